@@ -1,30 +1,47 @@
 """What one iteration's time grows with: splats, pixels, the selected share and threads.
 
-    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png]
+    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png] [--model] [--splats 60000]
 
 The demo's head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at 802×550, all in one
 process. More splats are smaller ones, as on a real head: their size falls with the square root of their number. Run it
 on an idle machine. Prints every figure, with the (splat, tile) pairs of the view, and draws them.
+
+--model: instead, what more threads than this machine has would bring. The pieces that an iteration is cut into for N
+threads are timed one after the other (time of the thread, median of repeats) and given to N threads as `threads.py`
+does: each takes the next piece when it is free, and one at a time holds Python's lock to call a kernel. Added are what
+lies between the kernels, and for each kernel the measured time to wake N − 1 threads and to hear of the last one's end.
+Cores are taken to be alike and memory to keep up: the last column is the bandwidth that this needs.
 """
 
 import argparse
+import heapq
+import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from time import thread_time
+from typing import Any
+from unittest.mock import patch
 
 import matplotlib
 import numpy as np
 from iteration import demo_head, device_step, front_camera, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
+from stga_addon.raster.cpu import threads as kernel_threads
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
-from stga_addon.raster.cpu.threads import set_threads, threads
+from stga_addon.raster.cpu.threads import parallel, set_threads, threads
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 SPLATS, WIDTH, HEIGHT = 60_000, 802, 550
+MODELLED_THREADS = (1, 2, 4, 8, 16)
+BYTES_PER_SPLAT, BYTES_PER_PAIR, BYTES_PER_PIXEL = 3_100, 140, 71
+"""What an iteration at least reads and writes, by the table of benchmarks/iteration.py."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +97,131 @@ def series(repeats: int) -> dict[str, list[Point]]:
     return found
 
 
+@dataclass(frozen=True)
+class Kernel:
+    """A call of a kernel, in milliseconds: its pieces, and for how long each holds Python's lock to be called."""
+
+    name: str
+    pieces: list[float]
+    call: float
+
+
+def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
+    """Runs an iteration on this thread, cut as for the threads that are set. Returns its kernels, in order, and what
+    lies between them, in milliseconds of this thread.
+    """
+    found: list[Kernel] = []
+    aside = 0.0
+
+    def one_by_one(kernel: Any, parts: list[tuple[int, int]], arguments: tuple[Any, ...]) -> None:
+        nonlocal aside
+        begin = thread_time()
+        times = []
+        for first, past in parts:
+            before = thread_time()
+            kernel(first, past, *arguments)
+            times.append(1e3 * (thread_time() - before))
+        before = thread_time()
+        for _ in range(3):
+            kernel(0, 0, *arguments)
+        call = 1e3 * (thread_time() - before) / 3
+        found.append(Kernel(kernel.__name__, [max(call, ms) for ms in times], call))
+        aside += 1e3 * (thread_time() - begin)
+
+    with patch.object(kernel_threads, "_run", one_by_one):
+        before = thread_time()
+        step()
+        whole = 1e3 * (thread_time() - before)
+    return found, whole - aside
+
+
+def span_ms(kernel: Kernel, count: int, two_threads: float, waking: float) -> float:
+    """How long a kernel takes `count` threads. Each takes the next piece as soon as it is free, and one at a time calls
+    the kernel; the calling thread first wakes the others, one after the other, and at the end hears of each.
+
+    two_threads: what a kernel without work costs on two threads; waking: what it takes to wake one.
+    """
+    helpers = min(count, len(kernel.pieces)) - 1
+    if not helpers:
+        return sum(kernel.pieces)
+    latency = two_threads - waking
+    free, lock = [helpers * waking, *(latency + n * waking for n in range(1, helpers + 1))], 0.0
+    heapq.heapify(free)
+    for ms in kernel.pieces:
+        lock = max(free[0], lock) + kernel.call
+        heapq.heapreplace(free, lock + ms - kernel.call)
+    return max(free)
+
+
+def waking_ms(repeats: int = 200) -> float:
+    """What it takes a thread to give work to one that waits for it."""
+    queue: SimpleQueue[int] = SimpleQueue()
+    Thread(target=lambda: [None for _ in iter(queue.get, -1)], daemon=True).start()
+    times = []
+    for n in range(repeats):
+        before = thread_time()
+        queue.put(n)
+        times.append(1e3 * (thread_time() - before))
+        while not queue.empty():
+            pass
+    queue.put(-1)
+    return statistics.median(times)
+
+
+def dispatch_ms(repeats: int) -> float:
+    """What a kernel without work costs on two threads."""
+
+    @parallel(lambda: 16)
+    def nothing(begin: int, end: int) -> None:
+        pass
+
+    before = threads()
+    set_threads(2)
+    try:
+        return median_ms(nothing, 10 * repeats)
+    finally:
+        set_threads(before)
+
+
+def model(splats: int, repeats: int) -> None:
+    """Print what an iteration would take on more threads, and of the most threads each kernel's part."""
+    rng = np.random.default_rng(0)
+    head, mesh, faces = demo_head(splats, rng)
+    camera = front_camera(WIDTH, HEIGHT)
+    target = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    backend, batch = device_step("cpu", head, mesh, faces, camera, target)
+    arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
+    pairs = len(
+        render_forward(arrays, head.face, frames_in_camera(face_frames(mesh, faces, mesh), camera), 3).lists.pair_splat
+    )
+    moved = splats * BYTES_PER_SPLAT + pairs * BYTES_PER_PAIR + WIDTH * HEIGHT * BYTES_PER_PIXEL
+    two, waking = dispatch_ms(repeats), waking_ms()
+    print(f"a kernel without work on two threads {1e3 * two:.0f} µs, to wake each further one {1e3 * waking:.1f} µs")
+    runs: dict[int, list[tuple[list[Kernel], float]]] = {count: [] for count in MODELLED_THREADS}
+    for _ in range(repeats + 2):
+        for count in runs:  # in turn, because the machine's speed changes
+            set_threads(count)
+            runs[count].append(kernels_of(lambda: backend.step(batch)))
+    print(f"{'threads':>7}{'work':>8}{'between':>9}{'ms':>8}{'efficiency':>12}{'GB/s':>7}")
+    single = 0.0
+    for count, measured in runs.items():
+        kernels = [median_kernel(calls) for calls in zip(*(run[0] for run in measured[2:]), strict=True)]
+        between = statistics.median(run[1] for run in measured[2:])
+        spans = [span_ms(kernel, count, two, waking) for kernel in kernels]
+        work, ms = sum(sum(kernel.pieces) for kernel in kernels), sum(spans) + between
+        single = single or ms
+        print(f"{count:>7}{work:>8.2f}{between:>9.2f}{ms:>8.2f}{single / ms / count:>12.2f}{moved / ms / 1e6:>7.0f}")
+    for kernel, span in zip(kernels, spans, strict=True):
+        share = sum(kernel.pieces) / span / count
+        print(f"    {kernel.name:<24}{span:>8.2f} ms on {count} threads, busy for {share:.2f} of it")
+
+
+def median_kernel(calls: tuple[Kernel, ...]) -> Kernel:
+    """Several runs of the same call as one."""
+    pieces = [statistics.median(times) for times in zip(*(call.pieces for call in calls), strict=True)]
+    return Kernel(calls[0].name, pieces, statistics.median(call.call for call in calls))
+
+
 def draw(found: dict[str, list[Point]], path: Path) -> None:
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), constrained_layout=True)
     for axis, (name, points) in zip(axes, found.items(), strict=True):
@@ -101,7 +243,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--model", action="store_true")
+    parser.add_argument("--splats", type=int, default=SPLATS, help="of the model")
     options = parser.parse_args()
+    if options.model:
+        model(options.splats, options.repeats)
+        return
     found = series(options.repeats)
     if options.out:
         draw(found, options.out)

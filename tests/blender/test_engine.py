@@ -22,7 +22,7 @@ from stga_addon.light.harmonics import uniform  # noqa: E402
 from stga_addon.light.relight import Relighter  # noqa: E402
 from stga_addon.light.transfer import transfer_of  # noqa: E402
 from stga_addon.light.values import Light, Lighting  # noqa: E402
-from stga_addon.raster.cpu.project import _basis  # noqa: E402
+from stga_addon.raster.cpu.harmonics import basis as harmonics  # noqa: E402
 from stga_addon.render.render import render as render_splats  # noqa: E402
 from stga_addon.render.render import render_avatar  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
@@ -413,7 +413,7 @@ def _merged(scans, spaces, eye):
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
         basis = np.zeros((len(splats), 16), np.float32)
         for row, (x, y, z) in zip(basis, direction.astype(np.float32), strict=True):
-            _basis(2, x, y, z, row)
+            row[:] = harmonics(x, y, z)
         color = np.einsum("nk,nkc->nc", basis[:, :9], splats.sh) / 0.28209479177387814
         parts.append(replace(world, sh=color[:, None].astype(np.float32)))
     names = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound", "strain_color")

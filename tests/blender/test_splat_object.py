@@ -203,7 +203,7 @@ def test_constant_colors_are_scene_linear():
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_colors_follow_the_active_camera(degree):
     """Catches harmonics of another order or sign, and directions in the world's instead of the splats' own space."""
-    kernels = pytest.importorskip("stga_addon.raster.cpu.project")
+    harmonics = pytest.importorskip("stga_addon.raster.cpu.harmonics")
     avatar = avatar_of("stga", 400)
     sh = np.random.default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
@@ -216,7 +216,7 @@ def test_colors_follow_the_active_camera(degree):
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     basis = np.zeros((400, 16), np.float32)
     for row, (x, y, z) in zip(basis, direction.astype(np.float32), strict=True):
-        kernels._basis(degree, x, y, z, row)
+        row[:] = harmonics.basis(x, y, z)
     seen = 0.5 + np.einsum("nk,nkc->nc", basis[:, : sh.shape[1]], sh)
     np.testing.assert_allclose(displayed_colors(shown), linear(seen), atol=2e-4)
     set_input(shown, splat_nodes.VIEW_DEPENDENT, False)

@@ -18,7 +18,7 @@ numba = pytest.importorskip("numba")
 
 from numba.core import config  # noqa: E402
 
-from stga_addon.raster.cpu import FASTMATH, blend, image_loss, optimizer  # noqa: E402
+from stga_addon.raster.cpu import FASTMATH, blend, image_loss, optimizer, splat_block  # noqa: E402
 
 DRIVER = str(Path(__file__).with_name("compile_ir.py"))
 X86, ARM = "x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"
@@ -111,6 +111,7 @@ def faults(text: str, cpu: str, loops: int, spills: int) -> str:
 
 STATE = "f4[::1]"
 PIXELS = "u8, u8"
+LIMITS = "UniTuple(f4, 4)"
 TABLE = np.zeros((2, 3), np.float32)
 ADAM = numba.types.void(
     numba.typeof(np.zeros(2, np.int32)),
@@ -134,6 +135,16 @@ LOOPS = {
         4,
     ),
     "Adam": (optimizer._adam_block, ADAM, 2, 0),
+    "projection": (splat_block.project_geometry, f"void({STATE}, {STATE}, {LIMITS})", 1, 80),
+    "bounds in tiles": (splat_block.project_bounds, f"void({STATE}, f4, f4)", 1, 12),
+    "harmonics": (splat_block.compute_harmonics, f"void({STATE}, f4[:, ::1])", 1, 20),
+    "gradient of the projection": (
+        splat_block.differentiate_geometry,
+        f"void({STATE}, {STATE}, {LIMITS}, UniTuple(f4, 2), f4)",
+        1,
+        230,
+    ),
+    "gradient of the harmonics": (splat_block.differentiate_position, f"void({STATE}, f4[:, ::1])", 1, 52),
 }
 """name -> function, signature, its vectorized loops, and the spills that each may have"""
 

@@ -146,8 +146,9 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
             inside = 0 <= row < height
             if inside:
                 keep = (row % RING_ROWS) * stride
-                for n in range(span):
-                    target_row[keep + n] = np.float32(target[row, left + n, c]) * np.float32(1 / 255)
+                for n in range(np.uint64(span)):
+                    value = target[np.uint64(row), np.uint64(left) + n, np.uint64(c)]
+                    target_row[np.uint64(keep) + n] = np.float32(value) * np.float32(1 / 255)
                 for n in range(np.uint64(span)):
                     x, y = image[c, row, np.uint64(left) + n], target_row[np.uint64(keep) + n]
                     source[np.uint64(WINDOW_RADIUS_PX) + n] = x

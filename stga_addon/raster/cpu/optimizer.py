@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from . import jit, part_jit
-from .threads import parallel
+from .threads import EVEN_PIECES, parallel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 ROWS_PER_BLOCK = 256
@@ -40,7 +40,7 @@ class AdamOptions(NamedTuple):
     ema_share: np.float32
 
 
-@parallel(lambda rows, *_: len(rows))
+@parallel(lambda rows, *_: len(rows), EVEN_PIECES)
 @jit
 def adam_rows(first_row, past_row, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
@@ -94,6 +94,16 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
             average[i, c] += share * (value - average[i, c])
 
 
+@parallel(lambda rows, *_: len(rows), EVEN_PIECES, least=16_384)
+@jit
+def add_screen_gradients(first_row, past_row, rows, screen_gradient, total, count):
+    """Add screen_gradient (N,) of the listed rows (M,) to total (N,), and 1 to their count (N,)."""
+    for n in range(first_row, past_row):
+        i = np.uint64(rows[n])
+        total[i] += screen_gradient[i]
+        count[i] += ONE
+
+
 @jit
 def sum_by_triangle(rows, face, gradient, total, trained):
     """Add gradient (N, 3) of the listed rows (M,) to the total (F, 3) of their triangles, marked in trained (F,)."""
@@ -127,7 +137,7 @@ def scale_limit(
     return norm
 
 
-@parallel(lambda sums, *_: len(sums))
+@parallel(lambda sums, *_: len(sums), EVEN_PIECES, least=3)
 @jit
 def sum_excess_scale(first_sum, past_sum, sums, rows, log_scale, face, unbound, limits):
     """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see `scale_limit`."""
@@ -142,7 +152,7 @@ def sum_excess_scale(first_sum, past_sum, sums, rows, log_scale, face, unbound, 
         sums[k] = total
 
 
-@parallel(lambda rows, *_: len(rows))
+@parallel(lambda rows, *_: len(rows), EVEN_PIECES)
 @jit
 def add_excess_scale(first_row, past_row, rows, log_scale, face, unbound, limits, factor, gradient):
     """Add factor · ReLU(scale − limit) · scale to gradient (N, 3); see `scale_limit`."""
@@ -154,7 +164,7 @@ def add_excess_scale(first_row, past_row, rows, log_scale, face, unbound, limits
             gradient[i, c] += factor * max(ZERO, scale - limit) * scale
 
 
-@parallel(lambda rows, *_: len(rows))
+@parallel(lambda rows, *_: len(rows), EVEN_PIECES, least=4096)
 @jit
 def opacity_weight(first_row, past_row, rows, opacity, share, weight, gradient):
     """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient (N,).

@@ -1,5 +1,6 @@
 """Rendering on the CPU: splats and a camera to an image, and the image's gradient back to the splats."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -12,10 +13,12 @@ from ...capture.camera import Camera
 from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .project import compose_frames, project_backward, project_forward
-from .threads import PIECES_PER_THREAD, threads
-from .tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs, mark_tiles
+from .threads import pieces_of
+from .tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs, list_visible, mark_tiles
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
+RUN_TILES = 4
+"""Tiles in a row that the same thread renders one after the other."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,7 @@ class BufferPool:
 
     def __init__(self) -> None:
         self._buffers: dict[str, np.ndarray] = {}
+        self._kept: dict[str, tuple[tuple[int, ...], np.ndarray]] = {}
 
     def get(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
         """An uninitialized array; the same memory whenever the same name is asked for again."""
@@ -62,6 +66,12 @@ class BufferPool:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
             buffer = self._buffers[name] = np.empty(size + size // 8, dtype)
         return buffer[:size].reshape(shape)
+
+    def kept(self, name: str, key: tuple[int, ...], make: Callable[..., np.ndarray]) -> np.ndarray:
+        """make(*key), which nobody writes to; the same array as long as the key is the same."""
+        if name not in self._kept or self._kept[name][0] != key:
+            self._kept[name] = key, make(*key)
+        return self._kept[name][1]
 
 
 def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
@@ -112,7 +122,7 @@ def render_forward(
 
     touched = rendered = np.ones((tiles_y, tiles_x), bool)
     if focus is None:
-        project(np.arange(len(splats.xyz)), rendered)
+        project(buffers.kept("everything", (len(splats.xyz),), np.arange), rendered)
     else:
         project(np.flatnonzero(focus), rendered)
         touched = np.zeros_like(rendered)
@@ -149,14 +159,15 @@ def render_backward(
     n, buffers = len(splats.xyz), buffers or BufferPool()
     tiles_x, _ = tile_grid(*frames.size)
     lists, columns, tiles, rows = output.lists, output.projection.columns, output.tiles, output.lists.visible
-    wanted = np.ones(n, bool)
+    wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
     if output.focus is not None:
         wanted = output.focus
         tiles, rows = tiles[output.touched.ravel()[tiles]], rows[wanted[rows]]
     pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
     screen_gradient = buffers.get("screen_gradient", (n,))
     if v_transmittance is None:
-        v_transmittance = np.broadcast_to(np.float32(0), output.transmittance.shape)
+        shape = output.transmittance.shape
+        v_transmittance = buffers.kept("v_transmittance", shape, lambda *shape: np.zeros(shape, np.float32))
     blend_backward(
         tiles, tiles_x, lists, output.blended, wanted, columns, output.background, v_image,
         np.ascontiguousarray(v_transmittance), pair_gradients,
@@ -191,7 +202,7 @@ def new_image(width: int, height: int, lists: TileLists, buffers: BufferPool) ->
 def sort_into_tiles(projection: Projection, tiles_x: int, tiles_y: int, buffers: BufferPool) -> TileLists:
     """Which projected splats reach which tile, front to back; rows of several projections may follow each other."""
     depth, rect = projection.depth, projection.rect
-    visible = np.flatnonzero(rect[:, 2] > rect[:, 0]).astype(np.int32)
+    visible = list_visible(rect)
     order = depth_order(depth, visible)
     first_pair, pairs = (buffers.get(name, depth.shape, np.int32) for name in ("first_pair", "pairs"))
     counts = buffers.get("counts", (SORT_PARTS, tiles_x * tiles_y), np.int32)
@@ -225,6 +236,7 @@ def _dilate(tiles: np.ndarray, reach: int) -> np.ndarray:
 
 
 def interleave_tiles(tiles: np.ndarray) -> np.ndarray:
-    """Reorder tiles so that each thread's pieces of work are spread over the whole image, which balances the load."""
-    pieces = PIECES_PER_THREAD * threads()
-    return np.concatenate([tiles[k::pieces] for k in range(pieces)])
+    """Reorder tiles so that each thread's pieces of work are spread over the whole image, which balances the load; in
+    runs of neighbors, which share splats."""
+    pieces = np.arange(len(tiles)) // RUN_TILES % pieces_of()
+    return np.asarray(tiles[np.argsort(pieces, kind="stable")])

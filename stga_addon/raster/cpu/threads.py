@@ -14,6 +14,11 @@ from typing import Any
 
 PIECES_PER_THREAD = 8
 """More pieces than threads, so that a thread which finishes early takes over work."""
+EVEN_PIECES = 4
+"""The same for kernels whose units all cost alike."""
+MANY_THREADS = 8
+"""From here on, threads get fewer pieces each: every call of a kernel holds Python's lock while its arguments are
+unpacked, up to 20 µs, for which all other threads wait."""
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -32,34 +37,48 @@ def set_threads(count: int) -> None:
     _threads = max(1, count)
 
 
-def parallel(units: Callable[..., int], pieces: int = PIECES_PER_THREAD) -> Callable[[Any], Callable[..., None]]:
+def parallel(
+    units: Callable[..., int], pieces: int = PIECES_PER_THREAD, least: int = 1
+) -> Callable[[Any], Callable[..., None]]:
     """Make kernel(begin, end, *arguments) a function of the arguments alone that runs on all threads.
 
     units: how many units of work the arguments hold; a kernel must do [begin, end) of them whatever the others do, and
     write what no other unit writes, so that results do not depend on the threads. pieces: a thread, of equal length.
+    least: units of a piece, so many that they take longer than to wake a thread.
     """
 
     def decorate(kernel: Any) -> Callable[..., None]:
         @wraps(kernel)
         def call(*arguments: Any) -> None:
-            _run(kernel, units(*arguments), pieces, arguments)
+            _run(kernel, cut(units(*arguments), pieces, least), arguments)
 
         return call
 
     return decorate
 
 
-def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> None:
-    if _threads == 1:
-        kernel(0, units, *arguments)
+def pieces_of(pieces: int = PIECES_PER_THREAD) -> int:
+    """How many pieces of work there are, where few threads get `pieces` each."""
+    return _threads * max(2, min(pieces, pieces * MANY_THREADS // _threads)) if _threads > 1 else 1
+
+
+def cut(units: int, pieces: int = PIECES_PER_THREAD, least: int = 1) -> list[tuple[int, int]]:
+    """First and past-the-last unit of each piece of work; see `parallel`."""
+    size = max(least, -(-units // pieces_of(pieces)))
+    return [(begin, min(begin + size, units)) for begin in range(0, units, size)]
+
+
+def _run(kernel: Any, parts: list[tuple[int, int]], arguments: tuple[Any, ...]) -> None:
+    """Call the kernel for each part; the parts are those of `cut`."""
+    if len(parts) == 1:
+        kernel(*parts[0], *arguments)
         return
-    size = max(1, -(-units // (pieces * _threads)))
-    begins = iter(range(0, units, size))  # shared: under Python's lock, each piece is taken once
+    remaining = iter(parts)  # shared: under Python's lock, each piece is taken once
     finished: SimpleQueue[BaseException | None] = SimpleQueue()
 
     def work() -> None:
-        for begin in begins:
-            kernel(begin, min(begin + size, units), *arguments)
+        for begin, end in remaining:
+            kernel(begin, end, *arguments)
 
     def assist() -> None:
         try:
@@ -69,7 +88,7 @@ def _run(kernel: Any, units: int, pieces: int, arguments: tuple[Any, ...]) -> No
         else:
             finished.put(None)
 
-    helpers = min(_threads, -(-units // size)) - 1
+    helpers = min(_threads, len(parts)) - 1
     _start(helpers)
     for _ in range(helpers):
         _tasks.put(assist)

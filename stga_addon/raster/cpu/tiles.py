@@ -11,30 +11,47 @@ SORT_PARTS = 16
 
 
 @jit
+def list_visible(rect):
+    """The splats (M,) int32 with tiles in their bounds, rect (N, 4)."""
+    found, count = np.empty(len(rect), np.int32), 0
+    for i in range(np.uint64(len(rect))):
+        found[count] = i
+        count += rect[i, 2] > rect[i, 0]
+    return found[:count].copy()
+
+
+@jit
 def depth_order(depth, candidates):
     """The candidates (M,) int32 sorted by depth, near to far; equal depths keep their order.
 
-    Least-significant-digit radix sort on the bits of the float: positive floats order like their bits.
+    Least-significant-digit radix sort on the bits of the float: positive floats order like their bits. Counted from the
+    least, the depths of a head have 22 bits, and take two of the three passes.
     """
-    buckets = 1 << RADIX_BITS
-    bits = depth.view(np.uint32)
+    buckets, count = 1 << RADIX_BITS, np.uint64(len(candidates))
+    bits, mask = depth.view(np.uint32), np.uint32(buckets - 1)
     keys, values = np.empty(len(candidates), np.uint32), candidates.copy()
-    for n in range(len(candidates)):
-        keys[n] = bits[candidates[n]]
+    least, most = np.uint32(0xFFFFFFFF), np.uint32(0)
+    for n in range(count):
+        key = bits[np.uint64(candidates[n])]
+        keys[n], least, most = key, min(least, key), max(most, key)
     next_keys, next_values = np.empty_like(keys), np.empty_like(values)
-    for shift in (np.uint32(0), np.uint32(RADIX_BITS), np.uint32(2 * RADIX_BITS)):
+    shift = np.uint32(0)
+    while most > least and np.uint32(most - least) >> shift > 0:
         place = np.zeros(buckets + 1, np.int64)
-        for n in range(len(keys)):
-            place[((keys[n] >> shift) & np.uint32(buckets - 1)) + 1] += 1
+        for n in range(count):
+            place[np.uint64((np.uint32(keys[n] - least) >> shift) & mask) + np.uint64(1)] += 1
         for b in range(buckets):
             place[b + 1] += place[b]
-        for n in range(len(keys)):
-            digit = (keys[n] >> shift) & np.uint32(buckets - 1)
-            next_keys[place[digit]] = keys[n]
-            next_values[place[digit]] = values[n]
+        for n in range(count):
+            digit = np.uint64((np.uint32(keys[n] - least) >> shift) & mask)
+            at = np.uint64(place[digit])
+            next_keys[at], next_values[at] = keys[n], values[n]
             place[digit] += 1
         keys, next_keys = next_keys, keys
         values, next_values = next_values, values
+        shift = np.uint32(shift + np.uint32(RADIX_BITS))
+        if shift > np.uint32(2 * RADIX_BITS):
+            break
     return values
 
 

@@ -26,7 +26,7 @@ import math
 import numpy as np
 
 from ...avatar import embedding, strain
-from ..cpu import blend, image_loss, layout, optimizer, project
+from ..cpu import blend, image_loss, layout, optimizer, splat_block
 from ..cpu.layout import Parameters
 
 WORKGROUP = 256
@@ -97,7 +97,7 @@ CONSTANTS: dict[str, int | float] = {
     "NEEDED": NEEDED,
     "OVERFLOWED": OVERFLOWED,
     **{name: float(getattr(blend, name)) for name in ("MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE")},
-    **{name: float(getattr(project, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
+    **{name: float(getattr(splat_block, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
     **{name: getattr(embedding, name) for name in ("MIN_AREA_RATIO", "UPRIGHT_COSINE")},
     "STRAIN_GAIN": strain.STRAIN_GAIN,
     "STRAIN_COMPONENTS": strain.STRAIN_COMPONENTS,

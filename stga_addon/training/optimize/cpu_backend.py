@@ -7,7 +7,7 @@ from ...avatar.offsets.offset import moved_frames, offset_of
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
+from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
 from ..settings import TrainingSettings
 from . import adam, driven_offsets
@@ -46,8 +46,7 @@ class CpuBackend:
         self._add_limit_gradients(rows)
         adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
         if batch.accumulate:
-            state.screen_gradient.numpy()[rows] += screen[rows]
-            state.gradient_count.numpy()[rows] += 1
+            add_screen_gradients(rows, screen, state.screen_gradient.numpy(), state.gradient_count.numpy())
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from ...capture.camera import Camera
 from ...raster.cpu import KERNEL_CACHE_FOLDER
 from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.layout import PROJECTED, Parameters, TileLists
-from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
+from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
 from ...render.device import adapter_name
@@ -106,6 +106,7 @@ def _second_half() -> None:
     rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
     state, rows = _pair(), np.arange(2, dtype=np.int32)
     adam.step(state, rows, rates)
+    add_screen_gradients(rows, np.zeros(2, np.float32), state.screen_gradient.numpy(), state.gradient_count.numpy())
     offsets = with_offsets(state, OFFSETS, 2).driven_offsets
     driven_offsets.step(
         offsets, rows, state.face.numpy(), state.gradients.xyz.numpy(),

@@ -1,0 +1,305 @@
+"""Projection of a block of splats, forward and backward, in loops that LLVM vectorizes.
+
+The values of a block lie in one flat float32 array `b`: column C of splat q at b[C + q]. Every loop computes all
+BLOCK_SPLATS, whatever an earlier block has left behind the last splat, so that a splat's bits do not depend on its
+place. `project` copies to the array, and from it, what is scattered in memory.
+"""
+
+import math
+
+import numpy as np
+
+from . import inline_jit
+from .elementary import exponential, logarithm
+from .harmonics import basis, basis_gradient
+from .layout import TILE
+
+LOW_PASS_PX2 = np.float32(0.3)
+"""Added to the projected covariance's diagonal, px²: no splat is narrower than a pixel."""
+NEAR_M = np.float32(0.01)
+QUATERNION_LIFT = np.float32(2.0**90)
+ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+
+BLOCK_SPLATS = 64
+BASIS_SIZE = 16
+# The splat's frame in camera space and its parameters.
+(M00, M01, M02, M10, M11, M12, M20, M21, M22, ORIGIN_X, ORIGIN_Y, ORIGIN_Z, LOCAL_X, LOCAL_Y, LOCAL_Z,
+ RAW_0, RAW_1, RAW_2, RAW_3, LOG_0, LOG_1, LOG_2, LOGIT) = (np.uint64(n * BLOCK_SPLATS) for n in range(23))  # fmt: skip
+# On the screen: the geometry of `layout.Projection`; the covariance, its determinant, and that of the splat without
+# LOW_PASS_PX2; bounds in tiles; SEEN: 1 where the splat may be visible, −1 where it is not finite, else 0.
+(MEAN_X, MEAN_Y, PRECISION_X, SHEAR, PRECISION_Y, OPACITY, EXTENT_Y, XX, XY, YY, DETERMINANT, SHARP,
+ X0, Y0, X1, Y1, SEEN) = (np.uint64(n * BLOCK_SPLATS) for n in range(23, 40))  # fmt: skip
+# In camera space; the unit vector from the camera in world space, 1 / distance; and the harmonics of the vector.
+(CAMERA_X, CAMERA_Y, CAMERA_Z, TOWARD_X, TOWARD_Y, TOWARD_Z, PER_DISTANCE) = (
+    np.uint64(n * BLOCK_SPLATS) for n in range(40, 47)
+)
+(B0, B1, B2, B3, B4, B5, B6, B7, B8, B9, B10, B11, B12, B13, B14, B15) = (
+    np.uint64(n * BLOCK_SPLATS) for n in range(47, 63)
+)
+FORWARD_SIZE = 63 * BLOCK_SPLATS
+# Gradients: of the columns of `layout.Projection`, and of the red, green and blue of harmonic k together; of the
+# splat's parameters and its place in camera space; the length of the center's, in units of half the image.
+G_MEAN_X, G_MEAN_Y, G_PRECISION_X, G_SHEAR, G_PRECISION_Y, G_OPACITY, G_RED, G_GREEN, G_BLUE = (
+    np.uint64(n * BLOCK_SPLATS) for n in range(63, 72)
+)
+W0, W1, W2, W3, W4, W5, W6, W7, W8, W9, W10, W11, W12, W13, W14, W15 = (
+    np.uint64(n * BLOCK_SPLATS) for n in range(72, 88)
+)
+(V_LOCAL_X, V_LOCAL_Y, V_LOCAL_Z, V_RAW_0, V_RAW_1, V_RAW_2, V_RAW_3, V_LOG_0, V_LOG_1, V_LOG_2, V_LOGIT,
+ V_CAMERA_X, V_CAMERA_Y, V_CAMERA_Z, V_SCREEN) = (np.uint64(n * BLOCK_SPLATS) for n in range(88, 103))  # fmt: skip
+BACKWARD_SIZE = 103 * BLOCK_SPLATS
+
+
+@inline_jit
+def _rotation(q0, q1, q2, q3):
+    """Rotation matrix entries of a unit quaternion wxyz."""
+    return (
+        ONE - TWO * (q2 * q2 + q3 * q3), TWO * (q1 * q2 - q0 * q3), TWO * (q1 * q3 + q0 * q2),
+        TWO * (q1 * q2 + q0 * q3), ONE - TWO * (q1 * q1 + q3 * q3), TWO * (q2 * q3 - q0 * q1),
+        TWO * (q1 * q3 - q0 * q2), TWO * (q2 * q3 + q0 * q1), ONE - TWO * (q1 * q1 + q2 * q2),
+    )  # fmt: skip
+
+
+@inline_jit
+def _unit(b, q):
+    """Unit quaternion and 1 / norm of a quaternion of any length; zero counts as the identity, with 1 / norm = 0.
+
+    The squares of 1e-20 and 1e20 leave float32's range, so quaternions far from length one are first scaled by a
+    power of two. 1 / norm only serves the gradient, whose square must stay in range too: it ends at 1e12.
+    """
+    q0, q1, q2, q3 = b[RAW_0 + q], b[RAW_1 + q], b[RAW_2 + q], b[RAW_3 + q]
+    size = abs(q0) + abs(q1) + abs(q2) + abs(q3)
+    up, down = QUATERNION_LIFT, ONE / QUATERNION_LIFT
+    lift = up if size < np.float32(1e-12) else (down if size > np.float32(1e12) else ONE)
+    q0 = ONE if size == ZERO else q0 * lift
+    q1, q2, q3 = q1 * lift, q2 * lift, q3 * lift
+    rn = ONE / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    per_norm = ZERO if size == ZERO else min(rn * lift, np.float32(1e12))
+    return q0 * rn, q1 * rn, q2 * rn, q3 * rn, per_norm
+
+
+@inline_jit
+def _camera_point(b, q):
+    """The splat in camera space."""
+    x, y, z = b[LOCAL_X + q], b[LOCAL_Y + q], b[LOCAL_Z + q]
+    return (
+        b[M00 + q] * x + b[M01 + q] * y + b[M02 + q] * z + b[ORIGIN_X + q],
+        b[M10 + q] * x + b[M11 + q] * y + b[M12 + q] * z + b[ORIGIN_Y + q],
+        b[M20 + q] * x + b[M21 + q] * y + b[M22 + q] * z + b[ORIGIN_Z + q],
+    )
+
+
+@inline_jit
+def _pixels_per_local(b, q, jx, jy, tx, ty):
+    """The affine map U from the triangle's local frame to pixels, row by row: the projection's Jacobian times its
+    matrix.
+
+    jx, jy: focal lengths over depth; tx, ty: x and y over depth.
+    """
+    m20, m21, m22 = b[M20 + q], b[M21 + q], b[M22 + q]
+    return (
+        jx * (b[M00 + q] - tx * m20), jx * (b[M01 + q] - tx * m21), jx * (b[M02 + q] - tx * m22),
+        jy * (b[M10 + q] - ty * m20), jy * (b[M11 + q] - ty * m21), jy * (b[M12 + q] - ty * m22),
+    )  # fmt: skip
+
+
+@inline_jit
+def _row_times_matrix(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22):
+    return a0 * r00 + a1 * r10 + a2 * r20, a0 * r01 + a1 * r11 + a2 * r21, a0 * r02 + a1 * r12 + a2 * r22
+
+
+@inline_jit
+def project_geometry(b, intrinsics, limits):
+    """Write MEAN_X and MEAN_Y, XX to SHARP, OPACITY and CAMERA_X to CAMERA_Z.
+
+    intrinsics (4,): fl_x, fl_y, cx, cy. limits (4,): lowest and highest x / z and y / z in the projection's Jacobian.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    low_x, high_x, low_y, high_y = limits[0], limits[1], limits[2], limits[3]
+    for q in range(np.uint64(BLOCK_SPLATS)):
+        x, y, z = _camera_point(b, q)
+        rz = ONE / z
+        tx, ty = min(high_x, max(low_x, x * rz)), min(high_y, max(low_y, y * rz))
+        q0, q1, q2, q3, _ = _unit(b, q)
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
+        u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, fx * rz, fy * rz, tx, ty)
+        s0, s1, s2 = exponential(b[LOG_0 + q]), exponential(b[LOG_1 + q]), exponential(b[LOG_2 + q])
+        w00, w01, w02 = _row_times_matrix(u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+        w10, w11, w12 = _row_times_matrix(u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+        a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
+        xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS_PX2
+        yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS_PX2
+        # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or below.
+        m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
+        sharp = m01 * m01 + m02 * m02 + m12 * m12
+        b[CAMERA_X + q], b[CAMERA_Y + q], b[CAMERA_Z + q] = x, y, z
+        b[MEAN_X + q], b[MEAN_Y + q] = fx * x * rz + cx, fy * y * rz + cy
+        b[XX + q], b[XY + q], b[YY + q] = xx, a00 * a10 + a01 * a11 + a02 * a12, yy
+        b[DETERMINANT + q] = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2)
+        b[SHARP + q] = sharp
+        b[OPACITY + q] = ONE / (ONE + exponential(-b[LOGIT + q]))
+
+
+@inline_jit
+def compensate_low_pass(b):
+    """Take from OPACITY what LOW_PASS_PX2 adds to the area."""
+    for q in range(np.uint64(BLOCK_SPLATS)):
+        b[OPACITY + q] *= math.sqrt(b[SHARP + q] / b[DETERMINANT + q])
+
+
+@inline_jit
+def project_bounds(b, tiles_x, tiles_y):
+    """Write PRECISION_X, SHEAR, PRECISION_Y, EXTENT_Y, X0 to Y1 and SEEN; tiles_x, tiles_y float32."""
+    size = np.float32(TILE)
+    for q in range(np.uint64(BLOCK_SPLATS)):
+        mean_x, mean_y, det, opacity = b[MEAN_X + q], b[MEAN_Y + q], b[DETERMINANT + q], b[OPACITY + q]
+        reach = TWO * logarithm(np.float32(255.0) * opacity)
+        yy, infinite = b[YY + q], np.float32(np.inf)
+        ex, ey = math.sqrt(reach * b[XX + q]), math.sqrt(reach * yy)
+        b[PRECISION_X + q], b[SHEAR + q], b[PRECISION_Y + q] = yy / det, b[XY + q] / yy, ONE / yy
+        b[EXTENT_Y + q] = ey
+        b[X0 + q] = min(tiles_x, max(ZERO, np.floor((mean_x - ex) / size)))
+        b[X1 + q] = min(tiles_x, max(ZERO, np.ceil((mean_x + ex) / size)))
+        b[Y0 + q] = min(tiles_y, max(ZERO, np.floor((mean_y - ey) / size)))
+        b[Y1 + q] = min(tiles_y, max(ZERO, np.ceil((mean_y + ey) / size)))
+        finite = (opacity >= ZERO) & (det < infinite) & (abs(mean_x) < infinite) & (abs(mean_y) < infinite)
+        seen = (ONE if reach > ZERO else ZERO) if finite else -ONE
+        b[SEEN + q] = ZERO if b[CAMERA_Z + q] < NEAR_M else seen
+
+
+@inline_jit
+def compute_harmonics(b, to_world):
+    """Write TOWARD_X to PER_DISTANCE and B0 to B15; to_world (3, 3): rotation from camera to world space."""
+    t00, t01, t02 = to_world[0, 0], to_world[0, 1], to_world[0, 2]
+    t10, t11, t12 = to_world[1, 0], to_world[1, 1], to_world[1, 2]
+    t20, t21, t22 = to_world[2, 0], to_world[2, 1], to_world[2, 2]
+    for q in range(np.uint64(BLOCK_SPLATS)):
+        x, y, z = b[CAMERA_X + q], b[CAMERA_Y + q], b[CAMERA_Z + q]
+        rd = ONE / math.sqrt(x * x + y * y + z * z)
+        dx, dy = (t00 * x + t01 * y + t02 * z) * rd, (t10 * x + t11 * y + t12 * z) * rd
+        dz = (t20 * x + t21 * y + t22 * z) * rd
+        b[TOWARD_X + q], b[TOWARD_Y + q], b[TOWARD_Z + q], b[PER_DISTANCE + q] = dx, dy, dz, rd
+        (
+            b[B0 + q], b[B1 + q], b[B2 + q], b[B3 + q], b[B4 + q], b[B5 + q], b[B6 + q], b[B7 + q],
+            b[B8 + q], b[B9 + q], b[B10 + q], b[B11 + q], b[B12 + q], b[B13 + q], b[B14 + q], b[B15 + q],
+        ) = basis(dx, dy, dz)  # fmt: skip
+
+
+@inline_jit
+def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
+    """Gradient with respect to A's two rows of v·ln sqrt(sharp / det), as in `compensate_low_pass`."""
+    low = LOW_PASS_PX2
+    sharp = m01 * m01 + m02 * m02 + m12 * m12
+    xx, yy = a00 * a00 + a01 * a01 + a02 * a02, a10 * a10 + a11 * a11 + a12 * a12
+    det = sharp + low * (xx + yy + low)
+    # v holds sqrt(sharp) as a factor, so the quotient stays finite where a splat has no area and v = 0.
+    w = v * low * (xx + yy + low) / (det * max(sharp, np.float32(1e-30)))
+    u = -v * low / det
+    return (
+        w * (m01 * a11 + m02 * a12) + u * a00, w * (-m01 * a10 + m12 * a12) + u * a01,
+        w * (-m02 * a10 - m12 * a11) + u * a02, w * (-m01 * a01 - m02 * a02) + u * a10,
+        w * (m01 * a00 - m12 * a02) + u * a11, w * (m02 * a00 + m12 * a01) + u * a12,
+    )  # fmt: skip
+
+
+@inline_jit
+def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
+    """Write V_RAW_0 to V_LOGIT, V_SCREEN, V_CAMERA_X to V_CAMERA_Z without the harmonics' part, and CAMERA_X to
+    CAMERA_Z, from G_MEAN_X to G_OPACITY and PRECISION_X to OPACITY.
+
+    intrinsics, limits: as in `project_geometry`; half_size (2,): of the image, pixels; compensated: 1 after
+    `compensate_low_pass`, else 0; all float32.
+    """
+    fx, fy, half_width, half_height = intrinsics[0], intrinsics[1], half_size[0], half_size[1]
+    low_x, high_x, low_y, high_y = limits[0], limits[1], limits[2], limits[3]
+    for q in range(np.uint64(BLOCK_SPLATS)):
+        g_mean_x, g_mean_y, g_opacity = b[G_MEAN_X + q], b[G_MEAN_Y + q], b[G_OPACITY + q]
+        half_x, half_y = half_width * g_mean_x, half_height * g_mean_y
+        b[V_SCREEN + q] = math.sqrt(half_x * half_x + half_y * half_y)
+        x, y, z = _camera_point(b, q)
+        rz = ONE / z
+        slope_x, slope_y = x * rz, y * rz
+        tx, ty = min(high_x, max(low_x, slope_x)), min(high_y, max(low_y, slope_y))
+        q0, q1, q2, q3, rn = _unit(b, q)
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
+        jx, jy = fx * rz, fy * rz
+        u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, jx, jy, tx, ty)
+        s0, s1, s2 = exponential(b[LOG_0 + q]), exponential(b[LOG_1 + q]), exponential(b[LOG_2 + q])
+        w00, w01, w02 = _row_times_matrix(u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+        w10, w11, w12 = _row_times_matrix(u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+        a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
+
+        # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0 − shear·a1,
+        # ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy: the gradient with respect to
+        # a0 is v0, that with respect to a1 is −shear·v0 + v1. The residual, and every product of −shear·v0 with
+        # something of row 1, is taken together with row 0, because the two cancel for long splats.
+        precision_x, shear, inverse_yy = b[PRECISION_X + q], b[SHEAR + q], b[PRECISION_Y + q]
+        m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
+        e0 = inverse_yy * (LOW_PASS_PX2 * a00 + a11 * m01 + a12 * m02)
+        e1 = inverse_yy * (LOW_PASS_PX2 * a01 - a10 * m01 + a12 * m12)
+        e2 = inverse_yy * (LOW_PASS_PX2 * a02 - a10 * m02 - a11 * m12)
+        vs = -TWO * precision_x * precision_x * b[G_PRECISION_X + q]
+        vk = inverse_yy * b[G_SHEAR + q]
+        vw = -TWO * inverse_yy * inverse_yy * b[G_PRECISION_Y + q]
+        b00, b01, b02, b10, b11, b12 = _compensation_gradient(
+            compensated * g_opacity * b[OPACITY + q], a00, a01, a02, a10, a11, a12, m01, m02, m12
+        )
+        v00, v01, v02 = vs * e0 + vk * a10 + b00, vs * e1 + vk * a11 + b01, vs * e2 + vk * a12 + b02
+        v10 = vk * e0 + vw * a10 + b10 + shear * b00
+        v11 = vk * e1 + vw * a11 + b11 + shear * b01
+        v12 = vk * e2 + vw * a12 + b12 + shear * b02
+        by0, by1, by2 = v00 * e0 + v10 * a10, v01 * e1 + v11 * a11, v02 * e2 + v12 * a12
+        b[V_LOG_0 + q], b[V_LOG_1 + q], b[V_LOG_2 + q] = by0, by1, by2
+        # A = U·R·diag(s): to R, then through the normalized quaternion.
+        v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
+        p0, p1, p2 = u00 - shear * u10, u01 - shear * u11, u02 - shear * u12
+        h00, h01, h02 = p0 * v00 + u10 * v10, p0 * v01 + u10 * v11, p0 * v02 + u10 * v12
+        h10, h11, h12 = p1 * v00 + u11 * v10, p1 * v01 + u11 * v11, p1 * v02 + u11 * v12
+        h20, h21, h22 = p2 * v00 + u12 * v10, p2 * v01 + u12 * v11, p2 * v02 + u12 * v12
+        vq0 = TWO * (q3 * (h10 - h01) + q2 * (h02 - h20) + q1 * (h21 - h12))
+        vq1 = TWO * (q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22))
+        vq2 = TWO * (q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22))
+        vq3 = TWO * (q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11))
+        radial = vq0 * q0 + vq1 * q1 + vq2 * q2 + vq3 * q3
+        b[V_RAW_0 + q], b[V_RAW_1 + q] = (vq0 - radial * q0) * rn, (vq1 - radial * q1) * rn
+        b[V_RAW_2 + q], b[V_RAW_3 + q] = (vq2 - radial * q2) * rn, (vq3 - radial * q3) * rn
+        # to U, and through it to the camera-space position (the Jacobian depends on it).
+        d00, d01 = v00 * r00 + v01 * r01 + v02 * r02, v00 * r10 + v01 * r11 + v02 * r12
+        d02 = v00 * r20 + v01 * r21 + v02 * r22
+        d10, d11 = v10 * r00 + v11 * r01 + v12 * r02, v10 * r10 + v11 * r11 + v12 * r12
+        d12 = v10 * r20 + v11 * r21 + v12 * r22
+        m20, m21, m22 = b[M20 + q], b[M21 + q], b[M22 + q]
+        from_row_0 = d00 * m20 + d01 * m21 + d02 * m22
+        vtx = -jx * from_row_0
+        vty = -jy * (d10 * m20 + d11 * m21 + d12 * m22 - shear * from_row_0)
+        vtx = vtx if tx == slope_x else ZERO
+        vty = vty if ty == slope_y else ZERO
+        vtx, vty = vtx + g_mean_x * fx, vty + g_mean_y * fy
+        b[V_CAMERA_X + q], b[V_CAMERA_Y + q] = vtx * rz, vty * rz
+        # U shrinks with z as the scales do.
+        b[V_CAMERA_Z + q] = -rz * (by0 + by1 + by2) - (vtx * slope_x + vty * slope_y) * rz
+        b[CAMERA_X + q], b[CAMERA_Y + q], b[CAMERA_Z + q] = x, y, z
+        # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
+        b[V_LOGIT + q] = g_opacity * b[OPACITY + q] / (ONE + exponential(b[LOGIT + q]))
+
+
+@inline_jit
+def differentiate_position(b, to_world):
+    """Write V_LOCAL_X to V_LOCAL_Z from V_CAMERA_X to V_CAMERA_Z and the weights W1 to W15 of the harmonics."""
+    t00, t01, t02 = to_world[0, 0], to_world[0, 1], to_world[0, 2]
+    t10, t11, t12 = to_world[1, 0], to_world[1, 1], to_world[1, 2]
+    t20, t21, t22 = to_world[2, 0], to_world[2, 1], to_world[2, 2]
+    for q in range(np.uint64(BLOCK_SPLATS)):
+        dx, dy, dz, rd = b[TOWARD_X + q], b[TOWARD_Y + q], b[TOWARD_Z + q], b[PER_DISTANCE + q]
+        ex, ey, ez = basis_gradient(
+            dx, dy, dz, b[W1 + q], b[W2 + q], b[W3 + q], b[W4 + q], b[W5 + q], b[W6 + q], b[W7 + q], b[W8 + q],
+            b[W9 + q], b[W10 + q], b[W11 + q], b[W12 + q], b[W13 + q], b[W14 + q], b[W15 + q],
+        )  # fmt: skip
+        along = ex * dx + ey * dy + ez * dz
+        ex, ey, ez = (ex - along * dx) * rd, (ey - along * dy) * rd, (ez - along * dz) * rd
+        vx = b[V_CAMERA_X + q] + t00 * ex + t10 * ey + t20 * ez
+        vy = b[V_CAMERA_Y + q] + t01 * ex + t11 * ey + t21 * ez
+        vz = b[V_CAMERA_Z + q] + t02 * ex + t12 * ey + t22 * ez
+        b[V_LOCAL_X + q] = b[M00 + q] * vx + b[M10 + q] * vy + b[M20 + q] * vz
+        b[V_LOCAL_Y + q] = b[M01 + q] * vx + b[M11 + q] * vy + b[M21 + q] * vz
+        b[V_LOCAL_Z + q] = b[M02 + q] * vx + b[M12 + q] * vy + b[M22 + q] * vz

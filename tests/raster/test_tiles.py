@@ -1,0 +1,27 @@
+"""Order of the splats by depth against numpy's stable sort."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba")
+
+from stga_addon.raster.cpu.tiles import depth_order, list_visible
+
+
+@pytest.mark.parametrize("most", [1.0, 1.0 + 1e-6, 1.1, 3.0, 1e9, 3e38])
+@pytest.mark.parametrize("least", [1.0, 0.01])
+def test_depths_are_sorted_whatever_their_range(least, most):
+    """Catches a pass left out where depths differ in high bits only, and equal depths that change places."""
+    rng = np.random.default_rng(0)
+    depth = np.geomspace(least, most, 3000).astype(np.float32)[rng.integers(0, 3000, 5000)]
+    candidates = np.flatnonzero(rng.random(5000) < 0.7).astype(np.int32)
+    expected = candidates[np.argsort(depth[candidates], kind="stable")]
+    np.testing.assert_array_equal(depth_order(depth, candidates), expected)
+
+
+def test_splats_with_tiles_are_listed():
+    """Catches splats left out at the end, and broken ones (−1) that are listed."""
+    rect = np.array([[0, 0, 0, 0], [1, 2, 3, 4], [-1, -1, -1, -1], [0, 0, 1, 1], [5, 0, 6, 2]], np.int32)
+    np.testing.assert_array_equal(list_visible(rect), [1, 3, 4])
+    assert len(list_visible(rect[:1])) == 0
+    assert len(depth_order(np.ones(0, np.float32), np.zeros(0, np.int32))) == 0
