@@ -5,7 +5,7 @@ from typing import Any
 import bpy
 
 from ..stga_addon.requests.environment_job import CAN_MAKE
-from . import drive, ids, monitor
+from . import drive, ids, monitor, prepare
 from .analyze import AnalyzeCapture
 from .apply_motion import ApplyMotion
 from .arkit_controls import AddArkitControls, RemoveArkitControls
@@ -116,6 +116,7 @@ def register() -> None:
     register_classes(CLASSES)
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
+    prepare.register()
     monitor.register()
     drive.register()
 
@@ -123,6 +124,7 @@ def register() -> None:
 def unregister() -> None:
     drive.unregister()
     monitor.unregister()
+    prepare.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     unregister_classes(CLASSES)

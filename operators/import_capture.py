@@ -19,6 +19,7 @@ from ..stga_addon.scene.viewports import frame_head
 from ..stga_addon.tracking.folder import is_tracked
 from . import ids
 from .common import FileImport, file_path, flame_model_path, flame_property, is_head, reporting, scene_settings
+from .prepare import begin_preparing
 
 
 class ImportCapture(bpy.types.Operator, FileImport):
@@ -120,6 +121,7 @@ def bring_in(
         warn(sentence)
     counts = f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras"
     operator.report({"INFO"}, counts)
+    begin_preparing(context)
 
 
 def _open(context: Any, source: Path, flame: str, principal_point: str) -> Capture:

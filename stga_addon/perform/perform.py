@@ -76,7 +76,7 @@ def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, res
         try:
             request = read_request(folder)
             if isinstance(request, Train | Resume | Refine | Extend):
-                _load_ahead()
+                load_ahead()
             left = resumed(request) if resume else request
             result = perform(left, _StatusReport(writer, also), say) if left else _tracked(request)
         except Cancelled:
@@ -85,7 +85,7 @@ def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, res
         return result
 
 
-def _load_ahead() -> None:
+def load_ahead() -> None:
     """Load what a training loads later, at its end too: an update of the add-on may exchange the files meanwhile."""
     for room in LOADED_AHEAD:
         package = import_module(f"..{room}", __package__)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
+from .cache import BYTECODE, CACHE_VARIABLE, CHARTS
 from .own_python import own_python
 from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, remove_status_folder
 
@@ -59,10 +60,24 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
         raise
     finally:
         os.close(log)
+    _give_precedence(process)
+    return process
+
+
+def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+    """Start `python -m ARGUMENTS…` at low priority, without a status; what it prints is dropped. Raises StgaError where
+    the interpreter cannot be started."""
+    nothing = subprocess.DEVNULL
+    process = start_python(python, arguments, stdin=nothing, stdout=nothing, stderr=nothing, **_DETACHED)
+    _give_precedence(process)
+    return process
+
+
+def _give_precedence(process: subprocess.Popen[bytes]) -> None:
+    """Lower the priority of a worker on Linux and macOS; Windows starts it with a low one."""
     if os.name != "nt":
         with suppress(OSError):  # the process has ended already
             os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
-    return process
 
 
 def start_python(
@@ -105,17 +120,24 @@ def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, s
 
     Another process of this interpreter finds the packages that this process does, and no others: Blender's extensions
     have a folder for theirs, which its Python does not search by itself, and Blender ignores the user's site-packages.
+    As installed by Blender, these packages have no bytecode; it is kept in the cache folder, if Blender named one.
     """
     is_own = python in (sys.executable, own_python())
+    cache = variables.get(CACHE_VARIABLE) if is_own else None
+    compiled = (
+        {"PYTHONPYCACHEPREFIX": os.path.join(cache, BYTECODE), "MPLCONFIGDIR": os.path.join(cache, CHARTS)}
+        if cache
+        else {"PYTHONDONTWRITEBYTECODE": "1"}  # the extension's folder belongs to Blender
+    )
     own_paths = filter(None, sys.path) if is_own else ()
     dropped = ("PYTHON",) if is_own else ("PYTHONHOME", "PYTHONSTARTUP")
     kept = {name: value for name, value in variables.items() if not name.startswith(dropped)}
     return {
         **kept,
         **({"PYTHONNOUSERSITE": "1"} if is_own else {}),
+        **compiled,
         "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *own_paths]),
         "PYTHONSAFEPATH": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",  # the extension's folder belongs to Blender
         "PYTHONUNBUFFERED": "1",
         "PYTHONUTF8": "1",
     }

@@ -14,7 +14,6 @@ import sysconfig
 import threading
 import time
 import tomllib
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,6 +24,8 @@ from stga_addon import __version__
 from stga_addon.development.package import ROOT, build_zip, fetch_wheels
 from stga_addon.development.repository import INDEX, PAGE, write_repository
 from stga_addon.errors import StgaError
+
+from .zips import with_version
 
 BLENDERS = [shlex.split(command) for command in os.environ.get("STGA_BLENDER", "").split(" ; ") if command.strip()]
 pytestmark = pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender")
@@ -41,13 +42,7 @@ def zips(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     except StgaError as error:
         pytest.skip(f"wheels not present and not downloadable: {error}")
     new = build_zip(tmp_path_factory.mktemp("new"))
-    old = tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip"
-    with zipfile.ZipFile(new) as source, zipfile.ZipFile(old, "w") as made:
-        for entry in source.infolist():
-            data = source.read(entry)
-            if entry.filename == "blender_manifest.toml":
-                data = data.replace(f'version = "{__version__}"'.encode(), f'version = "{OLD_VERSION}"'.encode(), 1)
-            made.writestr(entry, data)
+    old = with_version(new, OLD_VERSION, tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip")
     return old, new
 
 

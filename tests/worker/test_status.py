@@ -355,6 +355,22 @@ def test_worker_environment():
     assert made["PYTHONDONTWRITEBYTECODE"] == "1"
 
 
+def test_bytecode_of_the_own_interpreter(monkeypatch, tmp_path):
+    """Catches a worker that compiles the packages of an extension at every start, or writes among their files.
+
+    Another interpreter has bytecode of its own packages, which it would not find with a prefix.
+    """
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages/some_package.py").touch()
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "packages")])
+    variables = {**os.environ, "STGA_CACHE": str(tmp_path / "cache")}
+    command = [sys.executable, "-c", "import some_package"]
+    subprocess.run(command, env=worker_environment(variables, sys.executable), check=True)
+    assert [path.name for path in (tmp_path / "packages").iterdir()] == ["some_package.py"]
+    assert list((tmp_path / "cache").rglob("some_package.*.pyc"))
+    assert "PYTHONPYCACHEPREFIX" not in worker_environment(variables, "/usr/bin/python3")
+
+
 def test_own_interpreter_finds_the_bundled_packages(monkeypatch):
     """Catches a worker of Blender's Python without the packages of Blender's extensions."""
     monkeypatch.setattr(sys, "path", ["", "/extensions/site-packages"])

@@ -11,7 +11,8 @@ from typing import Any
 
 import numba
 from numba.core import config
-from platformdirs import user_cache_path
+
+from ...worker.cache import KERNELS, cache_folder
 
 # Reassociation and contraction let reductions vectorize; NaN and infinity keep their meaning, because a broken
 # splat must be recognised and dropped.
@@ -20,9 +21,7 @@ FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 # Compiled kernels are kept between processes, but never in the package's own folder: an installed extension must
 # not write there. One folder per package name, because a cached kernel refers to its modules by name, and the same
 # files may be imported as `stga_addon` and as part of an extension.
-KERNEL_CACHE_FOLDER = os.environ.get("NUMBA_CACHE_DIR") or str(
-    user_cache_path("stga", appauthor=False) / "kernels" / __name__
-)
+KERNEL_CACHE_FOLDER = os.environ.get("NUMBA_CACHE_DIR") or str(cache_folder() / KERNELS / __name__)
 
 
 def _cached(**options: Any) -> Any:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from functools import cache
 from pathlib import Path
 
@@ -19,13 +20,15 @@ from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacit
 from ...raster.cpu.project import project_backward
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
 from ...render.device import adapter_name
-from ...worker.launch import same_interpreter_environment
+from ...worker.cache import has_kernels, is_preparing
+from ...worker.launch import end_with_this_process, same_interpreter_environment
 from . import adam, driven_offsets
 from .losses import image_gradient, whole_image
 from .state import TrainState, new_state, with_offsets
 
 PACKAGE = "stga_addon"
 HELPER_TIMEOUT_S = 120.0
+POLL_INTERVAL_S = 0.05
 CAMERA = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
 
 
@@ -34,9 +37,27 @@ def precompile_kernels(device: str = "cpu") -> None:
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
     second process compiles half of them at the same time (`begin_compiling`), because Numba compiles one function at a
-    time per process.
+    time per process. While a process compiles ahead
+    (`perform.preparation`), this one waits for it.
     """
-    helper = begin_compiling()
+    _await_preparation()
+    compile_for_cpu()
+    if device != "cpu":
+        from ...raster.gpu.device import Device
+        from .gpu_backend import compile_kernels
+
+        compile_kernels(Device(adapter_name(device)))
+
+
+def _await_preparation() -> None:
+    end = time.monotonic() + HELPER_TIMEOUT_S
+    while is_preparing() and time.monotonic() < end:
+        time.sleep(POLL_INTERVAL_S)
+
+
+def compile_for_cpu() -> None:
+    """`precompile_kernels` for the CPU, whether or not another process compiles."""
+    helper = _compiling_helper()
     _render()
     _limit()
     if helper is not None:
@@ -45,21 +66,21 @@ def precompile_kernels(device: str = "cpu") -> None:
         except subprocess.TimeoutExpired:
             helper.kill()
     _second_half()  # loads from the cache what the second process has compiled
-    if device != "cpu":
-        from ...raster.gpu.device import Device
-        from .gpu_backend import compile_kernels
 
-        compile_kernels(Device(adapter_name(device)))
+
+def begin_compiling() -> None:
+    """Compile half of the kernels in a second process, while this one analyzes the capture."""
+    if not is_preparing():
+        _compiling_helper()
 
 
 @cache
-def begin_compiling() -> "subprocess.Popen[bytes] | None":
-    """The process that runs `_second_half`, started by the first call, while this one analyzes the capture; None if the
-    kernels are cached already or a second process would not help.
+def _compiling_helper() -> "subprocess.Popen[bytes] | None":
+    """The process that runs `_second_half`, started by the first call; None if the kernels are cached already or a
+    second process would not help.
     """
-    cached = any(Path(KERNEL_CACHE_FOLDER).glob("*/image_loss.image_loss-*.nbi"))
     # As part of an extension, the package has another name and another cache.
-    if cached or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
+    if has_kernels(Path(KERNEL_CACHE_FOLDER)) or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
         return None
     try:
         return subprocess.Popen(
@@ -68,6 +89,7 @@ def begin_compiling() -> "subprocess.Popen[bytes] | None":
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env=same_interpreter_environment(os.environ),
+            preexec_fn=end_with_this_process(),
         )
     except OSError:
         return None

@@ -1,0 +1,43 @@
+"""Compiles what a training runs while the user looks at the capture, in a folder that uninstalling removes."""
+
+import os
+import subprocess
+from contextlib import suppress
+from typing import Any
+
+import bpy
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.worker.cache import CACHE_VARIABLE, cache_folder, has_kernels
+from ..stga_addon.worker.launch import start_in_background
+from .common import package
+from .training_python import training_python
+
+PREPARATION = "stga_addon.perform.preparation"
+
+_processes: list["subprocess.Popen[bytes]"] = []
+
+
+def begin_preparing(context: Any) -> None:
+    """Compile in the background what the first training would wait for; nothing without a window, without a training
+    environment, or where it is compiled."""
+    if bpy.app.background or CACHE_VARIABLE not in os.environ or has_kernels(cache_folder()):
+        return
+    with suppress(StgaError):  # training says what is missing
+        _processes.append(start_in_background(training_python(context), [PREPARATION]))
+
+
+def register() -> None:
+    with suppress(ValueError):  # a checkout, which is no extension
+        os.environ.setdefault(CACHE_VARIABLE, bpy.utils.extension_path_user(package(), path="cache"))
+
+
+def unregister() -> None:
+    """End what is compiling, which would write into a folder that is being removed."""
+    for process in _processes:
+        process.kill()
+        process.wait()
+    _processes.clear()
+    with suppress(ValueError):
+        if os.environ.get(CACHE_VARIABLE) == bpy.utils.extension_path_user(package(), path="cache"):
+            del os.environ[CACHE_VARIABLE]

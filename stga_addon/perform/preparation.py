@@ -1,0 +1,30 @@
+"""Compilation ahead of a training: `python -m stga_addon.perform.preparation`, which Blender starts with a capture.
+
+The first training on a machine compiles Numba's kernels, and bytecode of the packages that an extension brings.
+"""
+
+from contextlib import suppress
+from importlib import import_module
+from importlib.util import find_spec
+
+from ..worker.cache import PREPARING, cache_folder
+from ..worker.lock import hold_lock
+from .perform import load_ahead
+
+
+def prepare() -> None:
+    """Compile what a training runs; without an effect while another process does, or where nothing can be written."""
+    folder = cache_folder()
+    with suppress(OSError):  # BlockingIOError among them
+        folder.mkdir(parents=True, exist_ok=True)
+        with hold_lock(folder / PREPARING):
+            load_ahead()
+            from ..training.optimize.precompile import compile_for_cpu
+
+            compile_for_cpu()
+            if find_spec("matplotlib") is not None:
+                import_module("matplotlib.font_manager")  # lists the fonts of this machine
+
+
+if __name__ == "__main__":
+    prepare()

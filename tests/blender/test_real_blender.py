@@ -1,0 +1,165 @@
+"""The complete edition in real Blenders without a network, from installing to uninstalling.
+
+STGA_BLENDER is the command that starts a Blender; several, separated by " ; ", are tried one after another. The wheels
+of the Python of each are downloaded into build/wheels, where they are missing.
+"""
+
+import json
+import os
+import shlex
+import subprocess
+import time
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from capture.factory import write_flame_capture
+
+from stga_addon import __version__
+from stga_addon.capture.flame_capture import OWN_MODELS
+from stga_addon.development.editions import complete
+from stga_addon.development.package import ROOT, build_zip, target_of, wheel_folder
+from stga_addon.development.wheels import collect_wheels
+from stga_addon.errors import StgaError
+from stga_addon.perform.perform import perform
+from stga_addon.progress import ignore
+from stga_addon.requests.values import Train
+from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.settings import make_settings
+from stga_addon.worker.status import WorkerState, inspect_worker
+
+from .zips import with_version
+
+BLENDERS = [shlex.split(command) for command in os.environ.get("STGA_BLENDER", "").split(" ; ") if command.strip()]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender"),
+]
+SCRIPT = Path(__file__).with_name("complete_script.py")
+OLD_VERSION = "0.1.9"
+ITERATIONS, UPDATE_ITERATIONS = 60, 3000
+"""Of a training; of one that is still at work when the update has ended."""
+MAX_DIFFERENCE_DB = 0.3
+TIMEOUT_S = 1800.0
+
+
+def name_of(command: list[str]) -> str:
+    return "-".join(command[-2:])
+
+
+def offline() -> list[str]:
+    """A prefix of commands that leaves them no network, where this system has one."""
+    prefixes = (["unshare", "-n"], ["unshare", "-rn"], [])
+    return next(prefix for prefix in prefixes if not prefix or not subprocess.run([*prefix, "true"]).returncode)
+
+
+def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
+    """The complete edition for a Blender, in the folder `out`; skips the test where wheels cannot be had."""
+    target = target_of(command)
+    try:
+        collect_wheels(wheel_folder(target), target)
+    except StgaError as error:
+        pytest.skip(f"wheels not present and not downloadable: {error}")
+    return build_zip(out, edition=complete(target), demo=demo)
+
+
+def blender(command: list[str], home: Path, *arguments: object, background: bool = True) -> None:
+    """Run a Blender in a home folder of its own, without a network."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "BLENDER", "STGA"))}
+    full = [*offline(), *command, *(["--background"] if background else []), *map(str, arguments)]
+    done = subprocess.run(
+        full, cwd=ROOT, env={**kept, "HOME": str(home)}, capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+
+
+def files_of(home: Path) -> set[str]:
+    """All files in a home folder but those that Blender itself writes: its settings, caches and lists."""
+    own = (".cache/blender", ".cache/mesa_shader_cache", ".config/blender", ".local")
+    extension = ("extensions/user_default/stga/", "extensions/.local/lib", "extensions/.user/user_default/stga")
+    names = {path.relative_to(home).as_posix() for path in home.rglob("*") if not path.is_dir()}
+    return {name for name in names if not name.startswith(own) or any(part in name for part in extension)}
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
+    model.rename(folder / OWN_MODELS[0])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A home folder in which every Blender has the complete edition, of a version before the one beside it."""
+    folder = tmp_path_factory.mktemp("real")
+    home = folder / "home"
+    home.mkdir()
+    for command in BLENDERS:
+        new = complete_zip(command, folder / name_of(command), demo)
+        blender(command, home, "--command", "extension", "validate", new)
+        old = with_version(new, OLD_VERSION, folder / "old.zip")
+        blender(command, home, "--command", "extension", "install-file", "--repo", "user_default", "--enable", old)
+        old.unlink()  # gigabytes
+    return home
+
+
+def script(command: list[str], home: Path, wait: bool, iterations: int) -> dict[str, Any]:
+    """What complete_script.py saw."""
+    result = home.parent / "result.json"
+    arguments = (result, int(wait), f"iterations={iterations}")
+    blender(command, home, "--python-exit-code", 1, "--python", SCRIPT, "--", *arguments)
+    seen: dict[str, Any] = json.loads(result.read_text())
+    print(seen)
+    return seen
+
+
+@pytest.mark.parametrize("command", BLENDERS, ids=name_of)
+def test_train(command: list[str], home: Path, demo: Path, tmp_path: Path) -> None:
+    """Catches a missing wheel, a worker that needs another Python or a network, and worse avatars."""
+    seen = script(command, home, True, ITERATIONS)
+    settings = make_settings("global", iterations=ITERATIONS)
+    perform(Train(tmp_path / "here", demo, settings), ignore, print)
+    found, expected = (read_metrics(run)[-1]["psnr"] for run in (Path(seen["run"]), tmp_path / "here"))
+    assert abs(found - expected) < MAX_DIFFERENCE_DB
+    assert seen["splats"] > 0
+
+
+@pytest.mark.parametrize("command", BLENDERS, ids=name_of)
+def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
+    """Catches an update that fails or ends a training, and one that disturbs another Blender's extension."""
+    seen = script(command, home, False, UPDATE_ITERATIONS)
+    run, others = Path(seen["run"]), other_profiles(home, seen["version"])
+    while not (run / "job/preview.npz").exists() and inspect_worker(run / "job").state.is_alive:
+        time.sleep(0.2)
+    new = next((home.parent / name_of(command)).glob("*.zip"))
+    blender(command, home, "--command", "extension", "install-file", "--repo", "user_default", "--enable", new)
+    assert inspect_worker(run / "job").state.is_alive, "the training ended before the update"
+    manifest = next(home.glob(f".config/blender/{short(seen['version'])}/extensions/user_default/stga/*.toml"))
+    assert tomllib.loads(manifest.read_text())["version"] == __version__
+    while (last := inspect_worker(run / "job")).state.is_alive:
+        time.sleep(0.5)
+    assert last.state == WorkerState.FINISHED, last
+    assert (run / "avatar.npz").is_file()
+    assert other_profiles(home, seen["version"]) == others
+
+
+def test_uninstall(home: Path) -> None:
+    """Catches files that uninstalling leaves, and one that disturbs another Blender's extension."""
+    for command in BLENDERS:
+        version = subprocess.run([*command, "--version"], cwd=ROOT, capture_output=True, text=True).stdout.split()[1]
+        others = other_profiles(home, version)
+        blender(command, home, "--command", "extension", "remove", "user_default.stga")
+        assert other_profiles(home, version) == others
+    assert {name for name in files_of(home) if not name.startswith("STGA Demo/run")} == set()
+
+
+def short(version: str) -> str:
+    return ".".join(version.split(".")[:2])
+
+
+def other_profiles(home: Path, version: str) -> dict[str, int]:
+    """Files of the extensions of other Blender versions in the home folder, and when they were changed."""
+    profiles = [path for path in home.glob(".config/blender/*") if path.name != short(version)]
+    files = [path for profile in profiles for path in (profile / "extensions").rglob("*") if path.is_file()]
+    return {str(path): path.stat().st_mtime_ns for path in files}
