@@ -28,6 +28,7 @@ from stga_addon.training.evaluate.evaluation_views import read_evaluation_view
 from stga_addon.training.evaluate.metrics import psnr
 
 WAYS = {
+    "no motion of the face": MotionOptions(strength=0.0),
     "coefficients copied": MotionOptions(),
     "relative to the first frame": MotionOptions(neutral="first"),
     "relative to the quiet face": MotionOptions(neutral="quiet"),
