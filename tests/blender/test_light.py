@@ -157,8 +157,8 @@ def test_irradiance_is_that_of_cycles(name):
 
 
 SIDE_PX, WIDTH_M = 512, 0.34
-MIN_FACING = 0.25
-"""Cosine towards the light of surface whose shadows count: beyond, it shades itself gradually."""
+MIN_FACING = 0.5
+"""Cosine towards the light of surface whose shadows count: where it is less, lifted points see past what blocks."""
 
 
 def seen_points(head) -> tuple[np.ndarray, np.ndarray]:
@@ -187,20 +187,20 @@ def edges(shadow: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "location", "energy"), [("SUN", (1.0, -1.2, 1.4), 3.0), ("POINT", (0.9, -0.9, 0.9), 30.0)]
-)
-def test_edges_of_shadows_are_those_of_cycles(kind, location, energy, tmp_path):
+@pytest.mark.parametrize(("kind", "energy"), [("SUN", 3.0), ("POINT", 30.0)])
+def test_edges_of_shadows_are_those_of_cycles(kind, energy, tmp_path):
     """Catches shadows that are shifted or torn off by lift and bias: edges beyond 2 pixels of 512 from the path
     tracer's."""
     shown, head = shown_head()
+    head.data.shade_flat()
+    location = tuple(PLACE @ Vector((0.6, 1.0, 0.2)))  # the plate throws its shadow onto the ball
     lamp(kind, location, energy, **({"angle": 0.0} if kind == "SUN" else {"shadow_soft_size": 0.0}))
     scene = bpy.context.scene
     camera = bpy.data.cameras.new("camera")
     camera.type, camera.ortho_scale = "ORTHO", WIDTH_M
     scene.camera = bpy.data.objects.new("camera", camera)
     scene.collection.objects.link(scene.camera)
-    scene.camera.location = PLACE.translation + Vector((0.6, -1.6, 0.6))
+    scene.camera.location = PLACE @ Vector((-0.6, 0.9, 0.9))
     scene.camera.rotation_euler = (scene.camera.location - PLACE.translation).to_track_quat("Z", "Y").to_euler()
     found = relit()
     points, normals = seen_points(head)
@@ -219,11 +219,9 @@ def test_edges_of_shadows_are_those_of_cycles(kind, location, energy, tmp_path):
     assert len(theirs) > 100
     apart = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
     one, other = apart.min(0), apart.min(1)
-    print(
-        f"{kind}: {len(theirs)} pixels of edges; mean {one.mean():.2f} and {other.mean():.2f} px, 95 % "
-        f"{np.quantile(one, 0.95):.2f} and {np.quantile(other, 0.95):.2f} px"
-    )
-    assert max(one.mean(), other.mean()) < 2
+    most = [float(np.quantile(distance, 0.95)) for distance in (one, other)]
+    print(f"{kind}: {len(theirs)} pixels of edges; mean {one.mean():.2f}, {other.mean():.2f}, 95 % {most} px")
+    assert max(most) < 2
 
 
 def path_traced(shown, head, path: Path) -> np.ndarray:
