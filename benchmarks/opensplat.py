@@ -17,7 +17,7 @@ from stga_addon.raster.cpu.layout import BLUE, OPACITY, PRECISION_X, PRECISION_Y
 
 SOURCE = Path("rasterizer", "gsplat-cpu", "gsplat_cpu.cpp")
 BINDING = """
-#include SOURCE_FILE
+#include "SOURCE_FILE"
 
 std::vector<torch::Tensor> both_ways(
     int64_t width, int64_t height, std::vector<torch::Tensor> splats, torch::Tensor background, torch::Tensor v_image
@@ -41,8 +41,8 @@ std::vector<torch::Tensor> both_ways(
 def build(folder: Path) -> Any:
     """The module of `both_ways`, compiled with the options of OpenSplat's release build."""
     source = (folder / SOURCE).resolve(strict=True)
-    flags = ["-O3", f'-DSOURCE_FILE="{source}"']
-    return load_inline("opensplat_cpu", BINDING, functions=["both_ways"], extra_cflags=flags)
+    binding = BINDING.replace("SOURCE_FILE", str(source))
+    return load_inline("opensplat_cpu", binding, functions=["both_ways"], extra_cflags=["-O3"])
 
 
 def both_ways_ms(

@@ -127,7 +127,7 @@ LOOPS = {
     "gradient of the color": (blend._sum_color_gradient, f"void({PIXELS}, {STATE}, {STATE})", 1, 0),
     "horizontal blur": (image_loss._blur_row, f"void({STATE}, i8, {STATE}, i8, i8)", 1, 0),
     "vertical blur": (image_loss._blur_column, f"void({STATE}, i8, i8, i8, {STATE}, i8, i8)", 1, 0),
-    "SSIM": (image_loss._similarity_row, f"f4({STATE}, i8, i8, i8, i8, {STATE})", 1, 8),
+    "SSIM": (image_loss._similarity_row, f"f4({STATE}, i8, i8, i8, i8, i8, {STATE})", 1, 8),
     "gradient of the loss": (
         image_loss._gradient_row,
         f"f4({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE})",

@@ -22,12 +22,13 @@ def as_many_as_before() -> Iterator[None]:
     set_threads(before)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 20])
 @pytest.mark.parametrize("units", [0, 1, 2, 5, 8, 100])
-def test_every_unit_is_done_once(count: int, units: int) -> None:
+@pytest.mark.parametrize("least", [1, 6])
+def test_every_unit_is_done_once(count: int, units: int, least: int) -> None:
     """Catches pieces that overlap, are left out at the end, or are taken by two threads."""
 
-    @parallel(len)
+    @parallel(len, least=least)
     def count_up(begin: int, end: int, done: np.ndarray) -> None:
         for n in range(begin, end):
             done[n] += 1

@@ -1,10 +1,13 @@
-"""Order of the splats by depth against numpy's stable sort."""
+"""Order of the splats by depth against numpy's stable sort, and the order in which tiles are rendered."""
 
 import numpy as np
 import pytest
 
 pytest.importorskip("numba")
 
+from stga_addon.raster.cpu.layout import TileLists
+from stga_addon.raster.cpu.rasterize import balance_tiles
+from stga_addon.raster.cpu.threads import cut, set_threads, threads
 from stga_addon.raster.cpu.tiles import depth_order, list_visible
 
 
@@ -25,3 +28,21 @@ def test_splats_with_tiles_are_listed():
     np.testing.assert_array_equal(list_visible(rect), [1, 3, 4])
     assert len(list_visible(rect[:1])) == 0
     assert len(depth_order(np.ones(0, np.float32), np.zeros(0, np.int32))) == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 16])
+def test_pieces_of_tiles_have_equally_many_pairs(count):
+    """Catches tiles that are lost or doubled, and a thread that gets the full tiles of the middle."""
+    before = threads()
+    set_threads(count)
+    try:
+        rng = np.random.default_rng(1)
+        far = np.abs(np.arange(1785) % 51 - 25) + np.abs(np.arange(1785) // 51 - 17)
+        pairs = np.where(far < 20, rng.integers(200, 400, 1785), 0)
+        lists = TileLists(*[np.zeros(0, np.int32)] * 4, np.append(0, np.cumsum(pairs)), np.zeros(0, np.int32))
+        tiles = balance_tiles(np.arange(1785, dtype=np.int32), lists)
+        np.testing.assert_array_equal(np.sort(tiles), np.arange(1785))
+        pieces = [pairs[tiles[a:b]].sum() for a, b in cut(1785)]
+        assert max(pieces) < 1.5 * sum(pieces) / len(pieces)
+    finally:
+        set_threads(before)

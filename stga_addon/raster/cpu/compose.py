@@ -13,8 +13,8 @@ from .project import project_forward
 from .rasterize import (
     BLACK_BACKGROUND,
     BufferPool,
+    balance_tiles,
     frames_in_camera,
-    interleave_tiles,
     new_image,
     new_projection,
     sort_into_tiles,
@@ -38,7 +38,7 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
         )  # fmt: skip
         begin = rows.stop
     lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
-    tiles = interleave_tiles(np.arange(tiles_x * tiles_y, dtype=np.int32))
+    tiles = balance_tiles(np.arange(tiles_x * tiles_y, dtype=np.int32), lists)
     blended = new_image(camera.width, camera.height, lists, buffers)
     blend_forward(tiles, tiles_x, lists, projection, BLACK_BACKGROUND, blended)
     rgb, alpha = blended.image, 1 - blended.transmittance

@@ -13,6 +13,8 @@ from .threads import parallel
 WINDOW_RADIUS_PX = 5
 LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
 """A pixel's gradient depends on image pixels up to this far away."""
+ROW_UNIT_PX = 32
+"""Rows of this length have no remainder for LLVM to compute pixel by pixel."""
 RING_ROWS = 2 * WINDOW_RADIUS_PX + 1
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 _window = np.exp(-0.5 * (np.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1) / 1.5) ** 2)
@@ -70,14 +72,15 @@ def _blur_column(ring, plane, stride, row, out, at, count):
 
 
 @inline_jit
-def _similarity_row(moments, stride, span, first, past, slopes):
-    """SSIM of a row of `span` pixels from its four blurred values, and its derivatives by three of them to `slopes`.
+def _similarity_row(moments, stride, padded, span, first, past, slopes):
+    """SSIM of a row of `span` pixels from its four blurred values, and its derivatives by three of them to `slopes`,
+    which are zero from there to `padded`.
 
     Both hold one value behind the other, `stride` apart; slopes from WINDOW_RADIUS_PX on. Returns the sum over the
     pixels from `first` to `past`.
     """
     total = ZERO
-    for n in range(np.uint64(span)):
+    for n in range(np.uint64(padded)):
         mx, my = moments[n], moments[np.uint64(stride) + n]
         squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
         mxy, mm = mx * my, mx * mx + my * my
@@ -92,9 +95,10 @@ def _similarity_row(moments, stride, span, first, past, slopes):
         by_product = TWO * luminance * over_e
         by_squares = -ssim * over_e
         by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
-        slopes[np.uint64(WINDOW_RADIUS_PX) + n] = by_mean
-        slopes[np.uint64(stride + WINDOW_RADIUS_PX) + n] = by_squares
-        slopes[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = by_product
+        inside = n < np.uint64(span)
+        slopes[np.uint64(WINDOW_RADIUS_PX) + n] = by_mean if inside else ZERO
+        slopes[np.uint64(stride + WINDOW_RADIUS_PX) + n] = by_squares if inside else ZERO
+        slopes[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = by_product if inside else ZERO
         total += ssim if (n >= np.uint64(first)) & (n < np.uint64(past)) else ZERO
     return total
 
@@ -132,7 +136,8 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
         # Columns [left, right) hold everything that matters; each row buffer is padded by WINDOW_RADIUS_PX zeros.
         left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
         span = right - left
-        stride = span + 2 * WINDOW_RADIUS_PX
+        padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX  # blurs go beyond the span, where nothing reads
+        stride = padded + 2 * WINDOW_RADIUS_PX
         target_row = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
         source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
         first = np.zeros(4 * RING_ROWS * stride, np.float32)
@@ -158,7 +163,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
             for plane in range(4):
                 into = (plane * RING_ROWS + row % RING_ROWS) * stride
                 if inside:
-                    _blur_row(source, plane * stride, first, into, span)
+                    _blur_row(source, plane * stride, first, into, padded)
                 else:
                     first[into : into + span] = ZERO
             # 2. SSIM of the row five above, and its slopes blurred horizontally
@@ -168,15 +173,15 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
             inside = 0 <= middle < height
             if inside:
                 for plane in range(4):
-                    _blur_column(first, plane, stride, middle, moments, plane * stride, span)
+                    _blur_column(first, plane, stride, middle, moments, plane * stride, padded)
                 counted = y0 <= middle < y1
-                total = _similarity_row(moments, stride, span, x0 - left, x1 - left, slopes)
+                total = _similarity_row(moments, stride, padded, span, x0 - left, x1 - left, slopes)
                 if counted:
                     similarity += total
             for plane in range(3):
                 into = (plane * RING_ROWS + middle % RING_ROWS) * stride
                 if inside:
-                    _blur_row(slopes, plane * stride, second, into, span)
+                    _blur_row(slopes, plane * stride, second, into, padded)
                 else:
                     second[into : into + span] = ZERO
             # 3. gradient of the row five above that
@@ -184,7 +189,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
             if out < y0 or out >= y1 or out < 0 or out >= height:
                 continue
             for plane in range(3):
-                _blur_column(second, plane, stride, out, blurred, plane * stride, span)
+                _blur_column(second, plane, stride, out, blurred, plane * stride, padded)
             keep = (out % RING_ROWS) * stride
             absolute = _gradient_row(
                 image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,

@@ -137,7 +137,7 @@ def scale_limit(
     return norm
 
 
-@parallel(lambda sums, *_: len(sums), EVEN_PIECES, least=3)
+@parallel(lambda sums, *_: len(sums), EVEN_PIECES, least=8)
 @jit
 def sum_excess_scale(first_sum, past_sum, sums, rows, log_scale, face, unbound, limits):
     """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see `scale_limit`."""
@@ -164,7 +164,7 @@ def add_excess_scale(first_row, past_row, rows, log_scale, face, unbound, limits
             gradient[i, c] += factor * max(ZERO, scale - limit) * scale
 
 
-@parallel(lambda rows, *_: len(rows), EVEN_PIECES, least=4096)
+@parallel(lambda rows, *_: len(rows), EVEN_PIECES, least=16_384)
 @jit
 def opacity_weight(first_row, past_row, rows, opacity, share, weight, gradient):
     """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient (N,).

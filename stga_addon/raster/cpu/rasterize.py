@@ -130,7 +130,7 @@ def render_forward(
         rendered = _dilate(touched, reach)
         project(np.flatnonzero(~focus), rendered)
     lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
-    tiles = interleave_tiles(np.flatnonzero(rendered).astype(np.int32))
+    tiles = balance_tiles(np.flatnonzero(rendered).astype(np.int32), lists)
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, lists, projection, background, blended)
@@ -235,8 +235,9 @@ def _dilate(tiles: np.ndarray, reach: int) -> np.ndarray:
     return grown
 
 
-def interleave_tiles(tiles: np.ndarray) -> np.ndarray:
-    """Reorder tiles so that each thread's pieces of work are spread over the whole image, which balances the load; in
-    runs of neighbors, which share splats."""
-    pieces = np.arange(len(tiles)) // RUN_TILES % pieces_of()
-    return np.asarray(tiles[np.argsort(pieces, kind="stable")])
+def balance_tiles(tiles: np.ndarray, lists: TileLists) -> np.ndarray:
+    """Reorder tiles so that all pieces of work have about as many pairs, in runs of neighbors, which share splats."""
+    runs, pieces = np.arange(len(tiles)) // RUN_TILES, pieces_of()
+    pairs = np.bincount(runs, lists.start[tiles + 1] - lists.start[tiles])
+    turn = np.argsort(np.argsort(-pairs, kind="stable")) % (2 * pieces)  # to the pieces and back, heavy runs first
+    return np.asarray(tiles[np.argsort(np.minimum(turn, 2 * pieces - 1 - turn)[runs], kind="stable")])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from . import jit
+from . import inline_jit, jit
 from .threads import parallel
 
 RADIX_BITS = 11
@@ -55,6 +55,22 @@ def depth_order(depth, candidates):
     return values
 
 
+@inline_jit
+def _tiles_of(rect, i, tiles_x):
+    """The first tile of splat i, how many it has in a row of tiles, and how many in all."""
+    width, height = np.uint64(rect[i, 2] - rect[i, 0]), np.uint64(rect[i, 3] - rect[i, 1])
+    return np.uint64(rect[i, 1] * tiles_x + rect[i, 0]), width, width * height
+
+
+@inline_jit
+def _next_tile(tile, column, width, tiles_x):
+    """The splat's tile after `tile`, its column-th in the row, and its column. One loop over all of them, without a
+    branch at the end of a row, is a fourth faster than two: the processor cannot foresee where short loops end."""
+    is_last, one = column == width, np.uint64(1)
+    step = np.uint64(tiles_x) - width + one if is_last else one
+    return tile + step, one if is_last else column + one
+
+
 @parallel(lambda *_: SORT_PARTS)
 @jit
 def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
@@ -64,14 +80,16 @@ def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
     `order`.
     """
     for k in range(part, past_part):
-        counts[k, :] = 0
-        for n in range(k * len(order) // SORT_PARTS, (k + 1) * len(order) // SORT_PARTS):
-            i = order[n]
-            x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
-            pairs[i] = (x1 - x0) * (y1 - y0)
-            for y in range(y0, y1):
-                for x in range(x0, x1):
-                    counts[k, y * tiles_x + x] += 1
+        row = counts[k]
+        row[:] = 0
+        for n in range(np.uint64(k * len(order) // SORT_PARTS), np.uint64((k + 1) * len(order) // SORT_PARTS)):
+            i = np.uint64(order[n])
+            tile, width, total = _tiles_of(rect, i, tiles_x)
+            pairs[i] = total
+            column = np.uint64(1)
+            for _ in range(total):
+                row[tile] += 1
+                tile, column = _next_tile(tile, column, width, tiles_x)
 
 
 @jit
@@ -105,17 +123,17 @@ def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_p
     first_pair[i].
     """
     for k in range(part, past_part):
-        for n in range(k * len(order) // SORT_PARTS, (k + 1) * len(order) // SORT_PARTS):
-            i = order[n]
-            x0, y0, x1, y1 = rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3]
-            found = first_pair[i]
-            for y in range(y0, y1):
-                for x in range(x0, x1):
-                    at = place[k, y * tiles_x + x]
-                    place[k, y * tiles_x + x] = at + 1
-                    pair_splat[at] = i
-                    splat_pairs[found] = at
-                    found += 1
+        row = place[k]
+        for n in range(np.uint64(k * len(order) // SORT_PARTS), np.uint64((k + 1) * len(order) // SORT_PARTS)):
+            i = np.uint64(order[n])
+            tile, width, total = _tiles_of(rect, i, tiles_x)
+            first, column = np.uint64(first_pair[i]), np.uint64(1)
+            for found in range(first, first + total):
+                at = row[tile]
+                row[tile] = at + 1
+                pair_splat[np.uint64(at)] = i
+                splat_pairs[found] = at
+                tile, column = _next_tile(tile, column, width, tiles_x)
 
 
 @jit

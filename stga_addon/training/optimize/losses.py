@@ -13,13 +13,13 @@ from ..settings import TrainingSettings
 from .hull_points import voxel_size
 
 
-def whole_image(height: int, width: int, parts: tuple[int, int] = (2, 4)) -> np.ndarray:
+def whole_image(height: int, width: int, parts: tuple[int, int] = (4, 2)) -> np.ndarray:
     """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one thread's work.
 
-    parts: of the image's shorter and of its longer side. Squares are cheapest, because the loss reads beyond their
-    edges.
+    parts: rows and columns of rectangles. Wide ones are cheapest: each of their rows begins anew, and pixels beyond the
+    left and right edge cost more than those above and below.
     """
-    rows, columns = parts if height <= width else parts[::-1]
+    rows, columns = parts
     tops, lefts = (_edges(side, count) for side, count in ((height, rows), (width, columns)))
     return np.array([[x0, y0, x1, y1] for y0, y1 in pairwise(tops) for x0, x1 in pairwise(lefts)], np.int64)
 
