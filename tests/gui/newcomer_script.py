@@ -56,6 +56,7 @@ class Clock:
 
 
 def install() -> Iterator[Callable[[], bool]]:
+    bpy.context.preferences.extensions.use_online_access_handled = True
     bpy.ops.screen.userpref_show(section="EXTENSIONS")
     yield lambda: True
     preferences = bpy.context.window_manager.windows[-1]
