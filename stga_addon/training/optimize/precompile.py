@@ -10,20 +10,18 @@ from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...raster.cpu.image_loss import change_background
-from ...raster.cpu.layout import PROJECTED, Parameters, TileLists
+from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
-from ...raster.cpu.precompile import blending_helper
-from ...raster.cpu.project import project_backward, project_forward
+from ...raster.cpu.precompile import rasterizer_helper
+from ...raster.cpu.project import project_forward
 from ...raster.cpu.rasterize import (
     BufferPool,
     frames_in_camera,
     new_projection,
     render_backward,
     render_forward,
-    sort_into_tiles,
     with_strain_color,
 )
-from ...raster.cpu.tiles import mark_tiles
 from ...render.device import adapter_name
 from ...worker.cache import is_preparing
 from . import adam, driven_offsets
@@ -39,8 +37,8 @@ def precompile_kernels(device: str = "cpu") -> None:
     """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate, and the GPU's.
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
-    second process compiles those that blend at the same time (`raster.cpu.precompile`). While a process compiles ahead
-    (`perform.preparation`), this one waits for it.
+    second process compiles most of the rasterizer at the same time (`raster.cpu.precompile`). While a process compiles
+    ahead (`perform.preparation`), this one waits for it.
     """
     _await_preparation()
     compile_for_cpu()
@@ -59,7 +57,7 @@ def _await_preparation() -> None:
 
 def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
-    helper = blending_helper()
+    helper = rasterizer_helper()
     _project()
     _limit()
     _optimize()
@@ -96,20 +94,10 @@ def _render() -> None:
 
 
 def _project() -> None:
-    """Projection, sorting into tiles, and the backward projection, of two splats that no tile contains."""
-    state, buffers = _pair(), BufferPool()
-    splats, face = with_strain_color(state.arrays()), state.face.numpy()
-    frames, tiles = frames_in_camera(WORLD, CAMERA), np.ones((1, 1), bool)
-    projection = new_projection(2, buffers)
+    state = _pair()
+    splats, face, frames = with_strain_color(state.arrays()), state.face.numpy(), frames_in_camera(WORLD, CAMERA)
+    projection, tiles = new_projection(2, BufferPool()), np.ones((1, 1), bool)
     project_forward(np.arange(2), tiles, splats, face, frames, 3, False, False, projection)
-    mark_tiles(projection.rect, np.arange(2), np.zeros_like(tiles))
-    sort_into_tiles(projection, 1, 1, buffers)
-    none, table = np.zeros(2, np.int32), np.ones((2, PROJECTED), np.float32)
-    gradients = with_strain_color(Parameters(*(g.numpy() for g in state.gradients)))
-    lists = TileLists(none, none, none, none, np.zeros(2, np.int64), none)
-    project_backward(
-        none, splats, face, frames, 3, False, False, table, lists, table, gradients, np.zeros(2, np.float32)
-    )
 
 
 def _optimize() -> None:
