@@ -76,6 +76,9 @@ def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, res
         try:
             request = read_request(folder)
             if isinstance(request, Train | Resume | Refine | Extend):
+                from ..raster.cpu.precompile import begin_compiling
+
+                begin_compiling()
                 load_ahead()
             left = resumed(request) if resume else request
             result = perform(left, _StatusReport(writer, also), say) if left else _tracked(request)

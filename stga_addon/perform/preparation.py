@@ -18,6 +18,9 @@ def prepare() -> None:
     with suppress(OSError):  # BlockingIOError among them
         folder.mkdir(parents=True, exist_ok=True)
         with hold_lock(folder / PREPARING):
+            from ..raster.cpu.precompile import rasterizer_helper
+
+            rasterizer_helper()
             load_ahead()
             from ..training.optimize.precompile import compile_for_cpu
 

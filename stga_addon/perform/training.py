@@ -15,6 +15,7 @@ from ..capture.takes import first_timesteps, join_takes, require_same_head, requ
 from ..errors import StgaError
 from ..format import format_duration
 from ..progress import Progress, Report, Say
+from ..raster.cpu.precompile import begin_compiling
 from ..render.device import choose_device
 from ..report.preset_timing import time_presets
 from ..report.run_summary import CurveUpdater, report_run
@@ -24,7 +25,6 @@ from ..training.effects.catalog import RELIGHT
 from ..training.effects.decisions import TRACKING
 from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
 from ..training.optimize.flame_refinement import with_refined_tracking
-from ..training.optimize.precompile import begin_compiling
 from ..training.run.continuation import continued_settings, select_for_takes
 from ..training.run.folder import AVATAR, Continuation, Run, Take, has_run, read_run
 from ..training.run.identity import file_digest, identity_of

@@ -47,10 +47,6 @@ def leave(worker: int) -> None:
     os._exit(0)
 
 
-timed("disabling_s", bpy.ops.preferences.addon_disable, module=module)
-for name in [name for name in sys.modules if name.startswith(module)]:
-    del sys.modules[name]
-timed("enabling_s", bpy.ops.preferences.addon_enable, module=module)
 timed("open_demo_s", bpy.ops.stga.open_demo)
 settings = bpy.context.scene.stga
 run = Path(settings.run_folder)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+from mathutils import Quaternion, Vector
 
 FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
 STEP_S, PATIENCE_S = 0.2, 600.0
@@ -45,6 +46,10 @@ def sidebar() -> bool:
     return bool(open_sidebar("STGA", [window.screen for window in bpy.context.window_manager.windows]))
 
 
+def write() -> None:
+    (FOLDER / "result.json").write_text(json.dumps(seen, indent=1))
+
+
 class Clock:
     """Seconds from its making, noted under a name."""
 
@@ -53,9 +58,11 @@ class Clock:
 
     def note(self, name: str) -> None:
         seen[name] = round(time.monotonic() - self.begin, 2)
+        write()
 
 
 def install() -> Iterator[Callable[[], bool]]:
+    bpy.context.preferences.extensions.use_online_access_handled = True
     bpy.ops.screen.userpref_show(section="EXTENSIONS")
     yield lambda: True
     preferences = bpy.context.window_manager.windows[-1]
@@ -94,8 +101,9 @@ def pose() -> Iterator[Callable[[], bool]]:
     with viewport():
         bpy.ops.stga.pose_head()
     yield lambda: True
-    with viewport():
-        bpy.ops.transform.rotate(value=JAW_ANGLE, orient_axis="X", orient_type="LOCAL")
+    jaw = bpy.context.view_layer.objects.active.pose.bones["jaw"]
+    side = jaw.bone.matrix_local.to_3x3().inverted() @ Vector((1.0, 0.0, 0.0))
+    jaw.rotation_quaternion = Quaternion(side, JAW_ANGLE)
     yield lambda: True
     picture("posed")
     with viewport():
@@ -146,7 +154,7 @@ class Player:
         except Exception:
             seen["traceback"] = traceback.format_exc()
             picture("failed")
-        (FOLDER / "result.json").write_text(json.dumps(seen, indent=1))
+        write()
         bpy.ops.wm.quit_blender()
         return None
 

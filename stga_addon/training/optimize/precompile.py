@@ -1,11 +1,7 @@
 """Compilation of all kernels before the timed part of a training run."""
 
-import os
 import subprocess
-import sys
 import time
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -13,20 +9,25 @@ from ...avatar.embedding import WORLD
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
-from ...raster.cpu import KERNEL_CACHE_FOLDER
 from ...raster.cpu.image_loss import change_background
-from ...raster.cpu.layout import PROJECTED, Parameters, TileLists
+from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
-from ...raster.cpu.project import project_backward
-from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward, with_strain_color
+from ...raster.cpu.precompile import rasterizer_helper
+from ...raster.cpu.project import project_forward
+from ...raster.cpu.rasterize import (
+    BufferPool,
+    frames_in_camera,
+    new_projection,
+    render_backward,
+    render_forward,
+    with_strain_color,
+)
 from ...render.device import adapter_name
-from ...worker.cache import has_kernels, is_preparing
-from ...worker.launch import end_with_this_process, same_interpreter_environment
+from ...worker.cache import is_preparing
 from . import adam, driven_offsets
 from .losses import image_gradient, whole_image
 from .state import TrainState, new_state, with_offsets
 
-PACKAGE = "stga_addon"
 HELPER_TIMEOUT_S = 120.0
 POLL_INTERVAL_S = 0.05
 CAMERA = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
@@ -36,9 +37,8 @@ def precompile_kernels(device: str = "cpu") -> None:
     """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate, and the GPU's.
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
-    second process compiles half of them at the same time (`begin_compiling`), because Numba compiles one function at a
-    time per process. While a process compiles ahead
-    (`perform.preparation`), this one waits for it.
+    second process compiles most of the rasterizer at the same time (`raster.cpu.precompile`). While a process compiles
+    ahead (`perform.preparation`), this one waits for it.
     """
     _await_preparation()
     compile_for_cpu()
@@ -57,42 +57,16 @@ def _await_preparation() -> None:
 
 def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
-    helper = _compiling_helper()
-    _render()
+    helper = rasterizer_helper()
+    _project()
     _limit()
+    _optimize()
     if helper is not None:
         try:
             helper.wait(HELPER_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             helper.kill()
-    _second_half()  # loads from the cache what the second process has compiled
-
-
-def begin_compiling() -> None:
-    """Compile half of the kernels in a second process, while this one analyzes the capture."""
-    if not is_preparing():
-        _compiling_helper()
-
-
-@cache
-def _compiling_helper() -> "subprocess.Popen[bytes] | None":
-    """The process that runs `_second_half`, started by the first call; None if the kernels are cached already or a
-    second process would not help.
-    """
-    # As part of an extension, the package has another name and another cache.
-    if has_kernels(Path(KERNEL_CACHE_FOLDER)) or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
-        return None
-    try:
-        return subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import _second_half; _second_half()"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            env=same_interpreter_environment(os.environ),
-            preexec_fn=end_with_this_process(),
-        )
-    except OSError:
-        return None
+    _render()  # loads from the cache what the second process has compiled
 
 
 def _pair() -> TrainState:
@@ -119,9 +93,15 @@ def _render() -> None:
     render_backward(rendering, state.arrays(), face, seen, np.zeros_like(rendering.image), gradients)
 
 
-def _second_half() -> None:
-    """Loss, Adam and the backward projection: about half of the time to compile."""
-    _project_backward()
+def _project() -> None:
+    state = _pair()
+    splats, face, frames = with_strain_color(state.arrays()), state.face.numpy(), frames_in_camera(WORLD, CAMERA)
+    projection, tiles = new_projection(2, BufferPool()), np.ones((1, 1), bool)
+    project_forward(np.arange(2), tiles, splats, face, frames, 3, False, False, projection)
+
+
+def _optimize() -> None:
+    """Loss and Adam."""
     image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
     target.setflags(write=False)  # like the loader's arrays: read-only arrays are a type of their own
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
@@ -133,19 +113,6 @@ def _second_half() -> None:
     driven_offsets.step(
         offsets, rows, state.face.numpy(), state.gradients.xyz.numpy(),
         lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, 1.0, adam.EPSILON,
-    )  # fmt: skip
-
-
-def _project_backward() -> None:
-    """Two splats that no tile contains."""
-    state = _pair()
-    frames, none = frames_in_camera(WORLD, CAMERA), np.zeros(2, np.int32)
-    gradients = Parameters(*(g.numpy() for g in state.gradients))
-    lists = TileLists(none, none, none, none, np.zeros(2, np.int64), none)
-    table = np.ones((2, PROJECTED), np.float32)
-    project_backward(
-        none, with_strain_color(state.arrays()), state.face.numpy(), frames, 3, False, False, table, lists,
-        table, with_strain_color(gradients), np.zeros(2, np.float32),
     )  # fmt: skip
 
 

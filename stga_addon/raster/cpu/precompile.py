@@ -1,0 +1,92 @@
+"""Compilation of the rasterizer's kernels, which take more than half of the time, in a second process.
+
+Numba compiles one function at a time per process. The second process needs no torch, so it starts at once.
+"""
+
+import os
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from ...avatar.embedding import WORLD
+from ...capture.camera import Camera
+from ...worker.cache import has_kernels, is_preparing
+from ...worker.launch import end_with_this_process, same_interpreter_environment
+from . import KERNEL_CACHE_FOLDER
+from .blend import blend_backward, blend_forward
+from .layout import PROJECTED, Parameters
+from .project import project_backward
+from .rasterize import (
+    BLACK_BACKGROUND,
+    BufferPool,
+    frames_in_camera,
+    new_image,
+    new_projection,
+    sort_into_tiles,
+    tile_grid,
+    with_strain_color,
+)
+from .tiles import mark_tiles
+
+PACKAGE = "stga_addon"
+SIZE = 16
+"""Width and height of the image, in pixels: one tile."""
+SHAPES = ((3,), (4,), (3,), (), (16, 3))
+"""Of a splat's `Parameters`."""
+
+
+def begin_compiling() -> None:
+    """Compile the rasterizer in a second process, while this one does something else."""
+    if not is_preparing():
+        rasterizer_helper()
+
+
+@cache
+def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
+    """The process that runs `compile_rasterizer`, started by the first call; None if the kernels are cached already or
+    a second process would not help.
+    """
+    # As part of an extension, the package has another name and another cache.
+    if has_kernels(Path(KERNEL_CACHE_FOLDER)) or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
+        return None
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import compile_rasterizer; compile_rasterizer()"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env=same_interpreter_environment(os.environ),
+            preexec_fn=end_with_this_process(),
+        )
+    except OSError:
+        return None
+
+
+def compile_rasterizer() -> None:
+    """Compile what renders after the projection, and the backward pass, with the types of real training.
+
+    Two splats that no tile contains: a column of a one-row array is contiguous, which is another type to Numba.
+    """
+    buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
+    tiles, touched = np.arange(tiles_x * tiles_y, dtype=np.int32), np.ones((tiles_y, tiles_x), bool)
+    projection = new_projection(2, buffers)
+    projection.rect[:] = 0
+    mark_tiles(projection.rect, np.arange(2), touched)
+    lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
+    blended = new_image(SIZE, SIZE, lists, buffers)
+    blend_forward(tiles, tiles_x, lists, projection, BLACK_BACKGROUND, blended)
+    v_image, v_transmittance = np.zeros((3, SIZE, SIZE), np.float32), np.zeros((SIZE, SIZE), np.float32)
+    pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
+    blend_backward(
+        tiles, tiles_x, lists, blended, np.ones(2, bool), projection.columns, BLACK_BACKGROUND, v_image,
+        v_transmittance, pair_gradients,
+    )  # fmt: skip
+    splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
+    frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
+    project_backward(
+        lists.visible, splats, np.zeros(2, np.int32), frames, 3, False, False, projection.columns, lists,
+        pair_gradients, splats, buffers.get("screen_gradient", (2,)),
+    )  # fmt: skip
