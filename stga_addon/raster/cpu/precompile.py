@@ -86,7 +86,8 @@ def compile_rasterizer() -> None:
     )  # fmt: skip
     splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
     frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
+    lists.first_pair[:], lists.pairs[:] = 0, 0
     project_backward(
-        lists.visible, splats, np.zeros(2, np.int32), frames, 3, False, False, projection.columns, lists,
+        np.arange(2, dtype=np.int32), splats, np.zeros(2, np.int32), frames, 3, False, False, projection.columns, lists,
         pair_gradients, splats, buffers.get("screen_gradient", (2,)),
     )  # fmt: skip
