@@ -256,8 +256,8 @@ class _SeenPoints:
     def residual(self, shot: _Shot, number: int, rows: np.ndarray, at: np.ndarray, level: int) -> np.ndarray:
         """Channels (M, 3) of a camera's image at points, minus those of the reference, in NOISE_LEVELS."""
         own = shot.views[number].levels[level]
-        found = sampled(own.channels, own.camera.project(at)[0])
-        return np.asarray((found - self.reference[level][rows]) / NOISE_LEVELS)
+        values = sampled(own.channels, own.camera.project(at)[0])
+        return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
 
 
 def _seen_points(take: _Take, timestep: int) -> _SeenPoints:

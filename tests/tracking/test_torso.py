@@ -130,7 +130,7 @@ def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, mo
     assert torso.motion in motions
     wrong = torso_angles(fit, found) - torsos * SWING_DEG
     assert np.abs(wrong - wrong.mean()).max() < 3.0
-    assert torso.misfit[torso.motion] < 0.5 * torso.misfit["head"]
+    assert torso.misfit[torso.motion] < 0.7 * torso.misfit["head"]
     apart = head.model.weights[:, ROOT] == 0
     for timestep, values in parameters.items():
         before, after = (posed_mesh(fit, own)[apart] for own in (values, found[timestep]))
