@@ -76,9 +76,11 @@ def blender(command: list[str], home: Path, *arguments: object, background: bool
 
 def files_of(home: Path) -> set[str]:
     """All files in a home folder but those that Blender itself writes: its settings, caches and lists."""
-    own = (".cache/blender", ".cache/mesa_shader_cache", ".config/blender", ".local")
+    own = (".cache/blender", ".cache/mesa_shader_cache", ".cache/openbox", ".config/blender", ".local")
     extension = ("extensions/user_default/stga/", "extensions/.local/lib", "extensions/.user/user_default/stga")
     names = {path.relative_to(home).as_posix() for path in home.rglob("*") if not path.is_dir()}
+    # Of modules of a single file, such as typing_extensions.py, Blender leaves what its own Python has compiled.
+    names = {name for name in names if "/site-packages/__pycache__/" not in name}
     return {name for name in names if not name.startswith(own) or any(part in name for part in extension)}
 
 
