@@ -3,12 +3,13 @@
 import numpy as np
 
 from .harmonics import basis, even_directions
-from .shadows import LIFT_M, ShadowMap
+from .shadows import ShadowMap
 from .surface import vertex_normals
 from .values import Light
 
 DIRECTIONS = 192
-MAP_SIZE, BIAS_M = 256, 0.0015
+MAP_SIZE, BIAS_M, LIFT_M = 256, 0.0015, 0.002
+"""As in `shadows`, for maps of half the size."""
 
 
 def transfer_of(vertices: np.ndarray, faces: np.ndarray, directions: int = DIRECTIONS) -> tuple[np.ndarray, np.ndarray]:
