@@ -1,13 +1,14 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
     python benchmarks/iteration.py [--head ellipsoid] [--device gpu] [--splats 60000] [--width 802] [--height 550]
-                                   [--repeats 30] [--out FILE.json]
+                                   [--repeats 30] [--opensplat FOLDER] [--out FILE.json]
 
 Splats of SH degree 3 on the demo's head (16,000 triangles, denser at eyes and mouth, as heads are), or on an evenly
 covered ellipsoid, for which a selection costs most. On the CPU: the instruction set, and medians over repeats in one
 process; beside each stage the bytes it must at least move and the time that takes at this machine's measured copy
 bandwidth. On a GPU, whose queue is never waited for: means over all repeats, the same table by kernel, the dispatches,
-submits, waits and milliseconds that an iteration takes of the host, and the device's memory. Run it on an idle machine.
+submits, waits and milliseconds that an iteration takes of the host, and the device's memory. --opensplat: a checkout of
+OpenSplat, whose CPU rasterizer is compiled and run on the same splats. Run it on an idle machine.
 """
 
 import argparse
@@ -33,7 +34,14 @@ from stga_addon.development.demo.head import synthetic_head
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
 from stga_addon.raster.cpu.layout import PROJECTED, Parameters
 from stga_addon.raster.cpu.project import project_backward, project_forward
-from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_forward, tile_grid, with_strain_color
+from stga_addon.raster.cpu.rasterize import (
+    BufferPool,
+    frames_in_camera,
+    render_backward,
+    render_forward,
+    tile_grid,
+    with_strain_color,
+)
 from stga_addon.raster.cpu.threads import threads
 from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.render.device import choose_device
@@ -194,8 +202,11 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=802)
     parser.add_argument("--height", type=int, default=550)
     parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--opensplat", type=Path, metavar="FOLDER")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    if options.opensplat and options.device != "cpu":
+        parser.error("--opensplat is compared with the CPU's rasterizer, not with --device")
     rng = np.random.default_rng(0)
     make_head = {"demo": demo_head, "ellipsoid": ellipsoid}[options.head]
     splats, mesh, faces = make_head(options.splats, rng)
@@ -208,6 +219,8 @@ def main() -> None:
         measure = partial(cpu_ms, backend, options.repeats)
         frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
         found = cpu_table(splats, frames, target, options.repeats)
+        if options.opensplat:
+            compare_opensplat(options.opensplat, splats, frames, target, found, options.repeats)
     else:
         import gpu_kernels  # needs wgpu
 
@@ -247,6 +260,34 @@ def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[
         floor = 1e3 * moved / bandwidth
         print(f"{name:<22}{ms:8.2f}{moved / 1e6:8.1f}{floor:10.2f}{ms / floor:7.1f}")
     return {name: ms for name, (ms, _) in found.items()}
+
+
+def compare_opensplat(
+    folder: Path, splats: Splats, frames, target: np.ndarray, found: dict[str, float], repeats: int
+) -> None:
+    """Print both rasterizers' times for one image and its gradient; found: stage -> ms of ours."""
+    import opensplat  # needs a C++ compiler
+
+    state, buffers, background = new_state(splats), BufferPool(), np.ones(3, np.float32)
+    face, gradients = state.face.numpy(), Parameters(*(g.numpy() for g in state.gradients))
+
+    def forward():
+        return render_forward(state.arrays(), face, frames, 3, background, buffers=buffers)
+
+    def both_ways():
+        render_backward(forward(), state.arrays(), face, frames, v_image, gradients, buffers=buffers)
+
+    output = forward()
+    v_image = np.empty_like(output.image)
+    image_gradient(output.image, target, whole_image(*target.shape[:2]), 0.2, v_image)
+    peer = opensplat.both_ways_ms(
+        folder, output.projection, output.lists.visible, output.image.copy(), v_image, min(repeats, 5)
+    )
+    blending = found["blend"] + found["blend backward"]
+    print(f"{'OpenSplat, both ways':<22}{peer[1]:8.2f}   forward {peer[0]:.2f}, on one thread, without projection")
+    print(f"{'blending, both ways':<22}{blending:8.2f}   {peer[1] / blending:.1f} times as fast")
+    ours = median_ms(both_ways, repeats)
+    print(f"{'rendering, both ways':<22}{ours:8.2f}   {peer[1] / ours:.1f} times as fast, with projection and sorting")
 
 
 if __name__ == "__main__":
