@@ -87,7 +87,9 @@ def compile_rasterizer() -> None:
         tiles, tiles_x, lists, blended, np.ones(2, bool), projection.columns, BLACK_BACKGROUND, v_image,
         v_transmittance, pair_gradients,
     )  # fmt: skip
+    # Without rows, no kernel is called: two, each of no pair.
+    projection.columns[:], lists.first_pair[:], lists.pairs[:] = 1, 0, 0
     project_backward(
-        lists.visible, splats, face, frames, 3, False, False, projection.columns, lists,
+        np.arange(2, dtype=np.int32), splats, face, frames, 3, False, False, projection.columns, lists,
         pair_gradients, splats, buffers.get("screen_gradient", (2,)),
     )  # fmt: skip
