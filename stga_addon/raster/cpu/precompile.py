@@ -18,7 +18,7 @@ from ...worker.launch import end_with_this_process, same_interpreter_environment
 from . import KERNEL_CACHE_FOLDER
 from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, Parameters
-from .project import project_backward
+from .project import project_backward, project_forward
 from .rasterize import (
     BLACK_BACKGROUND,
     BufferPool,
@@ -66,13 +66,16 @@ def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
 
 
 def compile_rasterizer() -> None:
-    """Compile what renders after the projection, and the backward pass, with the types of real training.
+    """Compile `render_forward` and `render_backward` with the types of real training.
 
     Two splats that no tile contains: a column of a one-row array is contiguous, which is another type to Numba.
     """
     buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
     tiles, touched = np.arange(tiles_x * tiles_y, dtype=np.int32), np.ones((tiles_y, tiles_x), bool)
-    projection = new_projection(2, buffers)
+    splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
+    frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
+    face, projection = np.zeros(2, np.int32), new_projection(2, buffers)
+    project_forward(np.arange(2), touched, splats, face, frames, 3, False, False, projection)
     projection.rect[:] = 0
     mark_tiles(projection.rect, np.arange(2), touched)
     lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
@@ -84,10 +87,9 @@ def compile_rasterizer() -> None:
         tiles, tiles_x, lists, blended, np.ones(2, bool), projection.columns, BLACK_BACKGROUND, v_image,
         v_transmittance, pair_gradients,
     )  # fmt: skip
-    splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
-    frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
-    lists.first_pair[:], lists.pairs[:] = 0, 0
+    # Without rows, no kernel is called: two, each of no pair.
+    projection.columns[:], lists.first_pair[:], lists.pairs[:] = 1, 0, 0
     project_backward(
-        np.arange(2, dtype=np.int32), splats, np.zeros(2, np.int32), frames, 3, False, False, projection.columns, lists,
+        np.arange(2, dtype=np.int32), splats, face, frames, 3, False, False, projection.columns, lists,
         pair_gradients, splats, buffers.get("screen_gradient", (2,)),
     )  # fmt: skip

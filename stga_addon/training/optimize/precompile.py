@@ -13,15 +13,7 @@ from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.precompile import rasterizer_helper
-from ...raster.cpu.project import project_forward
-from ...raster.cpu.rasterize import (
-    BufferPool,
-    frames_in_camera,
-    new_projection,
-    render_backward,
-    render_forward,
-    with_strain_color,
-)
+from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
 from ...render.device import adapter_name
 from ...worker.cache import is_preparing
 from . import adam, driven_offsets
@@ -37,7 +29,7 @@ def precompile_kernels(device: str = "cpu") -> None:
     """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate, and the GPU's.
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
-    second process compiles most of the rasterizer at the same time (`raster.cpu.precompile`). While a process compiles
+    second process compiles the rasterizer at the same time (`raster.cpu.precompile`). While a process compiles
     ahead (`perform.preparation`), this one waits for it.
     """
     _await_preparation()
@@ -58,7 +50,6 @@ def _await_preparation() -> None:
 def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
     helper = rasterizer_helper()
-    _project()
     _limit()
     _optimize()
     if helper is not None:
@@ -91,13 +82,6 @@ def _render() -> None:
     rendering = render_forward(state.arrays(), face, seen, 3, focus=np.ones(2, bool))
     gradients = Parameters(*(g.numpy() for g in state.gradients))
     render_backward(rendering, state.arrays(), face, seen, np.zeros_like(rendering.image), gradients)
-
-
-def _project() -> None:
-    state = _pair()
-    splats, face, frames = with_strain_color(state.arrays()), state.face.numpy(), frames_in_camera(WORLD, CAMERA)
-    projection, tiles = new_projection(2, BufferPool()), np.ones((1, 1), bool)
-    project_forward(np.arange(2), tiles, splats, face, frames, 3, False, False, projection)
 
 
 def _optimize() -> None:
