@@ -10,7 +10,7 @@ from .values import Caster, Light
 
 MAP_SIZE = 512
 """Texels a side of a light's shadow map, which just holds the head."""
-LIFT_M = 0.0005
+LIFT_M = 0.001
 """Points are lifted off the surface by as much along its normal, so that it does not shade itself."""
 BIAS_M, MAX_BIAS_M = 0.001, 0.006
 """A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the taps, at most

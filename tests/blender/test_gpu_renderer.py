@@ -218,4 +218,4 @@ def test_light_of_the_scene(mode):
     print(f"{psnr_db(image.rgb, expected.rgb):.1f} dB")
     assert psnr_db(image.rgb, expected.rgb) >= MIN_RELIT_PSNR_DB
     plain = compose([replace(one, relit=None).posed() for one in layers], camera)
-    assert psnr_db(image.rgb, plain.rgb) < 25, "nothing is lit"
+    assert psnr_db(image.rgb, plain.rgb) < 28, "nothing is lit"

@@ -61,6 +61,8 @@ from stga_addon.training.run.folder import read_run
 pytest.importorskip("torch")
 
 CASES = int(os.environ.get("STGA_FUZZ_CASES", 1500))
+PARTS = 10
+"""Tests that the cases are spread over, so that several processes share them."""
 FIRST_CASE = int(os.environ.get("STGA_FUZZ_FIRST", 0))
 MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000
@@ -240,13 +242,14 @@ def call(arguments: list[Any]) -> tuple[Any, str, str]:
 
 
 @pytest.mark.slow
-def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("part", range(PARTS))
+def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
     """Catches tracebacks, other exit codes, long messages, numeric warnings, hangs and files left half-written."""
     case, scratch = folder / "case", folder / "scratch"
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(folder / "start")  # relative names of outputs end up in FOLDER
     failures: dict[str, list[str]] = {}
-    for number in range(FIRST_CASE, FIRST_CASE + CASES):
+    for number in range(FIRST_CASE + part, FIRST_CASE + CASES, PARTS):
         shutil.rmtree(case, ignore_errors=True)
         shutil.rmtree(scratch, ignore_errors=True)
         shutil.copytree(folder / "template", case)

@@ -8,7 +8,7 @@ import { HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE, WET_HIGHLIGHT_SHARE } from './surfa
 export const SURFACE_TEXELS = 4; // color, roughness | irradiance, occlusion | corners | weights
 export const VERTEX_TEXELS = 3; // position | normal | irradiance of the world and of skin around
 export const MAP_SIZE = 512;
-export const LIFT_M = 0.002;
+export const LIFT_M = 0.001;
 
 const PREAMBLE = `#version 300 es
 precision highp float;
