@@ -103,6 +103,13 @@ class Cluster:
             except (OSError, ProcessLookupError):  # it has ended meanwhile
                 continue
 
+    def start_delayed(self) -> None:
+        """Start what waits for its time only: SLURM holds back jobs of a lost node for two minutes."""
+        waiting = self._run("squeue", "--noheader", "--states=PENDING", "--format=%i %r").splitlines()
+        for job, reason in (line.split(maxsplit=1) for line in waiting):
+            if reason == "BeginTime":
+                self._run("scontrol", "update", f"JobId={job}", "StartTime=now")
+
     def stop(self) -> None:
         for process in [*self.nodes.values(), *reversed(self._others)]:
             process.terminate()
@@ -114,10 +121,10 @@ class Cluster:
                 process.wait()
 
     def _idle(self) -> int:
-        done = subprocess.run(
-            ["sinfo", "--noheader", "--Node", "--format=%T"], env=self.variables, capture_output=True, text=True
-        )
-        return done.stdout.split().count("idle")
+        return self._run("sinfo", "--noheader", "--Node", "--format=%T").split().count("idle")
+
+    def _run(self, *command: str) -> str:
+        return subprocess.run(command, env=self.variables, capture_output=True, text=True).stdout
 
     def _spawn(self, command: list[str]) -> subprocess.Popen[bytes]:
         with (self.folder / f"{command[0]}.out").open("ab") as out:

@@ -85,6 +85,8 @@ def test_jobs_of_a_dead_node_resume_elsewhere(
             if node and not killed and (there.out / "train-seed0/checkpoint.npz").exists():
                 on_cluster.kill_node(node)
                 killed.append(node)
+            if killed:
+                on_cluster.start_delayed()
             return found
 
     try:
