@@ -8,7 +8,8 @@ from typing import Any
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.worker.cache import CACHE_VARIABLE, cache_folder, has_kernels
+from ..stga_addon.raster.kernel_cache import has_kernels
+from ..stga_addon.worker.cache import CACHE_VARIABLE, cache_folder
 from ..stga_addon.worker.launch import start_in_background
 from .common import package
 from .training_python import training_python

@@ -11,9 +11,6 @@ KERNELS, BYTECODE, CHARTS = "kernels", "bytecode", "matplotlib"
 """Folders in it: of Numba, of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
 PREPARING = "preparing.lock"
 """Held in it by the process that compiles ahead of a training (`perform.preparation`)."""
-LAST_COMPILED = "raster/cpu/image_loss.py"
-"""Module of a kernel that takes long to compile; its index file shows that kernels are compiled."""
-_PACKAGE = Path(__file__).parents[1]
 
 
 def cache_folder() -> Path:
@@ -24,13 +21,6 @@ def cache_folder() -> Path:
     from platformdirs import user_cache_path  # a Python without it, such as Blender's, has the variable
 
     return user_cache_path("stga", appauthor=False)
-
-
-def has_kernels(folder: Path) -> bool:
-    """Whether a Numba cache below `folder` holds kernels of the package as it is: an update replaces its files."""
-    source = _PACKAGE / LAST_COMPILED
-    indices = folder.rglob(f"{source.stem}.{source.stem}-*.nbi")
-    return any(index.stat().st_mtime >= source.stat().st_mtime for index in indices)
 
 
 def is_preparing() -> bool:

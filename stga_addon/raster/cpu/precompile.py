@@ -13,8 +13,9 @@ import numpy as np
 
 from ...avatar.embedding import WORLD
 from ...capture.camera import Camera
-from ...worker.cache import has_kernels, is_preparing
+from ...worker.cache import is_preparing
 from ...worker.launch import end_with_this_process, same_interpreter_environment
+from ..kernel_cache import has_kernels
 from . import KERNEL_CACHE_FOLDER
 from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, Parameters
