@@ -55,10 +55,10 @@ def test_killed_workers_resume_to_the_same_bits(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     (tmp_path / "whole").mkdir()
     (tmp_path / "killed").mkdir()
-    seeds = max(2, KILLS // 3)
-    whole, plan = tiny_plan(tmp_path / "whole", seeds, iterations=400), None
+    seeds, iterations = max(2, KILLS // 3), max(400, 80 * KILLS)
+    whole, plan = tiny_plan(tmp_path / "whole", seeds, iterations=iterations), None
     carry_out(whole, LocalEngine(2, 8.0, sys.executable))
-    plan = tiny_plan(tmp_path / "killed", seeds, iterations=400)
+    plan = tiny_plan(tmp_path / "killed", seeds, iterations=iterations)
     ended, killed, resumable = threading.Event(), list[str](), list[str]()
     thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
     thread.start()

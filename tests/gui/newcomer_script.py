@@ -17,7 +17,10 @@ from mathutils import Quaternion, Vector
 
 FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
 STEP_S, PATIENCE_S = 0.2, 600.0
+LOOK_S = 10.0
+"""For which a newcomer looks at the head before Train is clicked."""
 JAW_ANGLE, VIDEO_S = 0.3, 2.0
+STARTED = time.monotonic()
 seen: dict[str, Any] = {"version": bpy.app.version_string}
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 monitor = sys.modules[f"{extension}.operators.monitor"]
@@ -83,6 +86,9 @@ def open_demo() -> Iterator[Callable[[], bool]]:
 
 
 def train() -> Iterator[Callable[[], bool]]:
+    clock = Clock()
+    yield lambda: time.monotonic() > clock.begin + LOOK_S
+    seen["clicked_after_start_s"] = round(time.monotonic() - STARTED, 2)
     clock = Clock()
     with viewport():
         bpy.ops.stga.train(directory=chosen().run_folder, minutes=chosen().minutes)
