@@ -77,16 +77,13 @@ def _train(
         has_begun = exists and read_run(out).identity is not None
         identity = check_identity(out, run, capture)
         run = replace(run, identity=identity)
-        report(Progress(message="Compiling kernels"))
-        precompile_kernels(run.device)
         if has_begun and (out / CHECKPOINT).exists():
             session, evaluator = resume_session(capture, out, run, report)
         else:
             if has_begun and selection is None and (out / SELECTION).exists():
                 selection = read_selection(out, len(capture.faces), identity.digest)
             session, evaluator = begin_session(capture, out, run, selection, report)
-        wall_s = evaluator.lines[-1]["wall_s"] if evaluator.lines else 0.0
-        _Loop(session, evaluator, report, perf_counter() - wall_s).work()
+        _Loop(session, evaluator, report).work()
     return out / AVATAR
 
 
@@ -115,11 +112,14 @@ class _Loop:
     session: Session
     evaluator: Evaluator
     report: Report
-    began: float
+    began: float = 0.0
     speed: float = 0.0
 
     def work(self) -> None:
         """Train until the budget is spent, a goal of the settings is reached or the report asks to stop."""
+        self.report(self._progress("Compiling kernels"))  # meanwhile, the splats are shown as they begin
+        precompile_kernels(self.session.run.device)
+        self.began = perf_counter() - (self.evaluator.lines[-1]["wall_s"] if self.evaluator.lines else 0.0)
         if self._is_finished():  # a finished run was resumed
             self._restore_avatar()
             return
