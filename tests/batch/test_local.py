@@ -29,7 +29,7 @@ KILLS = int(os.environ.get("STGA_BATCH_KILLS", 6))
 
 
 def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str], resumable: list[str]) -> None:
-    """Kill workers, none more than three times: in turn at a random moment, and when there is a checkpoint.
+    """Kill workers, none more than four times: in turn at a random moment, and when there is a checkpoint.
 
     resumable: those that had one.
     """
@@ -37,7 +37,7 @@ def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: li
     while len(killed) < kills and not ended.wait(chance.uniform(0.2, 1.5)):
         folders = {job.name: job.request_folder for job in jobs}
         alive = {name: lock_owner(folder / LOCK_FILE) for name, folder in folders.items()}
-        found = [(name, process) for name, process in alive.items() if process and killed.count(name) < 3]
+        found = [(name, process) for name, process in alive.items() if process and killed.count(name) < 4]
         if len(killed) % 2:
             found = [(name, process) for name, process in found if (folders[name].parent / CHECKPOINT).exists()]
         if found:
