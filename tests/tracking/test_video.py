@@ -14,7 +14,7 @@ from .scenes import rig, write_colmap_text
 av = pytest.importorskip("av")
 
 BLOCK, COLUMNS, ROWS = 16, 6, 4
-FRAMES = 75
+FRAMES = 52
 X264 = {"bf": "3", "b_strategy": "0", "g": "12", "keyint_min": "12", "sc_threshold": "0", "crf": "12"}
 OPEN_X264 = X264 | {"x264-params": "open-gop=1:b-adapt=0"}
 OPEN_X265 = {"x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:log-level=0"}
