@@ -173,7 +173,7 @@ def test_image_equals_render_avatar(make, background, losses, tmp_path):
     shown, head = show(avatar)
     camera, mesh = expected_camera(camera_at(), shown), evaluated_vertices(head)
     expected = render_avatar(avatar, mesh, camera, (background,) * 3)
-    assert np.abs(expected - background).max(0).mean() > 0.05, "nothing to compare"
+    assert losses or np.abs(expected - background).max(0).mean() > 0.1, "nothing to compare"
     for lost in losses:
         assert np.abs(expected - render_avatar(lost(avatar), mesh, camera, (background,) * 3)).max() > 2 * TOLERANCE
     assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
