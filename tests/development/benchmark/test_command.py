@@ -36,8 +36,8 @@ def test_slices_are_jobs_of_a_batch(
     command = ["benchmark", str(toy_root), "--out", out, "--seeds", "2", *options]
     assert main([*command, "--dry-run"]) == 0
     printed = capsys.readouterr().out
-    assert re.search(r"benchmark-seed0 +Benchmark +1 thread, 2 GB +2 s\n", printed)
-    assert "2 jobs, 2 to do; 4 s of work" in printed
+    assert re.search(r"benchmark-seed0 +Benchmark +1 thread, 1 GB +1 s\n", printed)
+    assert "2 jobs, 2 to do; 2 s of work" in printed
     assert main(command) == 0
     printed = capsys.readouterr().out
     assert "2 of 2 jobs finished" in printed
