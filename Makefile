@@ -36,8 +36,8 @@ lint-web:
 	npx --yes -p typescript@5.9.3 tsc --noEmit --project $(PLAYER)/jsconfig.json
 
 fuzz: .venv/ready
-	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} STGA_FUZZ_CASES=$${STGA_FUZZ_CASES:-5000} \
-		$(BIN)/python -m pytest tests/fuzz tests/numerics/test_generated.py
+	STGA_FUZZ_SECONDS=$${STGA_FUZZ_SECONDS:-300} STGA_FUZZ_CASES=$${STGA_FUZZ_CASES:-20000} \
+		$(BIN)/python -m pytest $(PARALLEL) tests/fuzz tests/numerics/test_generated.py
 
 extension: .venv/ready
 	$(BIN)/python -m stga_addon.development.package --out dist

@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.transforms import camera_entry
 from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.files import write_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
@@ -116,13 +117,7 @@ def write_footage(
                     "file_path": path.relative_to(folder).as_posix(),
                     "timestep_index": timestep,
                     "camera_id": f"cam{number}",
-                    "transform_matrix": camera.camera_to_world_gl.tolist(),
-                    "w": camera.width,
-                    "h": camera.height,
-                    "fl_x": camera.fl_x,
-                    "fl_y": camera.fl_y,
-                    "cx": camera.cx,
-                    "cy": camera.height - camera.cy,
+                    **camera_entry(camera),
                 }
             )
     write_json(folder / "transforms.json", {"frames": frames})

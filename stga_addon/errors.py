@@ -2,6 +2,8 @@
 
 import re
 import reprlib
+import sys
+from collections.abc import Callable
 
 MAX_MESSAGE_CHARACTERS = 1000
 MAX_VALUE_CHARACTERS = 80
@@ -31,6 +33,16 @@ class DeviceError(StgaError):
     def __init__(self, cause: str, advice: str) -> None:
         super().__init__(f"--device gpu: {cause}; {advice}")
         self.cause = one_line(cause)
+
+
+def exit_code(work: Callable[[], object]) -> int:
+    """Of a program that does this work: 0, or 2 after a StgaError, whose sentence goes to stderr."""
+    try:
+        work()
+    except StgaError as error:
+        print(f"stga: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 def one_line(message: str) -> str:

@@ -1,4 +1,4 @@
-"""Atomic file writes and bounded reads of JSON and npz."""
+"""Atomic file writes and bounded reads of JSON, TOML and npz."""
 
 import ctypes
 import json
@@ -10,6 +10,7 @@ import secrets
 import stat
 import struct
 import time
+import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -24,6 +25,7 @@ import numpy as np
 from .errors import StgaError
 
 MAX_JSON_BYTES = 256 << 20
+MAX_TOML_BYTES = 16 << 20
 MAX_COMPRESSION = 16
 """Unpacked bytes per byte of an npz; Deflate reaches 1030, arrays of numbers reach 5."""
 MIN_NPZ_ALLOWANCE_BYTES = 128 << 20
@@ -199,15 +201,25 @@ def file_size(path: Path) -> int:
 
 def read_json(path: Path) -> Any:
     """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing, malformed or above 256 MiB."""
+    return _parsed(path, "JSON", MAX_JSON_BYTES, parse_json)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file. Raises StgaError naming the file where it is missing, malformed or above 16 MiB."""
+    found: dict[str, Any] = _parsed(path, "TOML", MAX_TOML_BYTES, lambda data: tomllib.loads(data.decode("utf-8")))
+    return found
+
+
+def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) -> Any:
     size = file_size(path)
-    if size > MAX_JSON_BYTES:
-        raise StgaError(f"{path}: has {size} bytes, more than the {MAX_JSON_BYTES} allowed")
+    if size > limit:
+        raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
     try:
-        return parse_json(path.read_bytes())
+        return parse(path.read_bytes())
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, RecursionError) as error:
-        raise StgaError(f"{path}: is not valid JSON ({error})") from error
+        raise StgaError(f"{path}: is not valid {form} ({error})") from error
 
 
 def parse_json(data: bytes) -> Any:

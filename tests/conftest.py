@@ -42,6 +42,20 @@ def toy(toy_root: Path) -> Capture:
 
 
 @pytest.fixture(scope="session")
+def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """footage/ of the demo's head in gray, head.npz and its exact landmarks points/; for tests that only read it."""
+    from tracking.test_track import record
+
+    from stga_addon.development.demo.head import synthetic_flame
+    from stga_addon.tracking.head_model import HeadModel
+    from stga_addon.tracking.mesh_image import shaded_image
+
+    folder, head = tmp_path_factory.mktemp("take"), HeadModel(synthetic_flame(0), "flame")
+    record(folder, head, lambda mesh, camera: shaded_image(mesh, head.model.faces, camera))
+    return folder
+
+
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of development data (studio_head, raster_reference, …), which is not part of the project."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -23,7 +23,6 @@ Paths are relative to the plan's folder; where a request writes, to the job's ow
 
 import os
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from graphlib import CycleError, TopologicalSorter
@@ -33,13 +32,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError, shorten
-from ..files import file_size
+from ..files import read_toml
 from ..requests.values import Request
 from ..schema import complaint, from_json, to_json
 from ..training.settings import TrainingSettings, make_settings
 from .job import KINDS, Job, Resources, input_paths, is_path, output_field
 
-MAX_PLAN_BYTES = 16 << 20
 MAX_JOBS = 100_000
 PLAN_KEYS = ("out", "resources", "job")
 TABLE_KEYS = ("request", "sweep", "cases", "after", "resources", "minutes")
@@ -77,16 +75,7 @@ class _Variant:
 
 def read_plan(path: Path) -> Plan:
     """Raises StgaError naming file, table and key of the first mistake."""
-    size = file_size(path)
-    if size > MAX_PLAN_BYTES:
-        raise StgaError(f"{path}: has {size} bytes, more than the {MAX_PLAN_BYTES} allowed")
-    try:
-        values = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, RecursionError) as error:
-        raise StgaError(f"{path}: is not valid TOML ({error})") from error
-    return make_plan(values, path.resolve().parent, str(path))
+    return make_plan(read_toml(path), path.resolve().parent, str(path))
 
 
 def plan_of_captures(

@@ -1,4 +1,4 @@
-"""Reading of cameras and frames: `transforms_{train,val,test}.json` or `transforms.json`."""
+"""Cameras and frames: `transforms_{train,val,test}.json` or `transforms.json`."""
 
 import itertools
 import math
@@ -44,6 +44,19 @@ class Frame:
     mesh: Path | None
     flame: Path | None
     where: str
+
+
+def camera_entry(camera: Camera) -> dict[str, Any]:
+    """A camera as an entry of a transforms file has it; cy is counted from the bottom, as VHAP writes it."""
+    return {
+        "transform_matrix": camera.camera_to_world_gl.tolist(),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.height - camera.cy,
+    }
 
 
 @dataclass(frozen=True)

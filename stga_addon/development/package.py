@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from ..errors import StgaError
+from ..errors import StgaError, exit_code
 from ..files import replacing
 from .demo.capture import CaptureOptions, make_capture
 from .editions import DEMO_FOLDER, PLATFORM, SMALL, Edition, complete, edition_manifest
@@ -172,13 +172,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--edition", choices=("small", "platform", "complete"), default="small")
     parser.add_argument("--blender", default="", help="complete: for the Python of this Blender, and no other")
     parser.add_argument("--all", action="store_true", help="complete: for every platform, not only this one")
-    try:
-        for path in build_editions(parser.parse_args(arguments)):
+    options = parser.parse_args(arguments)
+
+    def build() -> None:
+        for path in build_editions(options):
             print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
-    except StgaError as error:
-        print(f"stga: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    return exit_code(build)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,12 @@ import json
 import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import StgaError
+from ..errors import StgaError, exit_code
 
 INDEX, PAGE = "index.json", "index.html"
 TEXT = """<!DOCTYPE html>
@@ -90,12 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     built = sorted(path for path in options.zips.glob("*.zip") if not path.stem.endswith("-platform"))
     # One edition: Blender takes two zips of one version, platform and range for a mistake.
     zips = [path for path in built if "-py" in path.stem] or built
-    try:
-        print(write_repository(zips, options.out, shlex.split(options.blender)))
-    except StgaError as error:
-        print(f"stga: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return exit_code(lambda: print(write_repository(zips, options.out, shlex.split(options.blender))))
 
 
 if __name__ == "__main__":

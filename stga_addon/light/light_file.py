@@ -1,6 +1,5 @@
 """Light from a file: an environment (.hdr), or lights as text (.toml)."""
 
-import tomllib
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import file_size
+from ..files import read_toml
 from ..schema import from_json, setting
 from .environment import read_hdr, split_environment
 from .harmonics import rotated, uniform
@@ -66,13 +65,7 @@ def read_lighting(path: Path) -> Lighting:
         return Lighting(world, suns)
     if suffix != ".toml":
         raise StgaError(f"{path}: expected light as an environment (.hdr) or a list of lights (.toml)")
-    file_size(path)
-    try:
-        values = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, RecursionError) as error:
-        raise StgaError(f"{path}: is not valid TOML ({error})") from error
+    values = read_toml(path)
     try:
         entries = values.get("lights", [])
         if isinstance(entries, list):

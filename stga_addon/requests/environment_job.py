@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import StgaError
+from ..errors import StgaError, exit_code
 from ..files import write_json
 from ..worker.environment import (
     ADAPTERS_FILE,
@@ -149,12 +149,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check = top.add_subparsers(required=True).add_parser("check")
     check.add_argument("folder", type=Path)
     check.add_argument("python")
-    try:
-        print(check_in_worker(**vars(top.parse_args(arguments))))
-    except StgaError as error:
-        print(f"stga: {error}", file=sys.stderr)
-        return 2
-    return 0
+    options = vars(top.parse_args(arguments))
+    return exit_code(lambda: print(check_in_worker(**options)))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import StgaError
+from ..errors import StgaError, exit_code
 from ..worker.environment import environment_number, environments, status_folder, venv_python
 from ..worker.environment_use import READY
 from ..worker.requirements import DETECTOR_REQUIREMENTS, GPU_REQUIREMENT, REQUIREMENTS, TRACKING_REQUIREMENTS
@@ -156,12 +156,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     top.add_argument("--python", default=sys.executable)
     top.add_argument("--wheels", type=Path)
     top.add_argument("--tracking", action="store_true")
-    try:
-        print(make_environment(**vars(top.parse_args(arguments))))
-    except StgaError as error:
-        print(f"stga: {error}", file=sys.stderr)
-        return 2
-    return 0
+    options = vars(top.parse_args(arguments))
+    return exit_code(lambda: print(make_environment(**options)))
 
 
 if __name__ == "__main__":

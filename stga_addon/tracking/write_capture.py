@@ -10,6 +10,7 @@ from PIL import Image
 
 from ..capture.camera import Camera
 from ..capture.flame_capture import CANONICAL_NAME, PARAMETERS
+from ..capture.transforms import camera_entry
 from ..files import replacing, write_json, write_npz
 from ..flame.forward import FlameFrame, flame_forward
 from ..flame.sequence import FRAME_FIELDS
@@ -86,13 +87,7 @@ def _entry(out: Path, timestep: int, source: FootageCamera, number: int, camera:
         "camera_index": number,
         "camera_id": source.name,
         "file_path": name,
-        "transform_matrix": camera.camera_to_world_gl.tolist(),
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fl_x,
-        "fl_y": camera.fl_y,
-        "cx": camera.cx,
-        "cy": camera.height - camera.cy,  # counted from the bottom, as VHAP writes it
+        **camera_entry(camera),
     }
     mask = source.mask(timestep)
     if mask is not None:

@@ -18,13 +18,14 @@ from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE
 
+from .conftest import TrainedHere
 from .simulated import carry_out
-from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
+from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
-KILLS = int(os.environ.get("STGA_BATCH_KILLS", 6))
+KILLS = int(os.environ.get("STGA_BATCH_KILLS", 4))
 """Workers that are killed; 20 in the measurement of docs/batch.md."""
 
 
@@ -50,15 +51,13 @@ def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: li
             resumable += [name] if (folders[name].parent / CHECKPOINT).exists() else []
 
 
-def test_killed_workers_resume_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_workers_resume_to_the_same_bits(
+    tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
-    (tmp_path / "whole").mkdir()
-    (tmp_path / "killed").mkdir()
-    seeds, iterations = max(2, KILLS // 3), max(400, 80 * KILLS)
-    whole, plan = tiny_plan(tmp_path / "whole", seeds, iterations=iterations), None
-    carry_out(whole, LocalEngine(2, 8.0, sys.executable))
-    plan = tiny_plan(tmp_path / "killed", seeds, iterations=iterations)
+    seeds, iterations = max(2, KILLS // 3), max(ITERATIONS, 80 * KILLS)
+    whole, plan = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
     ended, killed, resumable = threading.Event(), list[str](), list[str]()
     thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
     thread.start()

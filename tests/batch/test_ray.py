@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from stga_addon.batch.engines import ray as ray_engine
-from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.engines.table import make_engine
 from stga_addon.errors import StgaError
 
-from .simulated import carry_out
-from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
+from .conftest import TrainedHere
+from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = """
@@ -35,7 +34,7 @@ for token, code in ((os.environ["RAY_AUTH_TOKEN"], 0), ("0" * 64, 1)):
     asked = subprocess.run([sys.executable, "-c", look], env=variables, capture_output=True, text=True, timeout=120)
     assert asked.returncode == code, asked
     assert ("InvalidAuthToken" in asked.stderr) == bool(code), asked
-batch, _ = carry_out(tiny_plan(Path(sys.argv[2]), iterations=100), engine)
+batch, _ = carry_out(tiny_plan(Path(sys.argv[2]), seeds=1), engine)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
 NODES = """
@@ -53,7 +52,7 @@ from stga_addon.worker.status import LOCK_FILE
 kills, seeds, size = int(sys.argv[3]), int(sys.argv[4]), {"num_cpus": 1, "object_store_memory": 80_000_000}
 cluster = Cluster(initialize_head=True, head_node_args={**size, "num_cpus": 0})
 nodes = [cluster.add_node(**size) for _ in range(2)]
-plan = tiny_plan(Path(sys.argv[2]), seeds, iterations=int(sys.argv[5]))
+plan = tiny_plan(Path(sys.argv[2]), seeds, int(sys.argv[5]))
 chance, killed, engine = random.Random(5), 0, make_engine("ray", cluster.address)
 with ThreadPoolExecutor(1) as pool:
     running = pool.submit(carry_out, plan, engine)
@@ -82,39 +81,31 @@ def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path) -> None:
+def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: TrainedHere) -> None:
     """Catches a cluster with a token that cannot be used, jobs that are lost with a node, and two workers on one."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
-    for name in ("local", "ray"):
-        (tmp_path / name).mkdir()
-    seeds, iterations = max(2, KILLS // 2), max(600, 200 * KILLS)
+    seeds, iterations = max(2, KILLS // 2), max(ITERATIONS, 200 * KILLS)
     variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "STGA_CHECKPOINT_S": "0.3"}
-    killed, states = run_script(NODES, tmp_path / "ray", KILLS, seeds, iterations, **variables)[-2:]
+    killed, states = run_script(NODES, tmp_path, KILLS, seeds, iterations, **variables)[-2:]
     names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))
     assert states == str([(name, "finished", "") for name in names])
     print(killed)
     assert int(killed.split()[0]) >= KILLS // 2
-    here, there = (tiny_plan(tmp_path / name, seeds, iterations=iterations) for name in ("local", "ray"))
-    carry_out(here, LocalEngine(2, 8.0))
+    here, there = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
     for seed in range(seeds):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
 
 
 @pytest.mark.slow
-def test_same_results_through_ray(tmp_path: Path) -> None:
+def test_same_results_through_ray(tmp_path: Path, trained_here: TrainedHere) -> None:
     """Catches a job that trains something else through Ray, and a cluster that anyone on this machine may use."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
-    for name in ("local", "ray"):
-        (tmp_path / name).mkdir()
-    printed = run_script(BATCH, tmp_path / "ray")
-    names = ("evaluate-seed0", "evaluate-seed1", "train-seed0", "train-seed1")
-    assert printed[-1] == str([(name, "finished", "") for name in names])
-    here, there = (tiny_plan(tmp_path / name, iterations=100) for name in ("local", "ray"))
-    carry_out(here, LocalEngine(2, 8.0))
-    for seed in range(2):
-        assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
+    printed = run_script(BATCH, tmp_path)
+    assert printed[-1] == str([(name, "finished", "") for name in ("evaluate-seed0", "train-seed0")])
+    there = tiny_plan(tmp_path, seeds=1)
+    assert splats_of(there, "train-seed0") == splats_of(trained_here(), "train-seed0")
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from stga_addon.batch.engines import slurm
-from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.engines.slurm import SlurmEngine
 from stga_addon.batch.engines.table import make_engine
 from stga_addon.batch.run import JobState
@@ -16,6 +15,7 @@ from stga_addon.errors import StgaError
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE
 
+from .conftest import TrainedHere
 from .simulated import carry_out, empty_jobs
 from .slurm_cluster import Cluster, missing_programs, running_cluster
 from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
@@ -36,16 +36,14 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 def on_cluster(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
     for name in ("PATH", "SLURM_CONF"):
         monkeypatch.setenv(name, cluster.variables[name])
+    monkeypatch.setattr(SlurmEngine, "interval_s", 0.5)
     return cluster
 
 
-def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
+def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere) -> None:
     """Catches jobs that begin before those they come after, or train something else than on this machine; and a killed
     worker whose job is lost."""
-    for name in ("local", "slurm"):
-        (tmp_path / name).mkdir()
-    here, there = (tiny_plan(tmp_path / name, iterations=200) for name in ("local", "slurm"))
-    carry_out(here, LocalEngine(2, 8.0))
+    there = tiny_plan(tmp_path)
     machines: set[str] = set()
     killed: list[int] = []
 
@@ -65,17 +63,15 @@ def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None
     assert killed
     assert machines == {"one", "two"}
     for seed in range(2):
-        assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
+        assert splats_of(there, f"train-seed{seed}") == splats_of(trained_here(), f"train-seed{seed}")
 
 
 def test_jobs_of_a_dead_node_resume_elsewhere(
-    on_cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a job that is lost with its machine, or is another one when it was resumed on the next."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
-    for name in ("local", "slurm"):
-        (tmp_path / name).mkdir()
-    here, there = (tiny_plan(tmp_path / name, iterations=500) for name in ("local", "slurm"))
+    there = tiny_plan(tmp_path)
     killed: list[str] = []
 
     class Watched(SlurmEngine):
@@ -96,9 +92,8 @@ def test_jobs_of_a_dead_node_resume_elsewhere(
             on_cluster.start_node(node)
     assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}, batch.failures
     assert killed
-    carry_out(here, LocalEngine(2, 8.0))
     for seed in range(2):
-        assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
+        assert splats_of(there, f"train-seed{seed}") == splats_of(trained_here(), f"train-seed{seed}")
 
 
 def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from capture.factory import write_mesh_capture
 
@@ -20,10 +19,12 @@ from stga_addon.worker.status import read_status
 
 ROOT = Path(__file__).resolve().parents[2]
 
-SETTINGS = {"strategy": "selective", "iterations": 40, "hull_points": False}
+ITERATIONS = 400
+"""Some seconds of training, so that workers and machines can be killed between checkpoints."""
+SETTINGS = {"strategy": "selective", "hull_points": False}
 
 
-def tiny_plan(base: Path, seeds: int = 2, **settings: Any) -> Plan:
+def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
     """Trainings of one capture with several seeds, and an evaluation after each; results into `base`/runs."""
     if not (base / "capture").exists():
         write_mesh_capture(base / "capture", (0, 1, 3, 4), range(4))
@@ -32,7 +33,7 @@ def tiny_plan(base: Path, seeds: int = 2, **settings: Any) -> Plan:
         "capture": "capture",
         "principal_point": "opencv",
         "device": "cpu",
-        "settings": {**SETTINGS, **settings},
+        "settings": {**SETTINGS, "iterations": iterations},
         "sweep": {"settings.seed": list(range(seeds))},
         "minutes": 0.1,
     }

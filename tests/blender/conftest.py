@@ -1,10 +1,15 @@
-"""An empty Blender file for every test, and the checkout as an extension."""
+"""An empty Blender file for every test, the checkout as an extension, and what is built from it."""
 
 import importlib.util
 import sys
 from pathlib import Path
 
 import pytest
+from capture.factory import write_flame_capture
+
+from stga_addon.capture.flame_capture import OWN_MODELS
+from stga_addon.development.package import build_zip, fetch_wheels
+from stga_addon.errors import StgaError
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -26,3 +31,21 @@ def extension():
     module.register()
     yield module
     module.unregister()
+
+
+@pytest.fixture(scope="session")
+def zip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built zip of the small edition."""
+    try:
+        fetch_wheels(ROOT / "wheels")
+    except StgaError as error:
+        pytest.skip(f"wheels not present and not downloadable: {error}")
+    return build_zip(tmp_path_factory.mktemp("dist"))
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture that holds its FLAME file, in place of the demo in a zip of the complete edition."""
+    folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
+    model.rename(folder / OWN_MODELS[0])
+    return folder

@@ -20,7 +20,6 @@ from stga_addon.training.settings import PRESETS  # noqa: E402
 @pytest.fixture
 def chosen(extension, tmp_path):
     """The scene's settings, with a head of a toy capture."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     root = write_mesh_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(root))
     return bpy.context.scene.stga
@@ -30,13 +29,13 @@ def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
     """Catches an empty analysis, choices that are lost by analyzing again, and ones that training does not get."""
     from types import SimpleNamespace
 
+    row = chosen.effects.add()  # as an earlier analysis leaves it
+    row.name, row.choice = "strain-color", "on"
     assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
     rows = {row.name: row for row in chosen.effects}
+    assert len(rows) == len(chosen.effects) > 2
     assert (rows["exposure"].on, rows["exposure"].choice) == (False, "auto")
     assert "255 levels" in rows["exposure"].reason
-    rows["strain-color"].choice = "on"
-    assert bpy.ops.stga.analyze_capture() == {"FINISHED"}
-    rows = {row.name: row for row in chosen.effects}
     assert (rows["strain-color"].on, rows["strain-color"].choice) == (True, "on")
     effects = " ".join(extension.operators.analyze.chosen_effects(SimpleNamespace(effects=chosen.effects)))
     assert effects == "strain-color=on"

@@ -13,6 +13,8 @@ from PIL import Image  # noqa: E402
 
 from stga_addon.tracking.footage.open import open_footage  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("extension")
+
 WIDTH, HEIGHT = 64, 48
 
 
@@ -37,11 +39,6 @@ def scene_with_cameras():
     parent.scale, parent.location = (2, 2, 2), (0.1, 0, 0)
     add_camera("on rail", (0.6, -0.5, 0.1)).parent = parent
     bpy.context.view_layer.update()
-
-
-@pytest.fixture(autouse=True)
-def _empty_scene(extension):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
 def test_points_project_as_in_blender(tmp_path):

@@ -10,18 +10,14 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
-from tracking.test_track import record  # noqa: E402
 
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
 from stga_addon.export.ply import read_ply  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
-from stga_addon.tracking.head_model import HeadModel  # noqa: E402
-from stga_addon.tracking.mesh_image import shaded_image  # noqa: E402
 
 
 @pytest.fixture
@@ -196,11 +192,9 @@ def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_p
 
 
 @pytest.mark.slow
-def test_an_avatar_from_footage(stga, bare, tmp_path, capfd):
+def test_an_avatar_from_footage(stga, bare, take, tmp_path, capfd):
     """Catches a .blend file that is missing because the training environment has no Blender, or one without links."""
-    head = HeadModel(synthetic_flame(0), "flame")
-    record(tmp_path, head, lambda mesh, camera: shaded_image(mesh, head.model.faces, camera))
-    given = [tmp_path / "footage", "--model", tmp_path / "head.npz", "--landmarks", tmp_path / "points"]
+    given = [take / "footage", "--model", take / "head.npz", "--landmarks", take / "points"]
     more = ["--iterations", "4", "--effect", "tracking=on"]
     bare()
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0

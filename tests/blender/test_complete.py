@@ -12,9 +12,7 @@ import pytest
 
 pytest.importorskip("bpy")
 
-from capture.factory import write_flame_capture
 
-from stga_addon.capture.flame_capture import OWN_MODELS
 from stga_addon.development.editions import complete
 from stga_addon.development.package import build_zip, wheel_folder
 from stga_addon.development.wheels import Target, check_wheels, collect_wheels, this_platform
@@ -77,13 +75,6 @@ print("RESULT " + json.dumps(result))
 @pytest.fixture(scope="module")
 def target() -> Target:
     return Target(this_platform(), f"{sys.version_info[0]}.{sys.version_info[1]}", ("4.2.0", "5.1.0"))
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
-    model.rename(folder / OWN_MODELS[0])
-    return folder
 
 
 @pytest.fixture(scope="module")

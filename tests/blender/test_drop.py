@@ -9,17 +9,14 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 
 from .test_import_operators import ball_avatar, write_motion  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("extension")
+
 HANDLERS = {
     "STGA_FH_capture": (".json", "stga.import_capture"),
     "STGA_FH_performance": (".csv;.json;.txt", "stga.apply_motion"),
     "STGA_FH_npz": (".npz", "stga.open_npz"),
     "STGA_FH_ply": (".ply", "stga.import_ply"),
 }
-
-
-@pytest.fixture(autouse=True)
-def _empty_scene(extension):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
 @pytest.fixture

@@ -33,7 +33,6 @@ def demo_head(extension, tmp_path: Path):
         with np.load(file) as found:  # its offsets are those of another mesh
             kept = {name: found[name] for name in found.files if name != "static_offset"}
         np.savez(file, **kept)
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     assert bpy.ops.stga.import_capture(directory=str(folder), flame=str(model)) == {"FINISHED"}
     capture = open_capture(folder, model)
     neutral = capture.neutral.astype(np.float32)

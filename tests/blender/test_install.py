@@ -16,19 +16,10 @@ from stga_addon import __version__
 from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
-from stga_addon.development.package import WHEELS, build_zip, extension_files, fetch_wheels, read_manifest
+from stga_addon.development.package import WHEELS, build_zip, extension_files, read_manifest
 from stga_addon.errors import StgaError
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def zip_file(tmp_path_factory) -> Path:
-    try:
-        fetch_wheels(ROOT / "wheels")
-    except StgaError as error:
-        pytest.skip(f"wheels not present and not downloadable: {error}")
-    return build_zip(tmp_path_factory.mktemp("dist"))
 
 
 def run(script: str, *arguments: object, home: Path) -> str:

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
+from stga_addon.capture.model import Capture  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.export.formats import export_avatar  # noqa: E402
@@ -30,6 +32,8 @@ from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 
 from .captures import closure  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("extension")
 
 OPERATORS = (
     "track_footage",
@@ -67,14 +71,26 @@ OPERATORS = (
 )
 
 
-@pytest.fixture(autouse=True)
-def _empty_scene(extension):
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-
-
 @pytest.fixture
 def mesh_capture(tmp_path) -> Path:
     return write_mesh_capture(tmp_path / "capture")
+
+
+@pytest.fixture
+def shown(mesh_capture, tmp_path) -> tuple[Capture, Avatar]:
+    """A mesh capture whose head is in the scene, and the avatar of avatar.npz, which is shown on it."""
+    bpy.ops.stga.import_capture(directory=str(mesh_capture))
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz")) == {"FINISHED"}
+    return open_capture(mesh_capture), avatar
+
+
+def assert_follow(capture: Capture, avatar: Avatar, timesteps: Iterable[int]) -> None:
+    """The splats in the scene are where the capture's meshes of these timesteps carry them."""
+    for timestep in timesteps:
+        bpy.context.scene.frame_set(timestep)
+        xyz, _, _ = evaluated_splats(bpy.context.scene.stga.splats)
+        np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5)
 
 
 def registered(name: str) -> bool:
@@ -199,8 +215,7 @@ def test_mesh_capture_from_import_to_show(extension, mesh_capture, tmp_path):
 
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz")) == {"FINISHED"}
-    xyz, _, _ = evaluated_splats(scene.stga.splats)
-    np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(3)).xyz, atol=1e-5)
+    assert_follow(capture, avatar, [3])
 
 
 def test_flame_capture_from_import_to_show(extension, tmp_path):
@@ -215,19 +230,12 @@ def test_flame_capture_from_import_to_show(extension, tmp_path):
     assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz")) == {"FINISHED"}
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "flame.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "flame.blend"))
-    scene = bpy.context.scene
-    for timestep in capture.timesteps:
-        scene.frame_set(timestep)
-        xyz, _, _ = evaluated_splats(scene.stga.splats)
-        np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5)
+    assert_follow(capture, avatar, capture.timesteps)
 
 
-def test_exports_read_back(extension, mesh_capture, tmp_path):
+def test_exports_read_back(shown, tmp_path):
     """Catches exports of the neutral pose, of the wrong frame, or in the head's turned world axes."""
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
-    avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    capture = open_capture(mesh_capture)
+    capture, avatar = shown
     bpy.context.scene.frame_set(3)
     assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "one.ply"), format="ply") == {"FINISHED"}
     at_3 = expected_world(avatar, capture.mesh(3)).xyz
@@ -241,39 +249,32 @@ def test_exports_read_back(extension, mesh_capture, tmp_path):
         bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
 
 
-def test_exports_for_other_tools(extension, mesh_capture, tmp_path):
+def test_exports_for_other_tools(shown, tmp_path):
     """Catches formats that Blender cannot write, frames left out, and a rate that is not the scene's."""
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
-    avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    capture, avatar = shown
     bpy.context.scene.render.fps = 30
-    for name in ("a.usdz", "a.glb", "a.spz"):
-        format = {"usdz": "usd", "glb": "gltf", "spz": "spz"}[name.partition(".")[2]]
+    for name, format in {"a.usdz": "usd", "a.glb": "gltf", "a.spz": "spz"}.items():
         assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / name), format=format) == {"FINISHED"}
         assert (tmp_path / name).stat().st_size > 0
     stage = usd.Stage.Open(str(tmp_path / "a.usdz"))
     assert stage.GetTimeCodesPerSecond() == 30
     positions = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions")
     assert positions.GetTimeSamples() == [0, 1, 2, 3]
-    capture = open_capture(mesh_capture)
     for frame in capture.timesteps:
         expected = expected_world(avatar, capture.mesh(frame)).xyz
         np.testing.assert_allclose(positions.Get(frame), expected, atol=1e-5)
 
 
-def test_export_of_a_web_page(extension, mesh_capture, tmp_path):
+def test_export_of_a_web_page(shown, tmp_path):
     """Catches a page of other frames than the scene's, at another rate, or seen from elsewhere than its camera."""
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene
     scene.render.fps, scene.frame_start = 30, 1
     assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web") == {"FINISHED"}
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert header["fps"] == 30
     assert len(arrays["translation"]) == 3
-    centers = [open_capture(mesh_capture).mesh(timestep).mean(0) for timestep in (1, 3)]
+    centers = [shown[0].mesh(timestep).mean(0) for timestep in (1, 3)]
     np.testing.assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
     camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
     head_to_camera = np.array(scene.camera.matrix_world.inverted() @ scene.stga.head.matrix_world)
@@ -368,21 +369,23 @@ def test_import_ply(extension, tmp_path, up):
     assert len(evaluated_splats(shown)[0]) == len(splats)
 
 
-def test_mistakes_are_sentences(extension, mesh_capture, tmp_path):
+@pytest.mark.parametrize(
+    ("operator", "arguments", "sentence"),
+    [
+        ("import_capture", {"directory": "{folder}/nowhere"}, r"^Error: .*nowhere: is not a folder"),
+        ("import_capture", {}, "no path given"),
+        ("import_capture", {"directory": "//capture"}, "has not been saved yet"),
+        ("import_capture", {"directory": "{folder}/capture"}, r"00003\.obj"),
+        ("import_ply", {"filepath": "{folder}/broken.ply"}, r"broken.ply: is not a PLY file"),
+    ],
+)
+def test_mistakes_are_sentences(extension, mesh_capture, tmp_path, operator, arguments, sentence):
     """Catches tracebacks, silence, and objects left behind by an import that failed."""
-    with pytest.raises(RuntimeError, match=r"^Error: .*nowhere: is not a folder"):
-        bpy.ops.stga.import_capture(directory=str(tmp_path / "nowhere"))
-    with pytest.raises(RuntimeError, match="no path given"):
-        bpy.ops.stga.import_capture()
-    with pytest.raises(RuntimeError, match="has not been saved yet"):
-        bpy.ops.stga.import_capture(directory="//capture")
     (mesh_capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
-    with pytest.raises(RuntimeError, match=r"00003\.obj"):
-        bpy.ops.stga.import_capture(directory=str(mesh_capture))
-    assert not bpy.data.objects
     (tmp_path / "broken.ply").write_bytes(b"ply\n")
-    with pytest.raises(RuntimeError, match=r"broken.ply: is not a PLY file"):
-        bpy.ops.stga.import_ply(filepath=str(tmp_path / "broken.ply"))
+    with pytest.raises(RuntimeError, match=sentence):
+        getattr(bpy.ops.stga, operator)(**{name: text.format(folder=tmp_path) for name, text in arguments.items()})
+    assert not bpy.data.objects
 
 
 def test_a_capture_that_is_gone_is_named(extension, mesh_capture):
@@ -421,27 +424,18 @@ def test_standard_view(extension):
     assert bpy.context.scene.view_settings.view_transform == "Standard"
 
 
-def test_a_hidden_head_still_moves_its_splats(extension, mesh_capture, tmp_path):
+def test_a_hidden_head_still_moves_its_splats(shown):
     """Catches splats that stand still once the mesh below them is hidden, as show does."""
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
-    avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    scene, capture = bpy.context.scene, open_capture(mesh_capture)
+    scene = bpy.context.scene
     assert scene.stga.head.hide_render
     assert not scene.stga.head.visible_get()
-    for timestep in (3, 0, 1):
-        scene.frame_set(timestep)
-        xyz, _, _ = evaluated_splats(scene.stga.splats)
-        np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5)
+    assert_follow(*shown, (3, 0, 1))
 
 
-def test_show_selection_after_select(extension, mesh_capture, tmp_path):
+def test_show_selection_after_select(shown):
     """Catches the two sides of the vertex groups' name and weight drifting apart: Python writes, nodes read."""
-    bpy.ops.stga.import_capture(directory=str(mesh_capture))
     bpy.ops.stga.select(threshold=0.0015)
-    avatar = write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    scene = bpy.context.scene
+    scene, (_, avatar) = bpy.context.scene, shown
     set_input(scene.stga.splats, splat_nodes.DISPLAY, POINTS)
     set_input(scene.stga.splats, splat_nodes.SHOW_SELECTION, True)
     scene.frame_set(3)

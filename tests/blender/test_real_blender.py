@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from capture.factory import write_flame_capture
 
 from stga_addon import __version__
-from stga_addon.capture.flame_capture import OWN_MODELS
 from stga_addon.development.editions import complete
 from stga_addon.development.package import ROOT, build_zip, target_of, wheel_folder
 from stga_addon.development.wheels import collect_wheels
@@ -82,13 +80,6 @@ def files_of(home: Path) -> set[str]:
     # Of modules of a single file, such as typing_extensions.py, Blender leaves what its own Python has compiled.
     names = {name for name in names if "/site-packages/__pycache__/" not in name}
     return {name for name in names if not name.startswith(own) or any(part in name for part in extension)}
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
-    model.rename(folder / OWN_MODELS[0])
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon import __version__
-from stga_addon.development.package import ROOT, build_zip, fetch_wheels
+from stga_addon.development.package import ROOT
 from stga_addon.development.repository import INDEX, PAGE, write_repository
 from stga_addon.errors import StgaError
 
@@ -35,15 +35,9 @@ ITERATIONS = 150
 
 
 @pytest.fixture(scope="module")
-def zips(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The built zip, and one that says that it is older."""
-    try:
-        fetch_wheels(ROOT / "wheels")
-    except StgaError as error:
-        pytest.skip(f"wheels not present and not downloadable: {error}")
-    new = build_zip(tmp_path_factory.mktemp("new"))
-    old = with_version(new, OLD_VERSION, tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip")
-    return old, new
+def zips(zip_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The built zip, after one that says that it is older."""
+    return with_version(zip_file, OLD_VERSION, tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip"), zip_file
 
 
 @pytest.fixture

@@ -33,11 +33,6 @@ from stga_addon.scene.display.splat_object import (  # noqa: E402
 FRAMES = (1, 5, 9)
 
 
-@pytest.fixture(autouse=True)
-def _empty_scene():
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-
-
 def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]:
     """Head-sized triangles (V, 3), (F, 3), a meter from the origin, each starting at a random one of its corners."""
     rng = np.random.default_rng(0)

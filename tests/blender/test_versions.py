@@ -21,8 +21,6 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
-from stga_addon.development.package import ROOT, build_zip, fetch_wheels
-from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.sequence import read_motion
@@ -31,15 +29,6 @@ from stga_addon.worker.environment import missing_packages
 # bpy that the tests themselves run in, and others: (version, the variable with the path of a Python that has it)
 TRAINING_PYTHON = "" if missing_packages() else sys.executable
 VERSIONS = {"this": None, "4.2": "STGA_BPY_4_2", "4.5": "STGA_BPY_4_5", "5.2": "STGA_BPY_5_2"}
-
-
-@pytest.fixture(scope="module")
-def zip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    try:
-        fetch_wheels(ROOT / "wheels")
-    except StgaError as error:
-        pytest.skip(f"wheels not present and not downloadable: {error}")
-    return build_zip(tmp_path_factory.mktemp("dist"))
 
 
 def python_of(version: str) -> str:

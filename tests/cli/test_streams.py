@@ -57,17 +57,24 @@ def test_ascii_streams(tmp_path: Path, environment: dict[str, str]) -> None:
     assert "Traceback" not in done.stderr
 
 
+# Three commands of one process, which is started once with the streams closed.
+THREE = """
+import sys
+from stga_addon.cli.main import main
+capture, out = sys.argv[1:]
+train = ["train", capture, "--out", f"{out}/run", "--iterations", "2", "--strategy", "gaussian-avatars"]
+render = ["render", f"{out}/run", "--cameras", f"{capture}/transforms_val.json", "--out", f"{out}/pictures"]
+codes = [main(arguments) for arguments in (train, render, ["info", "/none"])]
+raise SystemExit(0 if codes == [0, 0, 2] else repr(codes))
+"""
+
+
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
 def test_closed_descriptors(capture: Path, tmp_path: Path, closed: str) -> None:
     """Catches a progress bar that cannot do without stderr, and files that get the descriptor of a closed stream."""
-    out = tmp_path / "run"
-    training = f"train {capture} --out {out} --iterations 2 --strategy gaussian-avatars"
-    done = shell(f"stga {training} {closed}")
-    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
-    assert (out / "avatar.npz").exists()
-    cameras = capture / "transforms_val.json"
-    done = shell(f"stga render {out} --cameras {cameras} --out {tmp_path / 'pictures'} {closed}")
-    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    done = shell(f"\"{sys.executable}\" -c '{THREE}' {capture} {tmp_path} {closed}")
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    assert (tmp_path / "run/avatar.npz").exists()
     assert list((tmp_path / "pictures").glob("*.png"))
     assert shell(f"stga info /none {closed}").returncode == 2
 

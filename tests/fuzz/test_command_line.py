@@ -32,35 +32,15 @@ from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import Performance
 from stga_addon.report import preset_timing
+from stga_addon.requests import values as ask
 from stga_addon.requests.folder import write_request
-from stga_addon.requests.values import (
-    Analyze,
-    Benchmark,
-    ConvertMotion,
-    Evaluate,
-    Export,
-    Extend,
-    Played,
-    Refine,
-    Relight,
-    Render,
-    RenderBlend,
-    RenderRecording,
-    Request,
-    Resume,
-    Select,
-    SelectForTake,
-    SolveAgain,
-    TimePresets,
-    Track,
-    Train,
-)
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.training.run.folder import read_run
 
 pytest.importorskip("torch")
 
-CASES = int(os.environ.get("STGA_FUZZ_CASES", 1500))
+CASES = int(os.environ.get("STGA_FUZZ_CASES", 300))
+"""Of every run of the tests; `make fuzz` tries 20,000."""
 PARTS = 10
 """Tests that the cases are spread over, so that several processes share them."""
 FIRST_CASE = int(os.environ.get("STGA_FUZZ_FIRST", 0))
@@ -68,7 +48,7 @@ MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000
 REPORTED_FAILURES = 20
 
-REQUESTS = tuple(kind.__name__ for kind in get_args(Request))
+REQUESTS = tuple(kind.__name__ for kind in get_args(ask.Request))
 NUMBERS = [
     "0",
     "1",
@@ -191,31 +171,31 @@ def tracked_footage(case: Path) -> list[str]:
     return [str(footage / "footage"), "--model", str(footage / "head.npz"), "--landmarks", str(footage / "points")]
 
 
-def requests_about(case: Path) -> dict[str, Request]:
+def requests_about(case: Path) -> dict[str, ask.Request]:
     """A request of each kind, by its name, about the files of the case."""
     capture, run, footage, once = case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"}
     settings = read_run(case / "run").settings
     key = np.zeros(synthetic_flame(0).n_expression + 18)
-    avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
-    requests: tuple[Request, ...] = (
-        Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}),
-        Resume(run, capture, device="cpu"),
-        Refine(case / "refined", run, weights=np.linspace(0, 1, 320, dtype=np.float32), **once),
-        Extend(case / "extended", run, (case / "take",), **once),
-        SelectForTake(run, case / "take"),
-        Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points"),
-        SolveAgain(footage / "out", footage / "head.npz", {1: key}),
-        RenderRecording(case / "none.bin", case / "asked.mp4", 1, 25.0),
-        Analyze(capture),
-        Evaluate(run),
-        Render(avatar, case / "asked", cameras=capture / "transforms_val.json", capture=capture),
-        Export(avatar, case / "asked.stga", "web", capture, played=played),
-        ConvertMotion(case / "take.csv", case / "asked.npz", footage / "head.npz"),
-        Select(capture),
-        TimePresets(capture),
-        Relight(case / "run", flame=None),
-        RenderBlend(case / "take.blend", case / "asked", (1, 2)),
-        Benchmark(case / "asked", capture, 1.0, only=("draft",)),
+    avatar, played = case / "run/avatar.npz", ask.Played({4: open_capture(capture).neutral})
+    requests: tuple[ask.Request, ...] = (
+        ask.Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}),
+        ask.Resume(run, capture, device="cpu"),
+        ask.Refine(case / "refined", run, weights=np.linspace(0, 1, 320, dtype=np.float32), **once),
+        ask.Extend(case / "extended", run, (case / "take",), **once),
+        ask.SelectForTake(run, case / "take"),
+        ask.Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points"),
+        ask.SolveAgain(footage / "out", footage / "head.npz", {1: key}),
+        ask.RenderRecording(case / "none.bin", case / "asked.mp4", 1, 25.0),
+        ask.Analyze(capture),
+        ask.Evaluate(run),
+        ask.Render(avatar, case / "asked", cameras=capture / "transforms_val.json", capture=capture),
+        ask.Export(avatar, case / "asked.stga", "web", capture, played=played),
+        ask.ConvertMotion(case / "take.csv", case / "asked.npz", footage / "head.npz"),
+        ask.Select(capture),
+        ask.TimePresets(capture),
+        ask.Relight(case / "run", flame=None),
+        ask.RenderBlend(case / "take.blend", case / "asked", (1, 2)),
+        ask.Benchmark(case / "asked", capture, 1.0, only=("draft",)),
     )
     return {type(request).__name__: request for request in requests}
 

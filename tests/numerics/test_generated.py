@@ -12,6 +12,7 @@ from stga_addon.raster import reference
 
 from .scenes import NAMES, Scene, assert_close, compare, facing, kernel_gradients, random_cotangents, steady_pixels
 
+FUZZING = "STGA_FUZZ_SECONDS" in os.environ
 BOUNDED = {"deadline": None, "derandomize": True, "database": None, "suppress_health_check": list(HealthCheck)}
 
 
@@ -75,7 +76,7 @@ def test_any_scene_is_the_references(back_end: str, scene: Scene) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, **(BOUNDED | {"derandomize": "STGA_FUZZ_SECONDS" not in os.environ}))
+@settings(max_examples=6000 if FUZZING else 400, **(BOUNDED | {"derandomize": not FUZZING}))
 @given(scenes())
 def test_any_scene_is_the_references_at_length(scene: Scene) -> None:
     """The same with many more scenes; in `make fuzz` with others every time."""

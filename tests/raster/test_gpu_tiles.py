@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from raster import gpu_device
+from raster.test_outline import covariances
 from stga_addon.raster.cpu.layout import PROJECTED, TILE
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED, WORKGROUP
@@ -170,13 +171,7 @@ def ellipses(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Projected columns (count, PROJECTED) of splats on the grid and around it, and their bounds in tiles."""
     rng, size = np.random.default_rng(5), np.array([TILES_X, TILES_Y]) * TILE
     longest, shortest = {"round": (30, 2), "needles": (90, 0.6), "tiny": (0.7, 0.55), "huge": (3000, 200)}[kind]
-    turn = rng.uniform(0, np.pi, count)
-    axes = np.stack([np.stack([np.cos(turn), np.sin(turn)], -1), np.stack([-np.sin(turn), np.cos(turn)], -1)], 1)
-    sigma = np.exp(rng.uniform(np.log(shortest), np.log(longest), (count, 2)))
-    if kind == "needles":
-        sigma[:, 1] = shortest
-    covariance = np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes)
-    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    _, xx, xy, yy = covariances(rng, count, longest, shortest, kind == "needles")
     opacity = rng.uniform(0.005, 1, count)
     mean = rng.uniform((-20, -20), size + 20, (count, 2))
     columns = np.zeros((count, PROJECTED), np.float32)

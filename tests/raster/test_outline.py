@@ -6,17 +6,27 @@ import pytest
 from stga_addon.raster.cpu.outline import outline, rows_within
 
 
+def covariances(
+    rng: np.random.Generator, count: int, longest: float, shortest: float, thin: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Axes (count, 2) in pixels between two lengths, and xx, xy, yy (count,) of ellipses turned at random.
+
+    thin: the second axis is the shortest.
+    """
+    turn = rng.uniform(0, np.pi, count)
+    axes = np.stack([np.stack([np.cos(turn), np.sin(turn)], -1), np.stack([-np.sin(turn), np.cos(turn)], -1)], 1)
+    sigma = np.exp(rng.uniform(np.log(shortest), np.log(longest), (count, 2)))
+    if thin:
+        sigma[:, 1] = shortest
+    covariance = np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes)
+    return sigma, covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+
+
 def splats(kind: str, count: int = 400) -> np.ndarray:
     """(count, 6) float32 mean_x, mean_y, precision_x, shear, precision_y, extent_y around a tile of 16 × 16 pixels."""
     rng = np.random.default_rng(0)
     longest, shortest = {"round": (6, 2), "needles": (40, 0.6), "tiny": (0.7, 0.55), "huge": (3000, 200)}[kind]
-    turn = rng.uniform(0, np.pi, count)
-    axes = np.stack([np.stack([np.cos(turn), np.sin(turn)], -1), np.stack([-np.sin(turn), np.cos(turn)], -1)], 1)
-    sigma = np.exp(rng.uniform(np.log(shortest), np.log(longest), (count, 2)))
-    if kind == "needles":
-        sigma[:, 1] = shortest
-    covariance = np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes)
-    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    sigma, xx, xy, yy = covariances(rng, count, longest, shortest, kind == "needles")
     reach = 2 * np.log(255 * rng.uniform(0.005, 1, count))
     mean = rng.uniform(-8, 24, (count, 2)) + rng.normal(size=(count, 2)) * 2 * sigma.max(1, keepdims=True)
     columns = mean[:, 0], mean[:, 1], yy / (xx * yy - xy**2), xy / yy, 1 / yy, np.sqrt(reach * yy)

@@ -15,8 +15,8 @@ SECONDS, MEGABYTES = 1.0, 200.0
 
 def behaves(read: Callable[[], Any], folder: Path) -> str:
     """The error's message, or "" where `read` loads. Fails on anything else, on a reader that takes more than a
-    second or 200 MB beyond the file itself, and on one that changes `folder` or anything beside it."""
-    before = _listing(folder.parent)
+    second or 200 MB beyond the file itself, and on one that adds files to `folder` or beside it, or removes some."""
+    before = _listing(folder)
     begin = time.perf_counter()
     message = _message(read)
     seconds = time.perf_counter() - begin
@@ -34,7 +34,7 @@ def behaves(read: Callable[[], Any], folder: Path) -> str:
     finally:
         tracemalloc.stop()
     assert peak < MEGABYTES, f"{peak:.0f} MB: {message}"
-    assert _listing(folder.parent) == before
+    assert _listing(folder) == before
     return message
 
 
@@ -50,4 +50,6 @@ def _message(read: Callable[[], Any]) -> str:
 
 
 def _listing(folder: Path) -> list[str]:
-    return sorted(os.path.join(base, name) for base, dirs, files in os.walk(folder) for name in (*dirs, *files))
+    """What is in a folder, at any depth, and what is beside it; the folders there are those of all other tests."""
+    inside = [os.path.join(base, name) for base, dirs, files in os.walk(folder) for name in (*dirs, *files)]
+    return sorted([*inside, *os.listdir(folder.parent)])

@@ -18,7 +18,7 @@ from stga_addon.training.optimize.precompile import precompile_kernels
 from stga_addon.training.optimize.trainer import Trainer
 
 pytestmark = pytest.mark.slow
-ITERATIONS = int(os.environ.get("STGA_SOAK", 3000))
+ITERATIONS = int(os.environ.get("STGA_SOAK", 1500))
 STRAYS, DENSITY = 30, 40
 MARK = 250  # iterations between fingerprints
 RSS_GROWTH = 24 << 20

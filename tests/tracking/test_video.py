@@ -14,7 +14,7 @@ from .scenes import rig, write_colmap_text
 av = pytest.importorskip("av")
 
 BLOCK, COLUMNS, ROWS = 16, 6, 4
-FRAMES = 75
+FRAMES = 52
 X264 = {"bf": "3", "b_strategy": "0", "g": "12", "keyint_min": "12", "sc_threshold": "0", "crf": "12"}
 OPEN_X264 = X264 | {"x264-params": "open-gop=1:b-adapt=0"}
 OPEN_X265 = {"x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:log-level=0"}
@@ -295,7 +295,7 @@ def test_frame_that_the_decoder_leaves_out(tmp_path):
     path.write_bytes(data)
     camera = open_footage(path).cameras[0]
     assert shown(camera.image(40)) == 40
-    for before in (40, 70):  # in order, and by a seek
+    for before in (40, FRAMES - 1):  # in order, and by a seek
         camera.image(before)
         with pytest.raises(StgaError, match=r"a.mov: frame 41: cannot be decoded \(the decoder gives no picture"):
             camera.image(41)

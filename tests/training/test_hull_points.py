@@ -182,7 +182,7 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -
 def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None:
     """Catches a grid of 4 mm laid through a mesh of 100 m: 10^13 points."""
     huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
-    assert len(hull_points(huge, beside.views["train"], "stga", 0)) < 100_000
+    assert len(hull_points(huge, beside.views["train"][:2], "stga", 0)) < 100_000
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])

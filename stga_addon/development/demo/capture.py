@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...capture.camera import Camera, camera_from_gl
+from ...capture.transforms import camera_entry
 from ...errors import StgaError
 from ...files import replacing, write_json, write_npz
 from ...flame.forward import FlameFrame, flame_forward, neutral_frame
@@ -218,13 +219,7 @@ def _entry(timestep: int, index: int, camera: Camera) -> dict[str, Any]:
         "file_path": f"images/{name}",
         "fg_mask_path": f"fg_masks/{name}",
         "flame_param_path": f"flame_param/{timestep:05d}.npz",
-        "transform_matrix": camera.camera_to_world_gl.tolist(),
-        "fl_x": camera.fl_x,
-        "fl_y": camera.fl_y,
-        "cx": camera.cx,
-        "cy": camera.height - camera.cy,  # VHAP counts it from the bottom
-        "w": camera.width,
-        "h": camera.height,
+        **camera_entry(camera),
         "camera_angle_x": 2 * math.atan(camera.width / 2 / camera.fl_x),
         "camera_angle_y": 2 * math.atan(camera.height / 2 / camera.fl_y),
     }

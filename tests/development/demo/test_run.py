@@ -16,19 +16,27 @@ from stga_addon.training.run.metrics_log import read_metrics
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
 SMALL = CaptureOptions(train=2, test=1, cameras=6, width=72, height=100, samples=2)
+TINY = CaptureOptions(train=1, test=1, cameras=3, width=36, height=50, samples=1)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """Folder of a demo."""
+    folder = tmp_path_factory.mktemp("demo")
+    run_demo(folder, {"seconds": 6.0}, SMALL)
+    return folder
 
 
 @pytest.mark.slow
-def test_demo_writes_its_files(tmp_path):
+def test_demo_writes_its_files(demo):
     """Catches a break anywhere in the chain of the README's first command."""
-    run_demo(tmp_path, {"seconds": 6.0}, SMALL)
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    metrics = json.loads((demo / "metrics.json").read_text())
     assert metrics["blender_position_error_m"] < 1e-5
     # Far above what the untrained gray lattice reaches on these images (about 15 dB).
     assert metrics["val"]["psnr"] > 20
-    assert len(read_avatar(tmp_path / "avatar.npz").splats) == metrics["splats"]
-    assert Image.open(tmp_path / "comparison.png").size == (4 * 72 + 3 * 6, 100)
-    selection = np.asarray(Image.open(tmp_path / "selection.png")).astype(int)
+    assert len(read_avatar(demo / "avatar.npz").splats) == metrics["splats"]
+    assert Image.open(demo / "comparison.png").size == (4 * 72 + 3 * 6, 100)
+    selection = np.asarray(Image.open(demo / "selection.png")).astype(int)
     colored = np.ptp(selection, axis=2) > 25
     gray = (np.ptp(selection, axis=2) <= 3) & (selection.max(axis=2) < 250)
     assert colored.sum() > 50, "no selected splat is shown in color"
@@ -42,7 +50,7 @@ def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, caps
 
     adapter = gpu_device.device().name
     monkeypatch.setattr(
-        "stga_addon.development.demo.run.run_demo", lambda out, budget, device: run_demo(out, budget, SMALL, device)
+        "stga_addon.development.demo.run.run_demo", lambda out, budget, device: run_demo(out, budget, TINY, device)
     )
     assert main(["demo", "--out", str(tmp_path), "--iterations", "4", "--device", f"gpu:{adapter}"]) == 0
     assert f"Training on {adapter}" in capsys.readouterr().out
@@ -52,10 +60,9 @@ def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.slow
-def test_the_blend_file_opens_with_head_groups_and_splats(tmp_path):
+def test_the_blend_file_opens_with_head_groups_and_splats(demo):
     """Catches a demo.blend that an artist opens to find empty or unanimated."""
-    run_demo(tmp_path, {"seconds": 2.0}, SMALL)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "demo.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(demo / "demo.blend"))
     heads = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "head"]
     splats = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
     assert len(heads) == 1

@@ -17,7 +17,7 @@ from stga_addon.light.values import Light, Lighting
 from stga_addon.render.render import render_colors, to_uint8
 
 from .conftest import Head, make_head, show
-from .test_page import SNAPSHOT, difference, picture
+from .test_page import difference, picture, snapshot
 from .web_data import read_web_data
 
 MIN_PSNR = 55.0
@@ -98,18 +98,18 @@ def test_as_recorded_is_what_a_page_without_light_shows(browser, tmp_path):
     head = lit_head()
     dark = replace(head, avatar=replace(head.avatar, light=None))
     show(browser, tmp_path, dark.data())
-    encoded = browser.evaluate(SNAPSHOT % 1)
+    encoded = snapshot(browser, 1)
     assert browser.evaluate("document.getElementById('light').hidden")
     assert not browser.evaluate("document.querySelector('stga-avatar').hasLight")
     header, arrays = read_web_data(dark.data())
     assert "light" not in header
     assert not any(name.startswith("light") for name in arrays)
     show(browser, tmp_path, head.data())
-    assert browser.evaluate(SNAPSHOT % 1) == encoded
+    assert snapshot(browser, 1) == encoded
     set_lighting(browser, "{ environment: 'sky' }")
-    assert browser.evaluate(SNAPSHOT % 1) != encoded
+    assert snapshot(browser, 1) != encoded
     set_lighting(browser, "null")
-    assert browser.evaluate(SNAPSHOT % 1) == encoded
+    assert snapshot(browser, 1) == encoded
 
 
 @pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])

@@ -1,0 +1,27 @@
+"""What batches are compared with: the same requests, carried out one after another in this process."""
+
+from collections.abc import Callable
+from functools import cache
+
+import pytest
+
+from stga_addon.batch.plan import Plan
+from stga_addon.perform.perform import perform
+
+from .tiny import ITERATIONS, tiny_plan
+
+TrainedHere = Callable[..., Plan]
+
+
+@pytest.fixture(scope="session")
+def trained_here(tmp_path_factory: pytest.TempPathFactory) -> TrainedHere:
+    """Number of seeds and iterations -> `tiny_plan` with its results, without any engine."""
+
+    @cache
+    def train(seeds: int, iterations: int) -> Plan:
+        plan = tiny_plan(tmp_path_factory.mktemp("here"), seeds, iterations)
+        for job in plan.jobs:
+            perform(job.request)
+        return plan
+
+    return lambda seeds=2, iterations=ITERATIONS: train(seeds, iterations)
