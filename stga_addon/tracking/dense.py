@@ -51,8 +51,9 @@ SETTLED_GAIN = 0.02
 cameras see is the better evidence."""
 KEPT_STIFFNESS = 100.0
 """Of a timestep that keeps what it had, in the stiffness of the smoothness over time."""
-MAX_GROWTH, SMALL_MISS_M = 1.5, 0.001
-"""Of the landmarks' distance in a region that the images do not explain better."""
+MAX_GROWTH, SMALL_MISS_M, MIN_REGION_GAIN = 1.5, 0.001, 0.1
+"""Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it: lowered brows explain a
+little of raised ones."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,8 @@ def fit_dense(
         solved[timestep] = solver.solve(shot, texture, before, usual)
         before = shot, solved[timestep]
     ordered = [solved[timestep] for timestep in timesteps]
-    smooth = smooth_take(solver.head.head, np.stack([own.values for own in ordered]), [own.terms for own in ordered])
+    values, terms = np.stack([own.values for own in ordered]), [own.terms for own in ordered]
+    smooth = smooth_take(solver.head.head, values, terms, fit.ordered)
     parameters = {t: solver.head.complete(values) for t, values in zip(timesteps, smooth, strict=True)}
     moved = replace(fit, parameters=parameters)
     return DenseFit(moved, solver.agreeing(moved, solved), {t: solved[t].misfit for t in timesteps})
@@ -182,16 +184,16 @@ class _Solver:
         was, missed = self._missed(shot.landmarks, shot.start), self._missed(shot.landmarks, values)
         gain = (old.regions - new.regions).max()
         better = new.all < old.all and gain > self._min_gain
-        if better and not self._burst(shot.landmarks, was, missed, new.regions >= old.regions):
+        if better and not self._astray(shot.landmarks, was, missed, new.regions > (1 - MIN_REGION_GAIN) * old.regions):
             terms = self._terms(shot, texture, values, visible, 0)
             return _Solved(values, visible, terms, coarse, new, missed, True)
         stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
         terms = stiff, self.head.precision * shot.start  # which the prior does not move
         return _Solved(shot.start, visible, terms, coarse, old, was, False)
 
-    def _burst(self, landmarks: Observation, was: np.ndarray, now: np.ndarray, worse: np.ndarray) -> bool:
-        """Whether landmarks are missed by much more in a region that the images do not explain better."""
-        for region in np.flatnonzero(worse):
+    def _astray(self, landmarks: Observation, was: np.ndarray, now: np.ndarray, unsure: np.ndarray) -> bool:
+        """Whether landmarks are missed by much more in one of the regions that are not explained clearly better."""
+        for region in np.flatnonzero(unsure):
             use = (self.head.landmark_region == region) & (landmarks.weight > 0)
             if use.any() and np.median(now[use]) > MAX_GROWTH * np.median(was[use]) + SMALL_MISS_M:
                 return True

@@ -11,7 +11,7 @@ from ..capture.rigid import Similarity, similarity, weighted_procrustes
 from .head_model import HeadModel
 from .mesh_image import vertex_normals
 from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
-from .solve import Observation, person, solve_identity, solve_take
+from .solve import Observation, in_order, person, solve_identity, solve_take
 from .triangulation import Triangulation, rays, triangulate
 
 IDENTITY_TIMESTEPS = 12
@@ -50,6 +50,7 @@ class HeadFit:
     parameters  timestep -> (E + 18,) expression, pose of five joints, translation
     to_capture  from the world of the cameras
     static_offset  (V, 3) meters, part of the template beside the identity; None: none
+    ordered     whether timesteps follow each other in time (`in_order`)
     """
 
     head: HeadModel
@@ -57,6 +58,7 @@ class HeadFit:
     parameters: Mapping[int, np.ndarray]
     to_capture: Similarity
     static_offset: np.ndarray | None = None
+    ordered: bool = True
 
 
 def in_cameras_world(fit: HeadFit) -> HeadFit:
@@ -137,13 +139,15 @@ def fit_head(
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
             solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
-        solved = solve_take(subject, places, take_observed, solved)
+        solved = solve_take(subject, places, take_observed, solved, ordered=False)
         seen = {
             t: by_visibility(take[t], subject, places, values, world)
             for t, values in zip(timesteps, solved, strict=True)
         }
     report("Fit", ROUNDS, ROUNDS)
-    return HeadFit(subject, shape, dict(zip(timesteps, solved, strict=True)), world)
+    ordered = in_order(subject, places, take_observed, solved)
+    solved = solve_take(subject, places, take_observed, solved, ordered)
+    return HeadFit(subject, shape, dict(zip(timesteps, solved, strict=True)), world, ordered=ordered)
 
 
 def is_metric(

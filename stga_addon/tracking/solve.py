@@ -7,7 +7,7 @@ import numpy as np
 
 from ..flame.model import JOINTS, FlameModel
 from .head_model import HeadModel
-from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints
+from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints, head_rotation
 
 LANDMARK_SIGMA_M = 0.002
 """Standard deviation of a landmark over people and views; coefficients have a standard deviation of 1."""
@@ -27,6 +27,9 @@ EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.
 """Standard deviations of second differences from one timestep to the next."""
 JUMP_SCALE = 3.0
 """Standard deviations of a second difference beyond which it is a cut rather than a motion."""
+MAX_ORDERED_CHANGE = 0.5
+"""Mean squared change of expression and jaw from one timestep to the next, as a share of that between any two, up to
+which timesteps follow each other in time."""
 IDENTITY_ITERATIONS, TAKE_ITERATIONS = 12, 8
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations stop."""
@@ -100,26 +103,63 @@ def solve_identity(
 
 
 def solve_take(
-    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], start: np.ndarray
+    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], start: np.ndarray, ordered: bool
 ) -> np.ndarray:
     """Expression and pose (T, E + 18) of consecutive timesteps of a person whose identity is in the template.
 
-    start (T, E + 18). Second differences over time are penalized, but for jumps: captures of single expressions, and
-    cuts, are not smoothed. Memory does not grow with the take beyond its observations.
+    start (T, E + 18). ordered: second differences over time are penalized, but for jumps, such as cuts; else every
+    timestep is solved for itself. Memory does not grow with the take beyond its observations.
     """
     points = PosedPoints(head.model, places)
-    return _solve_windows(head, lambda row, values: normal_equations(points, values, observations[row]), start)
+    return _solve_windows(head, lambda row, values: normal_equations(points, values, observations[row]), start, ordered)
 
 
-def smooth_take(head: HeadModel, start: np.ndarray, terms: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+def in_order(head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], alone: np.ndarray) -> bool:
+    """Whether a take's timesteps follow each other in time: captures of one expression per timestep do not.
+
+    alone (T, E + 18): each timestep solved for itself. By von Neumann's ratio (1941) over expression and jaw, in
+    standard deviations of the prior, without the variance that the noise of landmarks has in them.
+    """
+    if len(alone) < 3:
+        return True
+    prior = parameter_precision(head)
+    jaw = head.model.n_expression + 3 * JOINTS.index("jaw")
+    moving = np.r_[: head.model.n_expression, jaw : jaw + 3]
+    noise = float((_landmark_noise(head, places, observations, alone) * prior)[moving].sum())
+    expressions = (alone * np.sqrt(prior))[:, moving]
+    variance = expressions.var(axis=0, ddof=1).sum() - noise
+    change = ((expressions[1:] - expressions[:-1]) ** 2).sum(1).mean() - 2 * noise
+    return bool(change <= MAX_ORDERED_CHANGE * 2 * variance)
+
+
+def _landmark_noise(
+    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], alone: np.ndarray
+) -> np.ndarray:
+    """(E + 18,) mean variance in a timestep's parameters of landmarks that move about their usual places."""
+    points, prior = PosedPoints(head.model, places), np.diag(parameter_precision(head))
+    missed, variance = [], []
+    for values, own in zip(alone, observations, strict=True):
+        away = points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:]) - own.position
+        missed.append(np.einsum("nij,nj->ni", own.root, away) @ head_rotation(values))
+        information, _ = normal_equations(points, values, own)
+        covariance = np.linalg.inv(information + prior)
+        variance.append(np.diag(covariance @ information @ covariance))
+    weight = np.mean([own.weight for own in observations], axis=0)
+    spread = (weight[:, None] * np.var(missed, axis=0)).sum() / max(3 * weight.sum(), 1e-9)
+    return np.asarray(spread / LANDMARK_SIGMA_M**2 * np.mean(variance, axis=0))
+
+
+def smooth_take(
+    head: HeadModel, start: np.ndarray, terms: Sequence[tuple[np.ndarray, np.ndarray]], ordered: bool
+) -> np.ndarray:
     """Parameters (T, E + 18) of consecutive timesteps from the Gauss–Newton matrix and right-hand side that each has at
-    `start`, with the prior and smoothness over time."""
+    `start`, with the prior and, of a take that is ordered, smoothness over time."""
 
     def linear(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         matrix, right = terms[row]
         return matrix.copy(), right - matrix @ (values - start[row])
 
-    return _solve_windows(head, linear, start)
+    return _solve_windows(head, linear, start, ordered)
 
 
 def person(head: HeadModel, shape: np.ndarray) -> HeadModel:
@@ -142,11 +182,11 @@ def normal_equations(
     return flat.T @ flat, -flat.T @ (np.sqrt(weight)[:, None] * residual).ravel()
 
 
-def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray) -> np.ndarray:
+def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray, ordered: bool) -> np.ndarray:
     solved = start.copy()
     for first in range(0, len(start), WINDOW - OVERLAP):
         window = slice(first, min(first + WINDOW, len(start)))
-        found = _solve_window(head, terms, first, solved[window])
+        found = _solve_window(head, terms, first, solved[window], ordered)
         kept = 0 if first == 0 else OVERLAP // 2
         solved[first + kept : window.stop] = found[kept:]
         if window.stop == len(start):
@@ -154,28 +194,36 @@ def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray) -> np.ndarr
     return solved
 
 
-def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray) -> np.ndarray:
-    from scipy.linalg import solveh_banded
-
-    count, size = start.shape
+def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray, ordered: bool) -> np.ndarray:
     prior, stiffness = parameter_precision(head), acceleration_precision(head.model)
-    state = start.copy()
+    state, size = start.copy(), start.shape[1]
+    blocks, right = np.zeros((len(state), size, size)), np.zeros_like(state)
     for _ in range(TAKE_ITERATIONS):
-        band = np.zeros((2 * size + 1, count * size)) if count > 2 else np.zeros((size, count * size))
-        right = np.zeros((count, size))
-        for number in range(count):
-            block, right[number] = terms(first + number, state[number])
-            block[np.diag_indices(size)] += prior
-            right[number] -= prior * state[number]
-            for offset in range(size):
-                band[offset, number * size : (number + 1) * size - offset] = np.diagonal(block, offset)
-        if count > 2:
-            _add_smoothness(band, right, state, stiffness)
-        step = solveh_banded(band, right.ravel(), lower=True)
-        state += step.reshape(count, size)
+        for number, values in enumerate(state):
+            blocks[number], right[number] = terms(first + number, values)
+            blocks[number][np.diag_indices(size)] += prior
+            right[number] -= prior * values
+        if ordered and len(state) > 2:
+            step = _smooth_step(blocks, right, state, stiffness)
+        else:
+            step = np.linalg.solve(blocks, right[..., None])[..., 0]
+        state = state + step
         if np.abs(step).max() < CONVERGED_STEP:
             break
     return state
+
+
+def _smooth_step(blocks: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+    """(T, E + 18) Gauss–Newton step of all timesteps together."""
+    from scipy.linalg import solveh_banded
+
+    count, size = state.shape
+    band = np.zeros((2 * size + 1, count * size))
+    for number, block in enumerate(blocks):
+        for offset in range(size):
+            band[offset, number * size : (number + 1) * size - offset] = np.diagonal(block, offset)
+    _add_smoothness(band, right, state, stiffness)
+    return np.asarray(solveh_banded(band, right.ravel(), lower=True).reshape(count, size))
 
 
 def _add_smoothness(band: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray) -> None:

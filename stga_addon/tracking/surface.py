@@ -39,6 +39,8 @@ SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
 LANDMARK_SHARE = 0.05
 """Weight of landmarks beside surface points: a detector's errors are the same in every frame and stay."""
+TAKE_LANDMARK_SHARE = 0.2
+"""The same once these errors are taken off: where skin slides along itself, as brows do, only landmarks show it."""
 MIN_SEEN_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better evidence."""
 MIN_SEEN_SHARE = 0.5
@@ -129,12 +131,12 @@ def _solved(
     starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
     identity = solve_identity(base, _both(take.places, points), together, starts, take.metric)
     world = fit.to_capture
-    moved = HeadFit(
-        person(base, identity.shape),
-        identity.shape,
-        dict(zip(seen, identity.frames, strict=True)),
-        replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale),
-        fit.static_offset,
+    moved = replace(
+        fit,
+        head=person(base, identity.shape),
+        shape=identity.shape,
+        parameters=dict(zip(seen, identity.frames, strict=True)),
+        to_capture=replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale),
     )
     return moved, {t: replace(own, position=own.position / identity.scale) for t, own in seen.items()}
 
@@ -175,7 +177,7 @@ def _whole_take(
         landmarks.append(replace(own, position=own.position - bias @ head_rotation(first.parameters[t]).T))
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
-    start = solve_take(fit.head, take.places, landmarks, start)
+    start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     together, near = [], [near_landmarks(fit.head, on, take) for on in points]
     visible_points: list[VisiblePoints] = [{} for _ in points]
     for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
@@ -185,10 +187,11 @@ def _whole_take(
             rough = replace(fit, parameters={t: start[number]})
             seen = seen_surface(rough, t, on, images, sweep, visible_points[stage])
             seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
-            joined = _joined(own, LANDMARK_SHARE, seen)
-            start[number] = solve_take(fit.head, _both(take.places, on), [joined], start[number : number + 1])[0]
+            joined = _joined(own, TAKE_LANDMARK_SHARE, seen)
+            here = start[number : number + 1]
+            start[number] = solve_take(fit.head, _both(take.places, on), [joined], here, ordered=False)[0]
         together.append(joined)
-    solved = solve_take(fit.head, _both(take.places, points[-1]), together, start)
+    solved = solve_take(fit.head, _both(take.places, points[-1]), together, start, fit.ordered)
     report(0)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
 

@@ -137,10 +137,10 @@ def test_smoothing_stays_at_the_solution_of_its_own_terms():
     observed = [
         Observation(places.on(mesh, head.model.faces), np.tile(np.eye(3), (60, 1, 1)), np.ones(60)) for mesh in meshes
     ]
-    solved = solve_take(one, places, observed, np.zeros((4, one.model.n_expression + 18)))
+    solved = solve_take(one, places, observed, np.zeros((4, one.model.n_expression + 18)), ordered=True)
     points = PosedPoints(one.model, places)
     terms = [normal_equations(points, row, own) for row, own in zip(solved, observed, strict=True)]
-    np.testing.assert_allclose(smooth_take(one, solved, terms), solved, atol=5e-3)
+    np.testing.assert_allclose(smooth_take(one, solved, terms, ordered=True), solved, atol=5e-3)
 
 
 def test_a_short_take_is_left_to_landmarks_and_surface():

@@ -20,6 +20,7 @@ from stga_addon.tracking.fit import (
 )
 from stga_addon.tracking.head_model import HeadModel, linear_model
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints
+from stga_addon.tracking.solve import Observation, in_order, person, solve_take
 from stga_addon.tracking.track import interpolated
 from stga_addon.tracking.triangulation import rays, triangulate
 from stga_addon.tracking.write_capture import flame_frame, posed_mesh
@@ -165,6 +166,42 @@ def test_jumps_are_not_smoothed(head):
         back = posed_mesh(fit, fit.parameters[timestep]) - fit.to_capture.translation
         found = back @ fit.to_capture.rotation / fit.to_capture.scale
         assert np.linalg.norm(found - mesh, axis=1)[head.model.masks["face"]].mean() < 0.8e-3
+
+
+def amounts_and_observations(head, amounts, noise):
+    """A person without identity, and what is known of 100 landmarks at each timestep of one moving expression."""
+    one, places = person(head, np.zeros(head.model.n_identity)), places_on(head, 100)
+    rng, observed = np.random.default_rng(3), []
+    for amount in amounts:
+        frame = replace(frame_at(head, 0), expr=amount * np.eye(head.model.n_expression)[0])
+        mesh = flame_forward(head.model, np.zeros(head.model.n_identity), frame)
+        points = places.on(mesh, head.model.faces) + rng.normal(0, noise, (100, 3))
+        observed.append(Observation(points, np.tile(np.eye(3), (100, 1, 1)), np.ones(100)))
+    return one, places, observed
+
+
+def test_expressions_in_no_order_are_not_smoothed(head):
+    """Catches brows that are raised at every third timestep and tracked at rest: beside surface points, landmarks count
+    little, and less than smoothness over timesteps that do not follow each other."""
+    amounts = np.array([0, 0.5, 0, 0, 0.4, 0, 0.5, 0, 0, 0.5, 0, 0.4])
+    one, places, observed = amounts_and_observations(head, amounts, 0.0003)
+    start = np.zeros((len(amounts), one.model.n_expression + 18))
+    ordered = in_order(one, places, observed, solve_take(one, places, observed, start, ordered=False))
+    assert not ordered
+    weak = [replace(own, weight=0.05 * own.weight) for own in observed]
+    found = solve_take(one, places, weak, start, ordered)[:, 0]
+    assert np.polyfit(amounts, found, 1)[0] > 0.7
+
+
+def test_expressions_in_order_are_smoothed(head):
+    """Catches noise of landmarks that is taken for expressions in no order: a take would tremble."""
+    amounts = 0.5 * np.sin(np.arange(24) / 4)
+    one, places, observed = amounts_and_observations(head, amounts, 0.002)
+    alone = solve_take(one, places, observed, np.zeros((24, one.model.n_expression + 18)), ordered=False)
+    assert in_order(one, places, observed, alone)
+    smooth = solve_take(one, places, observed, alone, ordered=True)
+    error, unsmoothed = (np.abs(values[:, 0] - amounts).mean() for values in (smooth, alone))
+    assert error < 0.7 * unsmoothed
 
 
 def test_one_camera_follows_a_head(head):

@@ -24,8 +24,9 @@ from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.posed_points import parameters_of
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.torso import NECK, ROOT, follow_torso, with_root
+from stga_addon.tracking.torso import follow_torso
 from stga_addon.tracking.torso_motion import read_torso_motion
+from stga_addon.tracking.torso_take import NECK, ROOT, with_root
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import flame_frame, posed_mesh
 

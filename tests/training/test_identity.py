@@ -1,5 +1,6 @@
 """Identity of a run: what was trained on one capture is not continued, measured or rendered on another."""
 
+import hashlib
 import json
 import shutil
 import signal
@@ -22,14 +23,16 @@ from stga_addon.perform.perform import perform
 from stga_addon.render import device as device_choice
 from stga_addon.requests.folder import request_folder, write_request
 from stga_addon.requests.values import Resume
+from stga_addon.schema import to_json
 from stga_addon.training.optimize.state import tensors_of
 from stga_addon.training.run import open_run as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, read_run, write_run
-from stga_addon.training.run.identity import difference, identity_of
+from stga_addon.training.run.identity import RunIdentity, difference, identity_of
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.open_run import device_of, open_run
 from stga_addon.training.run.progress import Progress
+from stga_addon.training.settings import TrainingSettings
 
 from .toys import quick_settings
 
@@ -130,6 +133,27 @@ def test_moved_captures_and_refined_meshes_are_accepted(copy: Path, toy: Capture
     train(opened.capture, copy, opened.run, resume=True)
     assert read_checkpoint(copy).iteration == ITERATIONS
     assert read_run(copy).capture == other
+
+
+def test_runs_of_format_version_4_are_resumed(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run of the version before, refused for a setting that it has by default; and with another value."""
+    out = tmp_path / "run"
+
+    def recorded(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
+        known = {name: value for name, value in to_json(settings).items() if name != "torso"}
+        digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
+        return replace(identity_of(capture, principal_point, settings), settings=digest)
+
+    with monkeypatch.context() as before:
+        before.setattr(open_run_module, "identity_of", recorded)
+        train(toy, out, make_run(toy), report=stop_at(ITERATIONS // 2))
+    factory.edit(out / "run.json", lambda document: (document.update(version=4), document["settings"].pop("torso")))
+    opened = open_run(out)
+    train(opened.capture, out, opened.run, resume=True)
+    assert read_checkpoint(out).iteration == ITERATIONS
+    assert open_run(out).run == opened.run
+    with pytest.raises(StgaError, match="begun with other settings"):
+        train(toy, out, make_run(toy, torso=True), resume=True)
 
 
 def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:

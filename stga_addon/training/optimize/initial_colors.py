@@ -19,12 +19,18 @@ MASK_EDGE_PIXELS = 3
 MAX_LATER_TIMESTEPS, MAX_LATER_VIEWS = 6, 2
 """Further timesteps that are read, and views of each."""
 MIDDLE_GRAY = 0.5
+MIN_ONE_SIDED_SHARE = 0.05
+"""Area of the triangles that no view shows, but whose mirror images are shown, as a share of the mesh: below it, the
+cameras stand on both sides of the head."""
+MAX_ASYMMETRY_SHARE = 0.015
+"""Median distance of the mesh from its mirror image, as a share of its diagonal, beyond which it is not symmetric."""
 
 
 def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     """Mean color (F, 3) from 0 to 1 of each triangle in the first view's timestep or, if hidden there, in later ones.
 
-    Teeth that the lips hide at first have their own color, not that of the lips. A triangle that no view shows has the
+    Teeth that the lips hide at first have their own color, not that of the lips. Where cameras stand on one side of the
+    head only, a triangle of the other side has the color of its mirror image. Any other that no view shows has the
     color of the nearest one of the neutral mesh that is connected with it: the back of a head that is seen from the
     front has the color of its sides. Where all connected ones are hidden too, as a back tooth, it is the nearest of
     those that only later timesteps show or, without any, of all. Gray if no view shows any.
@@ -37,6 +43,8 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     shown = seen | late
     if not shown.any():
         return np.full(color.shape, MIDDLE_GRAY)
+    hidden, mirrored = _other_side(capture, shown)
+    color[hidden], shown[hidden] = color[mirrored], True
     return np.asarray(color[_nearest_shown(capture, shown, late if late.any() else shown)])
 
 
@@ -65,6 +73,23 @@ def _mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, n
         for channel in range(3):
             total[:, channel] += np.bincount(found, pixels[:, channel], len(count))
     return total / np.maximum(count, 1)[:, None] / 255, count > 0
+
+
+def _other_side(capture: Capture, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles that are not `shown` (F,) bool but whose mirror images are, and these; none where they are few, or the
+    mesh is not symmetric."""
+    none = np.zeros(0, int)
+    corners = capture.neutral[capture.faces]
+    centers, edges = corners.mean(1), corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    across = centers * [-1, 1, 1] + [2 * centers[:, 0].mean(), 0, 0]
+    distance, partner = cKDTree(centers).query(across)
+    hidden = np.flatnonzero(~shown & shown[partner])
+    if np.median(distance) > MAX_ASYMMETRY_SHARE * np.linalg.norm(np.ptp(capture.neutral, axis=0)):
+        return none, none
+    if area[hidden].sum() < MIN_ONE_SIDED_SHARE * area.sum():
+        return none, none
+    return hidden, partner[hidden]
 
 
 def _nearest_shown(capture: Capture, shown: np.ndarray, others: np.ndarray) -> np.ndarray:

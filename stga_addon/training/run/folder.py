@@ -24,9 +24,11 @@ from ...schema import complaint, from_json, setting, to_json
 from ...worker.lock import hold_lock, lock_owner
 from ..effects.decisions import EffectDecision
 from ..settings import TrainingSettings
-from .identity import RunIdentity
+from .identity import LATER_SETTINGS, RunIdentity
 
 FORMAT, VERSION = "stga-run", 5
+OLDEST_VERSION = 4
+"""Read as well: LATER_SETTINGS are all that it lacks."""
 RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
 
 
@@ -109,8 +111,11 @@ def read_run(folder: Path) -> Run:
     if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
     version = values.pop("version", None)
-    if version != VERSION:
-        raise StgaError(f"{path}: has run format version {shorten(version)}, this add-on reads {VERSION}")
+    if version not in (OLDEST_VERSION, VERSION):
+        reads = f"{OLDEST_VERSION} and {VERSION}"
+        raise StgaError(f"{path}: has run format version {shorten(version)}, this add-on reads {reads}")
+    if version == OLDEST_VERSION and isinstance(values.get("settings"), dict):
+        values["settings"].update({name: getattr(TrainingSettings, name) for name in LATER_SETTINGS})
     try:
         run: Run = from_json(Run, values)
     except StgaError as error:

@@ -2,8 +2,9 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from ..settings import TrainingSettings
 QUANTUM = 1e-6 * 0.5**0.5
 """Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines compute other last
 bits. It is irrational, so that neither decimals nor binary fractions lie at the edge between two multiples."""
+LATER_SETTINGS = ("torso",)
+"""Settings that runs of format version 4 do not have; they were trained as with the defaults."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +60,16 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
         _digest(np.ascontiguousarray(capture.faces, np.int32).tobytes()),
         _digest(_quantized(capture.neutral)),
         "" if capture.flame_file is None else file_digest(capture.flame_file),
-        _digest(json.dumps(to_json(settings), sort_keys=True).encode()),
+        _settings_digest(to_json(settings)),
     )
+
+
+def version_4_identity(identity: RunIdentity, settings: TrainingSettings) -> RunIdentity:
+    """The identity as a run of format version 4 recorded it; the same where the settings are not those of one."""
+    if any(getattr(settings, name) != getattr(TrainingSettings, name) for name in LATER_SETTINGS):
+        return identity
+    known = {name: value for name, value in to_json(settings).items() if name not in LATER_SETTINGS}
+    return replace(identity, settings=_settings_digest(known))
 
 
 def difference(trained: RunIdentity, given: RunIdentity) -> str | None:
@@ -70,6 +81,10 @@ def difference(trained: RunIdentity, given: RunIdentity) -> str | None:
         "neutral": "has another neutral mesh",
     }
     return next((phrase for name, phrase in phrases.items() if getattr(trained, name) != getattr(given, name)), None)
+
+
+def _settings_digest(settings: dict[str, Any]) -> str:
+    return _digest(json.dumps(settings, sort_keys=True).encode())
 
 
 def _digest(data: bytes) -> str:

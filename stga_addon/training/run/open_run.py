@@ -9,7 +9,7 @@ from ...capture.takes import join_takes
 from ...errors import StgaError
 from ...render.device import GPU, adapter_names, choose_device
 from .folder import Run, Take, has_run, read_run
-from .identity import RunIdentity, difference, identity_of
+from .identity import RunIdentity, difference, identity_of, version_4_identity
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def _open_take(folder: Path, run: Run, take: Take) -> Capture:
 
 
 def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
-    """The identity of `run` on `capture`.
+    """The identity of `run` on `capture`, as the folder's files carry it.
 
     Raises StgaError where the folder holds a run that was begun with another one; the sentence names both sides.
     """
@@ -69,6 +69,8 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
     trained = stored.identity
     if trained is None or trained == given:  # None: the run was prepared, but has not begun
         return given
+    if trained == version_4_identity(given, run.settings):
+        return trained
     if trained.principal_point != given.principal_point:
         wanted = f"principal point '{trained.principal_point}', not '{given.principal_point}'"
         raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")

@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
+from stga_addon.training.optimize import initial_colors
 from stga_addon.training.optimize.initial_colors import triangle_colors
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.settings import make_settings
@@ -41,6 +42,29 @@ def test_what_no_view_shows_has_the_nearest_color(painted):
     gap = np.abs(colors[hidden][:, None] - shown[None]).max(axis=2).min(axis=1)
     assert gap.max() < 1e-6  # a color that some visible triangle has
     assert np.abs(255 * colors[hidden] - 127.5).max() > 20
+
+
+def test_the_side_that_no_camera_sees_has_the_colors_of_its_mirror_image(painted):
+    """Catches a head whose other side has the color of the outline, where the camera sees it worst."""
+    capture = painted()
+    views = [view for view in capture.views["train"] if view.camera_index == 0]
+    center = capture.neutral[capture.faces].mean(1)
+    towards = center @ views[0].camera.position / np.linalg.norm(center, axis=1)
+    towards /= np.linalg.norm(views[0].camera.position)
+    mirrored = np.linalg.norm(center[:, None] * [-1, 1, 1] - center[None], axis=2).argmin(axis=1)
+    other = (towards < -0.2) & (towards[mirrored] > 0.5)
+    assert other.mean() > 0.1
+    colors = triangle_colors(capture, views)
+    error = np.abs(255 * colors - own_colors(capture)[mirrored]).max(axis=1)
+    assert np.median(error[other]) < 3
+
+
+def test_cameras_on_both_sides_mirror_nothing(painted, monkeypatch):
+    """Catches colors of one side on the other where cameras see both."""
+    capture = painted()
+    colors = triangle_colors(capture, capture.views["train"])
+    monkeypatch.setattr(initial_colors, "MIN_ONE_SIDED_SHARE", 2.0)
+    np.testing.assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
 
 
 def test_masks_that_show_nothing_give_gray(painted, tmp_path):

@@ -1,0 +1,135 @@
+"""The frames of a tracked take in which the torso is followed, and the head's parameters with any orientation of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from ..capture.camera import Camera
+from ..capture.mesh_raster import silhouette
+from ..flame.forward import axis_angle_matrices
+from ..flame.model import JOINTS
+from ..flame.quaternions import from_matrices, to_axis_angle
+from .appearance import pyramid
+from .dense_terms import PyramidView, inside
+from .fit import HeadFit
+from .footage.model import FootageCamera
+from .posed_points import RIGID_SIZE
+from .write_capture import posed_mesh
+
+ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")
+HEAD_MARGIN = 0.03
+"""Around the head's silhouette, where hair and chin may be; share of the image's height."""
+PLAIN_LEVEL = 128
+"""Gray that stands for everything outside the mask."""
+EVIDENCE_LEVEL = 1
+"""Level of the pyramid in which motions are compared."""
+
+
+@dataclass(frozen=True)
+class TorsoShot:
+    """A timestep: by number of the camera its image, and the pixels (H, W) bool of the head at EVIDENCE_LEVEL."""
+
+    views: Mapping[int, PyramidView]
+    heads: Mapping[int, np.ndarray]
+
+    def shows(self, number: int, at: np.ndarray) -> np.ndarray:
+        """(N,) bool: points (N, 3) that lie in the camera's image, and not behind or before the head."""
+        camera, head = self.views[number].levels[EVIDENCE_LEVEL].camera, self.heads[number]
+        x, y = np.clip(camera.project(at)[0].astype(int), 0, [camera.width - 1, camera.height - 1]).T
+        return np.asarray(inside(camera, at) & ~head[y, x])
+
+
+class TorsoTake:
+    """The tracked take: images by timestep, and the head's parameters with any orientation of the torso."""
+
+    def __init__(
+        self,
+        fit: HeadFit,
+        parameters: Mapping[int, np.ndarray],
+        cameras: Sequence[FootageCamera],
+        torso: np.ndarray,
+    ) -> None:
+        self.model, self.parameters, self.cameras, self.torso = fit.head.model, parameters, cameras, torso
+        self._fit = fit
+        regressor = self.model.j_regressor[[ROOT, NECK]]
+        self._joints = regressor @ self.model.v_template
+        self._joint_dirs = np.einsum("jv,vak->jak", regressor, self.model.shapedirs)
+        self._center = posed_mesh(fit, next(iter(parameters.values()))).mean(0)
+
+    def with_torso(self, timestep: int, turn: np.ndarray) -> np.ndarray:
+        """The timestep's parameters with the torso in an orientation (3, 3)."""
+        root, neck = self._unposed_joints(timestep)
+        return with_root(self.parameters[timestep], turn, neck - root)
+
+    def pivot(self, timestep: int) -> np.ndarray:
+        """(3,) what the torso turns about: the joint of the neck."""
+        parameters, (root, neck) = self.parameters[timestep], self._unposed_joints(timestep)
+        turn = axis_angle_matrices(joint_rotation(parameters, ROOT)[None])[0]
+        return np.asarray(root + turn @ (neck - root) + parameters[-3:])
+
+    def _unposed_joints(self, timestep: int) -> np.ndarray:
+        return np.asarray(self._joints + self._joint_dirs @ self.parameters[timestep][:-RIGID_SIZE])
+
+    def mesh(self, parameters: np.ndarray) -> np.ndarray:
+        """(V, 3) of the head with these parameters."""
+        return posed_mesh(self._fit, parameters)
+
+    def shot(self, timestep: int) -> TorsoShot:
+        """Read a timestep; images are of constant size, as optical flow needs them."""
+        mesh = self.mesh(self.parameters[timestep])
+        views, heads = {}, {}
+        for number, source in enumerate(self.cameras):
+            mask = source.mask(timestep) if timestep in source.timesteps else None
+            if mask is not None:
+                camera = self._fit.to_capture.camera(source.camera)
+                levels = pyramid(camera, _masked(source.image(timestep), mask), self._center)
+                views[number] = PyramidView(bytes([number]), camera, levels)
+                heads[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera)
+        return TorsoShot(views, heads)
+
+    def head_pixels(self, mesh: np.ndarray, camera: Camera) -> np.ndarray:
+        """(H, W) bool: the head without its torso, and what is beside it."""
+        return grown(silhouette(mesh, self.model.faces[~self.torso], camera), HEAD_MARGIN)
+
+
+def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:
+    """Parameters (E + 18,) with the root joint in another orientation (3, 3), and the head in its place.
+
+    arm (3,): from the root joint to the neck's, before posing.
+    """
+    before, neck = axis_angle_matrices(np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)]))
+    changed = parameters.copy()
+    rigid = changed[-RIGID_SIZE:]
+    rigid[3 * ROOT : 3 * ROOT + 3] = axis_angle(rotation)
+    rigid[3 * NECK : 3 * NECK + 3] = axis_angle(rotation.T @ before @ neck)
+    rigid[-3:] += (before - rotation) @ arm
+    return changed
+
+
+def head_turn(parameters: np.ndarray) -> np.ndarray:
+    """(3, 3) orientation of the head in the world."""
+    root, neck = axis_angle_matrices(np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)]))
+    return np.asarray(root @ neck)
+
+
+def joint_rotation(parameters: np.ndarray, joint: int) -> np.ndarray:
+    """(3,) axis-angle of a joint in (E + 18,) parameters."""
+    return np.asarray(parameters[-RIGID_SIZE:][3 * joint : 3 * joint + 3])
+
+
+def axis_angle(rotation: np.ndarray) -> np.ndarray:
+    """(3,) of a rotation (3, 3)."""
+    return np.asarray(to_axis_angle(from_matrices(rotation[None]))[0])
+
+
+def grown(where: np.ndarray, share: float) -> np.ndarray:
+    """The pixels (H, W) bool with those around them, as far as a share of the image's height."""
+    return np.asarray(binary_dilation(where, iterations=max(1, round(share * len(where)))))
+
+
+def _masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3) uint8 over plain gray."""
+    share = mask[..., None].astype(np.float32) / 255
+    return np.asarray(image * share + PLAIN_LEVEL * (1 - share) + 0.5, np.uint8)
