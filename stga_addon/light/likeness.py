@@ -7,7 +7,7 @@ import numpy as np
 from .bounce import Bounce
 from .harmonics import COUNT, LAMBERT
 
-UNLIKE_LIGHT = 0.3
+UNLIKE_LIGHT = 0.2
 """Difference between two lights from which on nothing is kept, as a share of the capture's light."""
 ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
 """Difference between what arrives at a splat, now and in the capture, up to which all is kept and from which on

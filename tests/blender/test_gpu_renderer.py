@@ -194,7 +194,7 @@ def relit_layers(mode: str) -> list[SceneLayer]:
     world = np.random.default_rng(3).normal(0, 0.1, (9, 3)) + uniform(np.full(3, 0.4))
     light = Lighting(world, lights, mode=mode, mix=0.6, exposure=0.3, white=(1.1, 1.0, 0.9))
     if mode == "kept":  # nearly the light of the capture, some of whose colors are kept
-        dim = tuple(replace(light, color=0.06 * light.color) for light in lights)
+        dim = tuple(replace(light, color=0.15 * light.color) for light in lights)
         light = Lighting(uniform((0.6, 0.5, 0.4)), dim)
     relit = Relit(Relighter(avatar), mesh, light, (wall,))
     assert (relit.relighter.distant_in_head(mesh, light)[1].share > 0.2) == (mode == "kept")

@@ -13,7 +13,7 @@ from typing import Any
 import gpu
 from gpu.types import GPUShaderCreateInfo, GPUStageInterfaceInfo
 
-from ...light.likeness import UNLIKE_AT_SPLAT, ALIKE_AT_SPLAT
+from ...light.likeness import ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT
 from ...light.relight import HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE, REFLECTANCE, WET_HIGHLIGHT_SHARE
 from ...light.shadows import BIAS_M, LIFT_M, MAP_SIZE, MAX_BIAS_M, TAP_STEP
 from .relit_packing import LIGHT_TEXELS, MAP_TEXELS, RELIT_TEXELS, SURFACE_TEXELS, VERTEX_TEXELS

@@ -78,7 +78,7 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     show(browser, tmp_path, head.data(exact=exact))
     world, sun_light = harmonics(), SUN
     if alike:
-        world, sun_light = head.avatar.light.radiance * np.array([1.2, 1.0, 0.8]), {**SUN, "color": [0.2, 0.15, 0.1]}
+        world, sun_light = head.avatar.light.radiance * np.array([1.2, 1.0, 0.8]), {**SUN, "color": [0.6, 0.45, 0.3]}
     set_lighting(browser, str({"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5}))
     order = np.argsort(head.avatar.splats.face, kind="stable")
     relighter = Relighter(head.avatar)

@@ -6,7 +6,7 @@
 import { COSINE_LOBE, HARMONICS } from './harmonics.js';
 
 /** Difference between two lights from which on nothing is kept, as a share of the capture's light. */
-const UNLIKE_LIGHT = 0.3;
+const UNLIKE_LIGHT = 0.2;
 /** Difference between what arrives at a splat, now and in the capture, up to which all is kept, and from which nothing. */
 export const ALIKE_AT_SPLAT = 0.25;
 export const UNLIKE_AT_SPLAT = 0.75;

@@ -41,13 +41,7 @@ export function tailTexels(harmonics, strains) {
  * @param {string} [byView] variable that is added to
  * @param {string} [byStrain] the same of what depends on strain
  */
-export function tailColor(
-  harmonics,
-  strains,
-  direction = 'uToWorld * center',
-  byView = 'color',
-  byStrain = 'color',
-) {
+export function tailColor(harmonics, strains, direction = 'uToWorld * center', byView = 'color', byStrain = 'color') {
   const texels = tailTexels(harmonics, strains);
   const lines = [];
   for (let t = 0; t < texels; t++) lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
