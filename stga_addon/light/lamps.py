@@ -91,7 +91,7 @@ def distant_light(light: Light, center: np.ndarray) -> np.ndarray:
         rows = light_rows(light, center, -1)
         share = 1.0 if light.kind == "point" else max(along, 0.0) if light.kind == "area" else _in_cone(light, along)
         arriving = rows[:, 7:10].sum(0) * share / distance**2
-    return basis(toward[None]).T * (arriving * light.diffuse)
+    return np.asarray(basis(toward[None]).T * (arriving * light.diffuse))
 
 
 def _in_cone(light: Light, along: float) -> float:

@@ -192,10 +192,12 @@ def relit_layers(mode: str) -> list[SceneLayer]:
     )
     wall = Caster(np.array([[0.1, 0.1, 0.2], [0.2, 0.1, 0.2], [0.15, 0.3, 0.2]]), np.array([[0, 1, 2]]))
     world = np.random.default_rng(3).normal(0, 0.1, (9, 3)) + uniform(np.full(3, 0.4))
-    light = Lighting(world, lights, mode=mode, mix=0.6, exposure=0.3, white=(1.1, 1.0, 0.9))
-    if mode == "kept":  # nearly the light of the capture, some of whose colors are kept
+    light = Lighting(world, lights, exposure=0.3, white=(1.1, 1.0, 0.9))
+    if mode == "mix":
+        light = replace(light, mode=mode, mix=0.6)
+    elif mode == "kept":  # nearly the light of the capture, some of whose colors are kept
         dim = tuple(replace(light, color=0.15 * light.color) for light in lights)
-        light = Lighting(uniform((0.6, 0.5, 0.4)), dim)
+        light = Lighting(uniform((0.6, 0.5, 0.4)), dim, exposure=0.7)
     relit = Relit(Relighter(avatar), mesh, light, (wall,))
     assert (relit.relighter.distant_in_head(mesh, light)[1].share > 0.2) == (mode == "kept")
     shown = SceneLayer(avatar.splats, avatar.frames(mesh), TURNED, relit=relit)
