@@ -1,66 +1,126 @@
-"""The kernels of `raster.cpu.shade` and `raster.cpu.shadow` in NumPy, for Pythons without Numba such as Blender's."""
+"""The kernels of `raster.cpu.shade` and `raster.cpu.shadow` in NumPy, for Pythons without Numba such as Blender's.
+
+Vectors are rows of their own here, (3, N): NumPy is slow where the last axis is short.
+"""
+
+from collections.abc import Callable
 
 import numpy as np
 
-CHUNK_TEXELS = 1 << 20
-"""Candidate texels that are tested at a time, to bound the memory."""
+CHUNK_TEXELS = 1 << 17
+"""Texels in the boxes around triangles that are drawn at a time, to bound the memory."""
+CHUNK_POINTS = 1 << 13
+"""Points that are computed at a time, whose arrays stay in the processor's cache."""
 SUN, SPOT, AREA = 0, 2, 3
-MIN_FACING = 0.05
+MIN_FACING = np.float32(0.05)
+ONE, EIGHTH, PI = np.float32(1), np.float32(0.125), np.float32(np.pi)
 
 
 def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None:
     """As `raster.cpu.shadow.add_depths`."""
     size = len(depth)
-    corners = points[faces].astype(np.float64)
-    corners = corners[np.isfinite(corners).all((1, 2))]
-    low = np.ceil(np.clip(corners[:, :, :2].min(1), 0, size) - 0.5).astype(np.int64).clip(0)
-    high = np.floor(np.clip(corners[:, :, :2].max(1), -1, size) - 0.5).astype(np.int64).clip(-1, size - 1)
-    shape = np.maximum(high - low + 1, 0)
-    rows = np.flatnonzero(shape.prod(1))
-    groups = np.cumsum(shape[rows].prod(1)) // CHUNK_TEXELS
-    flat = depth.reshape(-1)
-    for group in np.unique(groups):
-        _add_group(corners[rows[groups == group]], low[rows[groups == group]], shape[rows[groups == group]], flat, size)
+    corners = np.stack([points[faces[:, k]].T for k in range(3)]).astype(np.float64)
+    low, high = np.clip(corners.min(0)[:2], 0, size), np.clip(corners.max(0)[:2], 0, size)
+    area = _crossed(corners[1] - corners[0], corners[2] - corners[0], 0, 1)
+    drawn = np.isfinite(corners).all((0, 1)) & (np.abs(area) > 1e-12) & (low < size).all(0) & (high > 0).all(0)
+    order = np.flatnonzero(drawn)
+    # From far to near, so that the nearest are mostly written last.
+    order = order[np.argsort(-corners[:, 2, order].sum(0))]
+    boxes = np.cumsum((np.ceil(high - low) + 1)[:, order].prod(0))
+    for group in np.split(order, np.flatnonzero(np.diff(boxes // CHUNK_TEXELS)) + 1):
+        _add_group(corners[:, :, group], area[group], depth)
 
 
-def _add_group(corners: np.ndarray, low: np.ndarray, shape: np.ndarray, flat: np.ndarray, size: int) -> None:
-    count = shape.prod(1)
-    face = np.repeat(np.arange(len(count)), count)
-    place = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-    x, y = low[face, 0] + place % shape[face, 0], low[face, 1] + place // shape[face, 0]
-    a, b, c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]
-    inverse = np.where(np.abs(area) > 1e-12, 1 / np.where(area == 0, 1, area), np.nan)
-    dx, dy = x + 0.5 - a[face, 0], y + 0.5 - a[face, 1]
-    u = (dx * c[face, 1] - dy * c[face, 0]) * inverse[face]
-    v = (dy * b[face, 0] - dx * b[face, 1]) * inverse[face]
-    inside = (u >= 0) & (v >= 0) & (u + v <= 1)
-    face, u, v = face[inside], u[inside], v[inside]
-    z = (a[face, 2] + u * b[face, 2] + v * c[face, 2]).astype(np.float32)
-    np.minimum.at(flat, y[inside] * size + x[inside], z)
+def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None:
+    """Draw triangles (3 corners, 3, F) row by row: of each the texels between where it begins and ends."""
+    size, u, v = len(depth), corners[1] - corners[0], corners[2] - corners[0]
+    across, down = _crossed(u, v, 2, 1) / area, _crossed(u, v, 0, 2) / area
+    plane = across, down, corners[0, 2] - across * corners[0, 0] - down * corners[0, 1]
+    high, middle, low = np.take_along_axis(corners, np.argsort(corners[:, 1], axis=0)[:, None], axis=0)
+    rows = np.ceil(high[1] - 0.5) - 1, np.floor(middle[1] - 0.5), np.floor(low[1] - 0.5)
+    limits = [np.clip(row, -1, size - 1).astype(np.int64) for row in rows]
+    long = _line(high, low)
+    for before, last, short in ((*limits[:2], _line(high, middle)), (*limits[1:], _line(middle, low))):
+        count = last - before
+        row = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count - before - 1, count)
+        y = row + 0.5
+        a, b = (np.repeat(slope, count) * y + np.repeat(begin, count) for slope, begin in (long, short))
+        begin = np.ceil(np.maximum(np.minimum(a, b), 0) - 0.5).clip(0)
+        texels = np.maximum(np.floor(np.minimum(np.maximum(a, b), size) - 0.5) - begin + 1, 0).astype(np.int64)
+        steepness, down, z = (np.repeat(values, count) for values in plane)
+        z += steepness * (begin + 0.5) + down * y
+        along = np.arange(int(texels.sum())) - np.repeat(np.cumsum(texels) - texels, texels)
+        at = np.repeat(row * size + begin.astype(np.int64), texels) + along
+        z, steepness = (np.repeat(values.astype(np.float32), texels) for values in (z, steepness))
+        _write_least(depth.reshape(-1), at, z + steepness * along.astype(np.float32))
+
+
+def _crossed(u: np.ndarray, v: np.ndarray, i: int, j: int) -> np.ndarray:
+    return np.asarray(u[i] * v[j] - u[j] * v[i])
+
+
+def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slope and begin of the lines through a and b (3, F): x = slope · y + begin."""
+    height = b[1] - a[1]
+    slope = (b[0] - a[0]) / np.where(height == 0, 1, height)
+    return slope, a[0] - slope * a[1]
+
+
+def _write_least(values: np.ndarray, at: np.ndarray, found: np.ndarray) -> None:
+    """As `np.minimum.at`, which older NumPy is slow at: what is still less after it was written is written again."""
+    while len(at):
+        less = found < values[at]
+        at, found = at[less], found[less]
+        values[at] = found
 
 
 def lit_shares(depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: float, lit: np.ndarray) -> None:
-    """As `raster.cpu.shadow.lit_shares`."""
-    size, reach = len(depth), 1 if step > 0 else 0
+    """As `raster.cpu.shadow.lit_shares`; step: a whole number."""
+    size, reach = len(depth), int(step)
+    border, width = 2 * reach + 3, 2 * reach + 2
     # The map with a border that blocks nothing; farther places are moved onto it.
-    padded = np.full((size + 4, size + 4), np.inf, np.float32)
-    padded[2:-2, 2:-2] = depth
-    flat, width = padded.reshape(-1), size + 4
-    z, lit[:] = points[:, 2] - bias, 0
-    for across in range(-reach, reach + 1):
-        for down in range(-reach, reach + 1):
-            x = np.clip(points[:, 0] - np.float32(0.5) + np.float32(across * step), -1.5, size + 0.5)
-            y = np.clip(points[:, 1] - np.float32(0.5) + np.float32(down * step), -1.5, size + 0.5)
-            left, top = np.floor(x), np.floor(y)
-            right_share, lower_share = x - left, y - top
-            at = (top.astype(np.int32) + 2) * width + left.astype(np.int32) + 2
-            for offset, weight in (
-                (0, (1 - right_share) * (1 - lower_share)), (1, right_share * (1 - lower_share)),
-                (width, (1 - right_share) * lower_share), (width + 1, right_share * lower_share),
-            ):  # fmt: skip
-                lit += np.where(z <= flat[at + offset], weight, np.float32(0))
-    lit /= np.float32((2 * reach + 1) ** 2)
+    padded = np.full((size + 2 * border,) * 2, np.inf, np.float32)
+    padded[border:-border, border:-border] = depth
+    least, most = _windows(padded, width, np.minimum), _windows(padded, width, np.maximum)
+    for start in range(0, len(points), CHUNK_POINTS):
+        part = slice(start, start + CHUNK_POINTS)
+        x, y = (np.clip(points[part, k] - np.float32(0.5), -1.5 - reach, size + reach + 0.5) + border for k in range(2))
+        z = points[part, 2] - bias[part]
+        corner = (y.astype(np.int64) - reach) * least.shape[1] + (x.astype(np.int64) - reach)
+        # Most points are nearer than all texels that are looked up, or farther.
+        found = (z <= least.reshape(-1)[corner]).astype(np.float32)
+        between = np.flatnonzero((found == 0) & (z <= most.reshape(-1)[corner]))
+        found[between] = _looked_up(padded, x[between], y[between], z[between], reach)
+        lit[part] = found
+
+
+def _windows(values: np.ndarray, width: int, reduced: Callable[..., np.ndarray]) -> np.ndarray:
+    """Least or largest of the `width` × `width` values from each place on."""
+    span = 1
+    while span < width:
+        shift = min(span, width - span)
+        values = reduced(values[:-shift], values[shift:])
+        values, span = reduced(values[:, :-shift], values[:, shift:]), span + shift
+    return values
+
+
+def _looked_up(padded: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, step: int) -> np.ndarray:
+    """(N,) share of the 3 × 3 places around x, y (N,), or of the one, that z (N,) is not farther than."""
+    flat, width = padded.reshape(-1), len(padded)
+    left, top = np.floor(x), np.floor(y)
+    right, lower = x - left, y - top
+    at = top.astype(np.int64) * width + left.astype(np.int64)
+    taps = (-step, 0, step) if step else (0,)
+    lit = np.zeros(len(z), np.float32)
+    for row in taps:
+        for below, weight in ((0, 1 - lower), (1, lower)):
+            open_ = np.zeros(len(z), np.float32)
+            for column in taps:
+                place = at + ((row + below) * width + column)
+                open_ += np.where(z <= flat.take(place), 1 - right, 0)
+                open_ += np.where(z <= flat.take(place + 1), right, 0)
+            lit += weight * open_
+    return lit / np.float32(len(taps) ** 2)
 
 
 def add_lights(
@@ -68,37 +128,42 @@ def add_lights(
     lights: np.ndarray, lit: np.ndarray, irradiance: np.ndarray, highlight: np.ndarray,
 ) -> None:  # fmt: skip
     """As `raster.cpu.shade.add_lights`."""
-    view = eye - points
-    view = view / np.sqrt(np.maximum((view * view).sum(1), np.float32(1e-20)))[:, None]
-    toward_eye = np.maximum((normals * view).sum(1), np.float32(MIN_FACING))
-    alpha = roughness * roughness
-    for light in lights:
-        toward, strength, width = _toward(light, points)
-        facing = np.maximum((normals * toward).sum(1), 0)
-        if light[12] >= 0:
-            strength = strength * lit[int(light[12])]
-        arriving = (strength * facing)[:, None] * light[7:10]
-        irradiance += arriving * light[13]
-        if light[14] > 0 and alpha.any():
-            half = toward + view
-            half = half / np.sqrt(np.maximum((half * half).sum(1), np.float32(1e-12)))[:, None]
-            gloss = _ggx(
-                facing, toward_eye, np.clip((normals * half).sum(1), 0, 1), np.clip((view * half).sum(1), 0, 1),
-                alpha, width, reflectance,
-            )  # fmt: skip
-            highlight += arriving * (gloss * light[14])[:, None]
+    for start in range(0, len(points), CHUNK_POINTS):
+        part = slice(start, start + CHUNK_POINTS)
+        place, normal = (np.ascontiguousarray(rows[part].T) for rows in (points, normals))
+        view = eye[:, None] - place
+        view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
+        surface = normal, view, np.maximum(_dot(normal, view), MIN_FACING), roughness[part], reflectance[part]
+        arriving, reflected = np.zeros_like(view), np.zeros_like(view)
+        for light in lights:
+            toward, strength, width = _toward(light, place)
+            strength = strength * np.maximum(_dot(normal, toward), 0)
+            if light[12] >= 0:
+                strength *= lit[int(light[12]), part]
+            if strength.any():
+                arriving += (light[13] * light[7:10])[:, None] * strength
+                if light[14] > 0:
+                    strength *= _gloss(toward, width, *surface)
+                    reflected += (light[14] * light[7:10])[:, None] * strength
+        irradiance[part] += arriving.T
+        highlight[part] += reflected.T
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) of vectors (3, N)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _toward(light: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors (N, 3) to a light (a row of `raster.cpu.shade`), factors (N,) of its color, and its width (N,)."""
+    """Unit vectors (3, N) to a light (a row of `raster.cpu.shade`), factors (N,) of its color, and its width (N,)."""
     if light[0] == SUN:
-        ones = np.ones(len(points), np.float32)
-        return np.broadcast_to(-light[4:7], points.shape), ones, light[15] * ones
-    toward = light[1:4] - points
-    square = np.maximum((toward * toward).sum(1), np.float32(1e-8))
+        ones = np.ones(points.shape[1], np.float32)
+        return np.broadcast_to(-light[4:7, None], points.shape), ones, light[15] * ones
+    toward = light[1:4, None] - points
+    square = np.maximum(_dot(toward, toward), np.float32(1e-8))
     away = 1 / np.sqrt(square)
-    toward *= away[:, None]
-    strength, along = 1 / square, -(toward @ light[4:7])
+    toward *= away
+    strength, along = 1 / square, -_dot(toward, light[4:7])
     if light[0] == AREA:
         strength = strength * np.maximum(along, 0)
     elif light[0] == SPOT:
@@ -107,16 +172,22 @@ def _toward(light: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return toward, strength, light[15] * away
 
 
-def _ggx(
-    facing: np.ndarray, toward_eye: np.ndarray, half: np.ndarray, fresnel_cosine: np.ndarray, alpha: np.ndarray,
-    width: np.ndarray, reflectance: np.ndarray,
+def _gloss(
+    toward: np.ndarray, width: np.ndarray, normal: np.ndarray, view: np.ndarray, toward_eye: np.ndarray,
+    roughness: np.ndarray, reflectance: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """As `raster.cpu.shade.ggx`, widened by the light's width."""
-    square = np.minimum(alpha * alpha + np.float32(0.125) * width * width, 1)
-    spread = half * half * (square - 1) + 1
-    distribution = square / np.maximum(np.pi * spread * spread, 1e-12)
-    shadowing = facing * np.sqrt(toward_eye * toward_eye * (1 - square) + square)
-    shadowing += toward_eye * np.sqrt(facing * facing * (1 - square) + square)
-    fresnel = reflectance + (1 - reflectance) * (1 - fresnel_cosine) ** 5
-    found = distribution * fresnel / (2 * np.maximum(shadowing, 1e-12))
-    return np.asarray(np.where((facing > 0) & (alpha > 0), found, 0), np.float32)
+    """(N,) as `raster.cpu.shade.ggx` of lights that are `width` (N,) wide; 0 where there is no roughness."""
+    half = toward + view
+    half *= 1 / np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))
+    facing = np.maximum(_dot(normal, toward), 0)
+    alpha = roughness * roughness
+    square = np.minimum(alpha * alpha + EIGHTH * width * width, ONE)
+    half_cosine = np.clip(_dot(normal, half), 0, 1)
+    spread = half_cosine * half_cosine * (square - ONE) + ONE
+    shadowing = facing * np.sqrt(toward_eye * toward_eye * (ONE - square) + square)
+    shadowing += toward_eye * np.sqrt(facing * facing * (ONE - square) + square)
+    fade = ONE - np.clip(_dot(view, half), 0, 1)
+    fade_square = fade * fade
+    fresnel = reflectance + (ONE - reflectance) * fade_square * fade_square * fade
+    found = square * fresnel / np.maximum(2 * PI * spread * spread * shadowing, np.float32(1e-12))
+    return np.asarray(np.where(alpha > 0, found, np.float32(0)))

@@ -14,10 +14,11 @@ from ..capture.rigid import weighted_procrustes
 from ..errors import StgaError
 from .bounce import Bounce
 from .harmonics import GLOSSY, basis, even_directions, rotated, sh_color
-from .lamps import Lamps
+from .lamps import Lamps, distant_light
+from .likeness import Kept, kept, kept_shares, recorded_light
 from .shadows import LIFT_M
-from .surface import at_splats, barycentric, vertex_normals
-from .values import Caster, Lighting
+from .surface import at_splats, surface_points, vertex_normals
+from .values import SKIN_ROUGHNESS, Caster, Lighting
 
 REFLECTANCE = 0.04
 """Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
@@ -41,8 +42,7 @@ class Relighter:
         if avatar.light is None:
             raise StgaError("the avatar does not know the light of its capture; `stga relight RUN` estimates it")
         self.avatar, self.light = avatar, avatar.light
-        self.corners = np.ascontiguousarray(avatar.faces[avatar.splats.face])
-        self.weights = barycentric(avatar).astype(np.float32)
+        self.corners, self.weights = surface_points(avatar)
 
     @cached_property
     def transfer(self) -> np.ndarray:
@@ -86,6 +86,11 @@ class Relighter:
         return np.where(count > 0.5, total / count, constant)
 
     @cached_property
+    def recorded_light(self) -> np.ndarray:
+        """(9, 3) harmonics of the capture's light in the axes of the neutral mesh, mean over its timesteps."""
+        return recorded_light(self.light.transfer, self.bounce, self.light.irradiance)
+
+    @cached_property
     def normal(self) -> np.ndarray:
         """(N, 3) the mesh's smooth normal at the splat, in the axes of its triangle (`FaceFrames.rotation`)."""
         mesh = self.avatar.neutral.astype(np.float64)
@@ -119,19 +124,38 @@ class Relighter:
         lit *= np.float32(2**lighting.exposure) / np.asarray(lighting.white, np.float32)
         return lit if share == 1 else share * lit + (1 - share) * self._recorded(mesh, eye)
 
+    def distant_in_head(self, mesh: np.ndarray, lighting: Lighting) -> tuple[np.ndarray, Kept]:
+        """(9, 6) float32 harmonics of the world, and of the world with lamps as if they were far away, in the axes of
+        the neutral mesh, for a head posed as `mesh` (V, 3); and how much of recorded colors they keep."""
+        center = (mesh.max(0) + mesh.min(0)) / 2
+        distant = lighting.world + sum((distant_light(light, center) for light in lighting.lights), np.zeros((9, 3)))
+        # Both at once: turning them into the head's axes takes longer than the rest.
+        both = self.world_in_head(mesh, np.concatenate([lighting.world, distant], axis=1))
+        found = kept(self.recorded_light, both[:, 3:])
+        # Other highlights than the capture's are asked for.
+        same = max(0.0, 1 - abs(lighting.specular - 1)) * max(0.0, 1 - abs(lighting.roughness / SKIN_ROUGHNESS - 1))
+        return both.astype(np.float32), replace(found, share=found.share * same)
+
     def _lit(self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster]) -> np.ndarray:
         vertex_normal = vertex_normals(mesh, self.avatar.faces)
-        points, normals = self._at_splats(mesh), self._unit(self._at_splats(vertex_normal))
-        world = self.world_in_head(mesh, lighting.world).astype(np.float32)
+        distant, likeness = self.distant_in_head(mesh, lighting)
+        world = distant[:, :3]
         lamps = Lamps(lighting, mesh, self.avatar.faces, casters)
         at_vertices = np.maximum(self.light.transfer @ world, 0)
         at_vertices += lamps.irradiance(mesh + LIFT_M * vertex_normal, vertex_normal)
+        # All at once, because the places of the vertices in memory are what takes time.
+        at_splats = self._at_splats(np.concatenate([mesh, vertex_normal, self.bounce.light(at_vertices)], axis=1))
+        points, normals = np.ascontiguousarray(at_splats[:, :3]), self._unit(at_splats[:, 3:6])
         roughness = np.where(self.roughness > 0, self.roughness, np.float32(max(lighting.roughness, 0.05)))
         arriving, highlight = lamps.shade(points + LIFT_M * normals, normals, eye, roughness, REFLECTANCE)
-        arriving += np.maximum(self.transfer @ world, 0) + self._at_splats(self.bounce.light(at_vertices))
+        arriving += np.maximum(self.transfer @ world, 0) + at_splats[:, 6:]
         highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
         albedo = self._albedo(self.diffuse_color + self._strain_color(mesh)) if self._strained else self.albedo
-        return np.asarray(albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight)
+        lit = np.asarray(albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight)
+        if likeness.share > 0:
+            same = np.asarray(likeness.gain, np.float32) * self._recorded(mesh, eye)
+            lit += kept_shares(likeness, arriving, self.irradiance)[:, None] * (same - lit)
+        return lit
 
     def _sky_highlight(
         self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray, roughness: np.ndarray
@@ -141,13 +165,14 @@ class Relighter:
         if not np.any(world):
             return np.zeros_like(points)
         view = self._unit(eye.astype(np.float32) - points)
-        cosine = np.maximum((normals * view).sum(1), np.float32(0.02))
-        seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ (GLOSSY[:, None] * world), 0)
+        cosine = np.maximum(np.einsum("nk,nk->n", normals, view), np.float32(0.02))
+        glossy = (GLOSSY[:, None] * world).astype(np.float32)
+        seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
         x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
         z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
-        share = np.minimum(x * x, 2 ** (-9.28 * cosine)) * x + y
+        share = np.minimum(x * x, np.exp2(np.float32(-9.28) * cosine)) * x + y
         reflected = REFLECTANCE * (z - 1.04 * share) + 1.04 * share + w
-        return np.asarray((seen * (reflected * self.occlusion)[:, None]).astype(np.float32))
+        return np.asarray(seen * (reflected * self.occlusion)[:, None], np.float32)
 
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
@@ -192,7 +217,8 @@ class Relighter:
 
     @staticmethod
     def _unit(vectors: np.ndarray) -> np.ndarray:
-        return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+        square = np.einsum("nk,nk->n", vectors, vectors)  # np.linalg.norm is slow where the last axis is short
+        return np.asarray(vectors / np.maximum(np.sqrt(square), np.float32(1e-12))[:, None])
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:

@@ -76,14 +76,17 @@ def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightV
 def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
     """What `light_view` sees, as a function of points."""
     view = light_view(head_bounds(vertices), light, size)
+    axes, shift = view.axes.astype(np.float32), (view.origin @ view.axes).astype(np.float32)
 
     def project(points: np.ndarray) -> np.ndarray:
-        local = (points - view.origin) @ view.axes
+        local = np.asarray(points, np.float32) @ axes - shift
+        factor: np.ndarray | np.float32 = np.float32(view.scale)
         if not view.is_parallel:
-            depth = local[:, 2:]
-            local[:, :2] /= np.where(depth > 1e-4, depth, np.nan)
-        local[:, :2] = local[:, :2] * view.scale + size / 2
-        return np.asarray(local, np.float32)
+            depth = local[:, 2]
+            factor = factor / np.where(depth > 1e-4, depth, np.float32(np.nan))
+        for k in range(2):
+            local[:, k] = local[:, k] * factor + np.float32(size / 2)
+        return np.asarray(local)
 
     return project
 
@@ -129,10 +132,11 @@ class ShadowMap:
     def _slope_bias(self, points: np.ndarray, normals: np.ndarray, bias: float, step: float) -> np.ndarray:
         """(N,) float32 meters."""
         if self._light.kind == "sun":
-            cosine = -(normals @ self._light.direction)
+            cosine = normals @ -self._light.direction.astype(np.float32)
         else:
-            away = self._light.position - points
-            cosine = (normals * away).sum(1) / np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+            away = self._light.position.astype(np.float32) - points
+            length = np.sqrt(np.einsum("nk,nk->n", away, away))
+            cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
         cosine = np.clip(cosine, 0.05, 1)
         slope = np.sqrt(1 - cosine**2) / cosine
         return np.asarray(np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32)

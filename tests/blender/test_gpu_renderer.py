@@ -192,18 +192,24 @@ def relit_layers(mode: str) -> list[SceneLayer]:
     )
     wall = Caster(np.array([[0.1, 0.1, 0.2], [0.2, 0.1, 0.2], [0.15, 0.3, 0.2]]), np.array([[0, 1, 2]]))
     world = np.random.default_rng(3).normal(0, 0.1, (9, 3)) + uniform(np.full(3, 0.4))
-    light = Lighting(world, lights, mode=mode, mix=0.6, exposure=0.3, white=(1.1, 1.0, 0.9))
+    light = Lighting(world, lights, exposure=0.3, white=(1.1, 1.0, 0.9))
+    if mode == "mix":
+        light = replace(light, mode=mode, mix=0.6)
+    elif mode == "kept":  # nearly the light of the capture, some of whose colors are kept
+        dim = tuple(replace(light, color=0.15 * light.color) for light in lights)
+        light = Lighting(uniform((0.6, 0.5, 0.4)), dim, exposure=0.7)
     relit = Relit(Relighter(avatar), mesh, light, (wall,))
+    assert (relit.relighter.distant_in_head(mesh, light)[1].share > 0.2) == (mode == "kept")
     shown = SceneLayer(avatar.splats, avatar.frames(mesh), TURNED, relit=relit)
     recorded = SceneLayer(avatar.splats, avatar.frames(mesh), np.diag([0.5, 0.5, 0.5, 1]) + np.eye(4, k=3) * 0.2)
     return [recorded, shown]
 
 
 @pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
-@pytest.mark.parametrize("mode", ["scene", "mix"])
+@pytest.mark.parametrize("mode", ["scene", "mix", "kept"])
 def test_light_of_the_scene(mode):
-    """Catches a light, shadow, highlight or bounce that the GPU computes otherwise than `Relighter`, and a layer as
-    recorded that is lit, too."""
+    """Catches a light, shadow, highlight, bounce or share of recorded colors that the GPU computes otherwise than
+    `Relighter`, and a layer as recorded that is lit, too."""
     layers, camera = relit_layers(mode), look_at((0.3, 0.2, 0.7), (0, 0, 0), 160, 200, 300)
     found: list[ComposedImage] = []
 

@@ -8,6 +8,7 @@ import pytest
 from light.scenes import lit_avatar
 from stga_addon.capture.color import srgb_to_linear
 from stga_addon.errors import StgaError
+from stga_addon.light import likeness
 from stga_addon.light.harmonics import rotated, sh_color, uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Light, Lighting
@@ -72,7 +73,8 @@ def test_a_still_head_under_still_light_does_not_flicker(relighter):
 
 def test_recorded_and_mix(relighter):
     """Catches a mix in display values, and modes that are exchanged."""
-    mesh, lighting = relighter.avatar.neutral, Lighting(uniform((1, 0.2, 0.2)))
+    sun = Light("sun", np.array([3.0, 2.0, 1.0]), direction=(1, 0, 0))
+    mesh, lighting = relighter.avatar.neutral, Lighting(uniform((0.1, 0.02, 0.02)), (sun,))
     sh = relighter.avatar.splats.sh
     recorded = relighter.colors(mesh, EYE, replace(lighting, mode="recorded"))
     np.testing.assert_allclose(recorded, sh_color(sh, np.tile(EYE, (len(sh), 1))), atol=1e-5)
@@ -83,8 +85,10 @@ def test_recorded_and_mix(relighter):
     )
 
 
-def test_the_captures_own_light_gives_back_what_was_recorded(relighter):
-    """Catches light that is taken away otherwise than it is given: bounce, occlusion, exposure, white."""
+def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypatch):
+    """Catches light that is taken away otherwise than it is given: bounce, occlusion, exposure, white; also where
+    nothing of the recorded colors is kept."""
+    monkeypatch.setattr(likeness, "UNLIKE_LIGHT", 1e-12)
     own = Lighting(relighter.light.radiance)
     lit = relighter.radiance(relighter.avatar.neutral, EYE, own)
     recorded = relighter.radiance(relighter.avatar.neutral, EYE, replace(own, mode="recorded"))

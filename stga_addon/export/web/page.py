@@ -24,6 +24,7 @@ MODULES = (
     "bounce.js",
     "surface.js",
     "shaders.js",
+    "likeness.js",
     "light_shaders.js",
     "gl.js",
     "camera.js",

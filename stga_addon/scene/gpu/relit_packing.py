@@ -6,18 +6,19 @@ from functools import lru_cache
 
 import numpy as np
 
-from ...light.harmonics import GLOSSY, basis
+from ...light.harmonics import GLOSSY
 from ...light.lamps import light_rows
+from ...light.likeness import Kept
 from ...light.relight import Relighter
 from ...light.shadows import LightView, head_bounds, light_view, texel_meters
-from ...light.values import Light
 from ..layers import Relit, SceneLayer
 
 SURFACE_TEXELS, VERTEX_TEXELS, LIGHT_TEXELS, MAP_TEXELS = 4, 3, 4, 4
 """Of a splat, of a vertex, of a point that stands for a light, and of a shadow map."""
-RELIT_TEXELS = 13
+RELIT_TEXELS = 14
 """Of a layer: share and factor of color; roughness, specular, first light and number of lights; eye, damping; typical
-albedo; nine harmonics of the world as highlights show them."""
+albedo; nine harmonics of the world as highlights show them; gain and share of what is kept of recorded colors
+(`light.likeness`)."""
 MAX_MAPS = 16
 
 
@@ -67,9 +68,10 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
         relit = layer.relit
         if relit is None:
             continue
-        vertices.append(_vertices(relit))
+        distant, kept = relit.relighter.distant_in_head(relit.mesh, relit.lighting)
+        vertices.append(_vertices(relit, distant))
         points = _lights(relit, maps, map_rows)
-        _fill(block, relit, first + sum(map(len, rows)), len(points) // LIGHT_TEXELS)
+        _fill(block, relit, kept, first + sum(map(len, rows)), len(points) // LIGHT_TEXELS)
         rows.append(points)
     first_map = first + sum(map(len, rows))
     lights = np.concatenate([head.reshape(-1, 4), *rows, *map_rows])
@@ -86,13 +88,14 @@ def with_eye(scene: RelitScene, layers: Sequence[SceneLayer], eye: np.ndarray) -
     return lights
 
 
-def _fill(block: np.ndarray, relit: Relit, first: int, count: int) -> None:
+def _fill(block: np.ndarray, relit: Relit, kept: Kept, first: int, count: int) -> None:
     lighting, relighter = relit.lighting, relit.relighter
     block[0, 0] = lighting.mix if lighting.mode == "mix" else 1
     block[0, 1:] = 2**lighting.exposure / np.asarray(lighting.white)
     block[1] = max(lighting.roughness, 0.05), lighting.specular, first, count
     block[2, 3], block[3, :3] = relighter.light.damping, _typical_albedo(relighter)
-    block[4:, :3] = GLOSSY[:, None] * lighting.world
+    block[4:13, :3] = GLOSSY[:, None] * lighting.world
+    block[13] = *kept.gain, kept.share
 
 
 @lru_cache(maxsize=8)
@@ -126,16 +129,12 @@ def _map_row(view: LightView, texel_m: float) -> np.ndarray:
     return row
 
 
-def _vertices(relit: Relit) -> np.ndarray:
+def _vertices(relit: Relit, distant: np.ndarray) -> np.ndarray:
+    """distant (9, 6): as of `Relighter.distant_in_head`."""
     relighter, mesh = relit.relighter, relit.mesh
     texels = np.zeros((len(mesh), VERTEX_TEXELS, 4), np.float32)
     texels[:, 0, :3], texels[:, 1, :3] = mesh, _normals(relighter)(mesh)
-    lighting, transfer = relit.lighting, relighter.light.transfer
-    center = head_bounds(mesh).center
-    distant = lighting.world + sum((_distant(light, center) for light in lighting.lights), np.zeros((9, 3)))
-    # Both at once: turning them into the head's axes takes longer than the rest.
-    both = relighter.world_in_head(mesh, np.concatenate([lighting.world, distant], axis=1)).astype(np.float32)
-    arriving = np.maximum(transfer @ both, 0)
+    arriving = np.maximum(relighter.light.transfer @ distant, 0)
     texels[:, 2, :3] = arriving[:, :3] + relighter.bounce.light(arriving[:, 3:])
     return texels.reshape(-1, 4)
 
@@ -167,23 +166,3 @@ class _Normals:
 @lru_cache(maxsize=8)
 def _normals(relighter: Relighter) -> _Normals:
     return _Normals(relighter.avatar.faces, len(relighter.avatar.neutral))
-
-
-def _distant(light: Light, center: np.ndarray) -> np.ndarray:
-    """(9, 3): a light as if it were far away, for the light that skin reflects onto skin."""
-    if light.kind == "sun":
-        toward, arriving = -light.direction, light.color
-    else:
-        offset = light.position - center
-        distance = max(float(np.linalg.norm(offset)), 1e-3)
-        toward, along = offset / distance, -float(offset @ light.direction) / distance
-        rows = light_rows(light, center, -1)
-        share = 1.0 if light.kind == "point" else max(along, 0.0) if light.kind == "area" else _in_cone(light, along)
-        arriving = rows[:, 7:10].sum(0) * share / distance**2
-    return basis(toward[None]).T * (arriving * light.diffuse)
-
-
-def _in_cone(light: Light, along: float) -> float:
-    edge = np.cos(light.cone / 2)
-    inside = float(np.clip((along - edge) / max((1 - edge) * light.blend, 1e-4), 0, 1))
-    return inside * inside * (3 - 2 * inside)

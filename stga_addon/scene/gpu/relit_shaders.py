@@ -13,6 +13,7 @@ from typing import Any
 import gpu
 from gpu.types import GPUShaderCreateInfo, GPUStageInterfaceInfo
 
+from ...light.likeness import ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT
 from ...light.relight import HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE, REFLECTANCE, WET_HIGHLIGHT_SHARE
 from ...light.shadows import BIAS_M, LIFT_M, MAP_SIZE, MAX_BIAS_M, TAP_STEP
 from .relit_packing import LIGHT_TEXELS, MAP_TEXELS, RELIT_TEXELS, SURFACE_TEXELS, VERTEX_TEXELS
@@ -38,6 +39,8 @@ RELIT_DEFINES = f"""
 #define HIGHLIGHT_SHARE {HIGHLIGHT_SHARE!r}
 #define WET_HIGHLIGHT_SHARE {WET_HIGHLIGHT_SHARE!r}
 #define MIN_DIFFUSE_SHARE {MIN_DIFFUSE_SHARE!r}
+#define ALIKE_AT_SPLAT {ALIKE_AT_SPLAT!r}
+#define UNLIKE_AT_SPLAT {UNLIKE_AT_SPLAT!r}
 #define PI 3.14159265358979
 """
 
@@ -179,8 +182,14 @@ vec3 relit(int splat, int layer, vec3 recorded, vec3 strain_color)
   if (eye.w > 0.0) {
     albedo = pow(max(albedo, vec3(1e-4)), vec3(1.0 - eye.w)) * pow(typical.rgb, vec3(eye.w));
   }
-  vec3 lit = (albedo * arriving / PI + settings.y * highlight) * factor.yzw;
-  return linear_to_srgb(mix(srgb_to_linear(max(recorded, vec3(0.0))), lit, factor.x));
+  vec3 lit = albedo * arriving / PI + settings.y * highlight, was = srgb_to_linear(max(recorded, vec3(0.0)));
+  vec4 kept = texelFetch(lights, at(row + 13), 0);
+  if (kept.a > 0.0) {
+    vec3 same = kept.rgb * old.rgb;
+    float off = length(arriving - same) / max(length(same), 1e-6);
+    lit = mix(lit, kept.rgb * was, kept.a * (1.0 - smoothstep(ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT, off)));
+  }
+  return linear_to_srgb(mix(was, lit * factor.yzw, factor.x));
 }
 """
 

@@ -67,18 +67,24 @@ def set_lighting(browser: Browser, lighting: str) -> None:
         ({}, True),
         ({"damping": 0.3, "convention": "gaussian_avatars", "sh_degree": 0, "strain": False}, True),
         ({"sh_degree": 2, "strain_position": True}, False),
+        ({"sh_degree": 2, "alike": True}, True),
     ],
 )
 def test_colors_are_the_relighters(options, exact, browser, tmp_path):
-    """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows or highlights that differ
-    from Python's, and a picture that shows other colors."""
+    """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows, highlights or a share of
+    recorded colors that differ from Python's, and a picture that shows other colors."""
+    alike = options.pop("alike", False)
     head = lit_head(**options)
     show(browser, tmp_path, head.data(exact=exact))
-    world = harmonics()
-    set_lighting(browser, str({"harmonics": world.ravel().tolist(), "sun": SUN, "exposure": 0.5}))
+    world, sun_light = harmonics(), SUN
+    if alike:
+        world, sun_light = head.avatar.light.radiance * np.array([1.2, 1.0, 0.8]), {**SUN, "color": [0.6, 0.45, 0.3]}
+    set_lighting(browser, str({"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5}))
     order = np.argsort(head.avatar.splats.face, kind="stable")
     relighter = Relighter(head.avatar)
-    sun = Light("sun", SUN["color"], direction=-np.array(SUN["toward"]))
+    sun = Light("sun", sun_light["color"], direction=-np.array(SUN["toward"]))
+    share = relighter.distant_in_head(head.meshes[0], Lighting(world, (sun,)))[1].share
+    assert 0.3 < share < 0.95 if alike else share < 0.1
     for frame in (0, 2):
         colors = relighter.colors(head.meshes[frame], head.camera.position, Lighting(world, (sun,), exposure=0.5))
         shown = picture(browser, frame)

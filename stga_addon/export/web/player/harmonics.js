@@ -10,7 +10,7 @@ const MIXED = 1.0925484305920792; // xy, yz, xz
 const UPRIGHT = 0.31539156525252005; // 3z² − 1
 const CROSSED = 0.5462742152960396; // x² − y²
 /** Of each coefficient in a lobe max(0, cosine), over its value in the lobe's direction (Ramamoorthi and Hanrahan). */
-const COSINE_LOBE = [Math.PI, ...Array(3).fill((2 * Math.PI) / 3), ...Array(5).fill(Math.PI / 4)];
+export const COSINE_LOBE = [Math.PI, ...Array(3).fill((2 * Math.PI) / 3), ...Array(5).fill(Math.PI / 4)];
 
 /**
  * Basis functions of a unit vector, orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x² − y².

@@ -17,6 +17,7 @@ import {
   VERTEX_TEXELS,
   lightFragmentShader,
 } from './light_shaders.js';
+import { keptColors, recordedLight } from './likeness.js';
 import { TEXTURE_WIDTH } from './shaders.js';
 import { Surface, received, rigidRotation, vertexNormals } from './surface.js';
 import { crossed, scaled, unit } from './vector.js';
@@ -51,6 +52,8 @@ export class LightPass {
     this.shadowProgram = program(gl, SHADOW_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER);
     /** @type {LitBy | null} */
     this.light = null;
+    this.recorded = recordedLight(this.transfer, this.bounce, /** @type {Values} */ (arrays.light_irradiance?.values));
+    this.kept = { share: 0, gain: [0, 0, 0] };
     this.view = sunView(this.neutral, [0, 1, 0]);
   }
 
@@ -82,7 +85,9 @@ export class LightPass {
     const around = Float64Array.from(world);
     if (sun) addPoint(around, sun.toward, sun.color);
     const arriving = received(this.transfer, rotatedLight(world, rotation));
-    this.bounce.add(received(this.transfer, rotatedLight(around, rotation)), arriving);
+    const distant = rotatedLight(around, rotation);
+    this.kept = keptColors(this.recorded, distant);
+    this.bounce.add(received(this.transfer, distant), arriving);
     for (let from = 0, to = 0; from < vertices.length; from += 3, to += 4 * VERTEX_TEXELS) {
       for (let k = 0; k < 3; k++) {
         this.vertexValues[to + k] = vertices[from + k];
@@ -146,12 +151,13 @@ export class LightPass {
    * @param {Program['uniforms']} uniforms
    */
   setLight(light, uniforms) {
-    const { gl, surface } = this;
+    const { gl, surface, kept } = this;
     const world = new Float32Array(3 * HARMONICS);
     for (let k = 0; light && k < world.length; k++) world[k] = GLOSSY[Math.floor(k / 3)] * light.world[k];
     gl.uniform3fv(uniforms['uWorld[0]'], world);
     gl.uniform3f(uniforms.uSunColor, ...(light?.sun?.color ?? [0, 0, 0]));
     gl.uniform1f(uniforms.uFactor, light?.factor ?? 1);
+    gl.uniform4f(uniforms.uKept, kept.gain[0], kept.gain[1], kept.gain[2], kept.share);
     gl.uniform1f(uniforms.uDamping, surface.damping);
     gl.uniform3f(uniforms.uTypical, surface.typical[0], surface.typical[1], surface.typical[2]);
   }

@@ -3,6 +3,7 @@
 // those of STGA for Blender's light/relight.py, light/shadows.py and raster/cpu/shade.py.
 
 import { FACE_TEXELS, SPLAT_TEXELS, TEXTURE_WIDTH, tailColor } from './shaders.js';
+import { ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT } from './likeness.js';
 import { HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE, WET_HIGHLIGHT_SHARE } from './surface.js';
 
 export const SURFACE_TEXELS = 4; // color, roughness | irradiance, occlusion | corners | weights
@@ -114,6 +115,7 @@ export function lightFragmentShader(harmonics, strains) {
 uniform sampler2D uSplats, uTail, uFaces, uSurface, uVertices, uShadows;
 uniform mat3 uToSun;
 uniform vec3 uMiddle, uEye, uSunColor, uTypical, uWorld[9];
+uniform vec4 uKept;
 uniform float uRadius, uTexel, uFactor, uDamping;
 out vec4 result;
 ${SURFACE_FUNCTIONS}
@@ -144,19 +146,18 @@ void main() {
     highlight += light * ggx(facing, max(dot(normal, view), 0.05), clamp(dot(normal, between), 0.0, 1.0),
       clamp(dot(view, between), 0.0, 1.0), pow(roughness, 4.0));
   }
-  vec3 color = surface.rgb;
-  ${strains ? strainColor(harmonics, strains) : ''}
-  vec3 albedo = albedoOf(color, old.rgb, surface.a > 0.0);
-  result = vec4(display(uFactor * (albedo * arriving / PI + highlight)), 1.0);
-}`;
-}
-
-/**
- * @param {number} harmonics
- * @param {number} strains
- */
-function strainColor(harmonics, strains) {
-  return `int triangle = int(texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS}), 0).w);
+  vec3 byView = vec3(0.0), byStrain = vec3(0.0);
+  int triangle = int(texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS}), 0).w);
   vec4 face = texelFetch(uFaces, texel(triangle * ${FACE_TEXELS} + 3), 0);
-  ${tailColor(harmonics, strains, false)}`;
+  ${tailColor(harmonics, strains, 'point - uEye', 'byView', 'byStrain')}
+  vec3 albedo = albedoOf(surface.rgb + byStrain, old.rgb, surface.a > 0.0);
+  vec3 lit = albedo * arriving / PI + highlight, same = uKept.rgb * old.rgb;
+  if (uKept.a > 0.0) {
+    vec3 recorded = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + byView + byStrain;
+    float off = length(arriving - same) / max(length(same), 1e-6);
+    float share = uKept.a * (1.0 - smoothstep(${ALIKE_AT_SPLAT}, ${UNLIKE_AT_SPLAT}, off));
+    lit = mix(lit, uKept.rgb * linear(recorded), share);
+  }
+  result = vec4(display(uFactor * lit), 1.0);
+}`;
 }

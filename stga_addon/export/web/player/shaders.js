@@ -37,20 +37,22 @@ export function tailTexels(harmonics, strains) {
  * Sum of coefficients times basis functions, unrolled: dynamic indices are slow on many GPUs.
  * @param {number} harmonics
  * @param {number} strains
- * @param {boolean} [fromView] whether to add what depends on the view
+ * @param {string} [direction] in which the eye sees the splat
+ * @param {string} [byView] variable that is added to
+ * @param {string} [byStrain] the same of what depends on strain
  */
-export function tailColor(harmonics, strains, fromView = true) {
+export function tailColor(harmonics, strains, direction = 'uToWorld * center', byView = 'color', byStrain = 'color') {
   const texels = tailTexels(harmonics, strains);
   const lines = [];
   for (let t = 0; t < texels; t++) lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
   const part = (/** @type {number} */ k) => `t${k >> 2}.${'xyzw'[k & 3]}`;
   const triple = (/** @type {number} */ k) => `vec3(${part(3 * k)}, ${part(3 * k + 1)}, ${part(3 * k + 2)})`;
-  if (harmonics && fromView) {
-    lines.push('vec3 d = normalize(uToWorld * center);');
+  if (harmonics) {
+    lines.push(`vec3 d = normalize(${direction});`);
     lines.push('float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;');
   }
-  for (let k = 0; k < harmonics && fromView; k++) lines.push(`color += (${SH[k]}) * ${triple(k)};`);
-  for (let k = 0; k < strains; k++) lines.push(`color += face.${'xyz'[k]} * ${triple(harmonics + k)};`);
+  for (let k = 0; k < harmonics; k++) lines.push(`${byView} += (${SH[k]}) * ${triple(k)};`);
+  for (let k = 0; k < strains; k++) lines.push(`${byStrain} += face.${'xyz'[k]} * ${triple(harmonics + k)};`);
   return lines.join('\n  ');
 }
 

@@ -14,6 +14,7 @@ export const MIN_DIFFUSE_SHARE = 0.1;
 const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
 const VIEW_DIRECTIONS = 96;
 const MIN_VIEW_COSINE = 0.3;
+const MAX_STEPS = 6; // triangles that a splat walks over
 const LEAST_ALBEDO = 1e-4;
 const CONSTANT = 0.28209479177387814; // harmonic of degree 0
 
@@ -44,18 +45,31 @@ export class Surface {
   }
 
   /**
+   * The point of the mesh that each splat belongs to: from its own triangle on, it walks over the edge beyond which it
+   * lies; of the triangles that it comes by, the one with the nearest point counts.
    * @param {Arrays} arrays
    * @param {FaceFrames} frames
    */
   placeSplats({ xyz, neutral, faces, splats_per_face }, frames) {
-    for (let face = 0, splat = 0; face < splats_per_face.values.length; face++) {
-      const ids = faces.values.subarray(3 * face, 3 * face + 3);
-      const corner = (/** @type {number} */ k) => neutral.values.subarray(3 * ids[k], 3 * ids[k] + 3);
-      const weightsAt = barycentric(corner(0), corner(1), corner(2));
-      for (const end = splat + splats_per_face.values[face]; splat < end; splat++) {
-        const point = placed(frames.world, face, xyz.values, splat);
-        this.weights.set(weightsAt(point), 3 * splat);
-        for (let k = 0; k < 3; k++) this.corners[3 * splat + k] = ids[k];
+    const beyond = beyondEdges(faces.values);
+    const corner = (/** @type {number} */ face, /** @type {number} */ k) => {
+      const from = 3 * faces.values[3 * face + k];
+      return neutral.values.subarray(from, from + 3);
+    };
+    for (let own = 0, splat = 0; own < splats_per_face.values.length; own++) {
+      for (const end = splat + splats_per_face.values[own]; splat < end; splat++) {
+        const point = placed(frames.world, own, xyz.values, splat);
+        let [least, face] = [Infinity, own];
+        for (let step = 0; step <= MAX_STEPS && face >= 0; step++) {
+          const { inside, weights, distance } = nearest(corner(face, 0), corner(face, 1), corner(face, 2), point);
+          if (distance < least) {
+            least = distance;
+            this.weights.set(weights, 3 * splat);
+            for (let k = 0; k < 3; k++) this.corners[3 * splat + k] = faces.values[3 * face + k];
+          }
+          const outermost = Math.min(...inside);
+          face = outermost < 0 ? beyond[3 * face + inside.indexOf(outermost)] : -1;
+        }
       }
     }
   }
@@ -111,26 +125,51 @@ function placed(world, face, xyz, splat) {
 }
 
 /**
- * A function that gives the weights of a triangle's corners at the point nearest to one, within it up to clamping.
+ * Of the edge opposite to each corner (3·F), the triangle beyond it; -1: none.
+ * @param {Values} faces
+ */
+function beyondEdges(faces) {
+  const found = new Int32Array(faces.length).fill(-1);
+  /** @type {Map<number, number>} */
+  const open = new Map();
+  for (let c = 0; c < faces.length; c++) {
+    const first = c - (c % 3);
+    const [a, b] = [faces[first + ((c + 1) % 3)], faces[first + ((c + 2) % 3)]];
+    const key = Math.min(a, b) * faces.length + Math.max(a, b);
+    const other = open.get(key);
+    if (other !== undefined) {
+      found[c] = Math.floor(other / 3);
+      if (found[other] < 0) found[other] = Math.floor(c / 3);
+    }
+    open.set(key, c);
+  }
+  return found;
+}
+
+/**
+ * Barycentric coordinates of a point in a triangle's plane, the same clamped to the triangle, and the square of the
+ * distance from there.
  * @param {ArrayLike<number>} a
  * @param {ArrayLike<number>} b
  * @param {ArrayLike<number>} c
+ * @param {Vector} point
  */
-function barycentric(a, b, c) {
-  const [first, second] = [difference(b, a), difference(c, a)];
+function nearest(a, b, c, point) {
+  const [first, second, offset] = [difference(b, a), difference(c, a), difference(point, a)];
   const uu = dotProduct(first, first);
   const uv = dotProduct(first, second);
   const vv = dotProduct(second, second);
   const area = Math.max(uu * vv - uv * uv, 1e-30);
-  return (/** @type {Vector} */ point) => {
-    const offset = difference(point, a);
-    const [pu, pv] = [dotProduct(offset, first), dotProduct(offset, second)];
-    const u = (vv * pu - uv * pv) / area;
-    const v = (uu * pv - uv * pu) / area;
-    const weights = [1 - u - v, u, v].map((weight) => Math.max(0, Math.min(1, weight)));
-    const sum = weights[0] + weights[1] + weights[2];
-    return weights.map((weight) => weight / sum);
-  };
+  const [pu, pv] = [dotProduct(offset, first), dotProduct(offset, second)];
+  const u = (vv * pu - uv * pv) / area;
+  const v = (uu * pv - uv * pu) / area;
+  const inside = [1 - u - v, u, v];
+  const clamped = inside.map((weight) => Math.max(0, Math.min(1, weight)));
+  const sum = clamped[0] + clamped[1] + clamped[2];
+  const weights = clamped.map((weight) => weight / sum);
+  let distance = 0;
+  for (let k = 0; k < 3; k++) distance += (offset[k] - weights[1] * first[k] - weights[2] * second[k]) ** 2;
+  return { inside, weights, distance };
 }
 
 /**
