@@ -1,14 +1,15 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
     python benchmarks/iteration.py [--head ellipsoid] [--device gpu] [--splats 60000] [--width 802] [--height 550]
-                                   [--repeats 30] [--opensplat FOLDER] [--out FILE.json]
+                                   [--repeats 30] [--opensplat FOLDER] [--processor-time] [--out FILE.json]
 
 Splats of SH degree 3 on the demo's head (16,000 triangles, denser at eyes and mouth, as heads are), or on an evenly
 covered ellipsoid, for which a selection costs most. On the CPU: the instruction set, and medians over repeats in one
 process; beside each stage the bytes it must at least move and the time that takes at this machine's measured copy
 bandwidth. On a GPU, whose queue is never waited for: means over all repeats, the same table by kernel, the dispatches,
 submits, waits and milliseconds that an iteration takes of the host, and the device's memory. --opensplat: a checkout of
-OpenSplat, whose CPU rasterizer is compiled and run on the same splats. Run it on an idle machine.
+OpenSplat, whose CPU rasterizer is compiled and run on the same splats. Run it on an idle machine, or with
+--processor-time: instead of time that passes, that of the processor, of ours divided by its threads.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 import trimesh
@@ -99,14 +100,19 @@ def front_camera(width: int, height: int) -> Camera:
     return Camera(width, height, 2.43 * width, 2.43 * width, width / 2, height / 2, view)
 
 
-def median_ms(work: Callable[[], object], repeats: int) -> float:
-    """Median wall time of `work` in milliseconds, after two calls that are not counted."""
+def median_ms(work: Callable[[], object], repeats: int, clock: Callable[[], float] = perf_counter) -> float:
+    """Median time of `work` in milliseconds, after two calls that are not counted; clock: returns seconds."""
     times = []
     for _ in range(repeats + 2):
-        begin = perf_counter()
+        begin = clock()
         work()
-        times.append(1e3 * (perf_counter() - begin))
+        times.append(1e3 * (clock() - begin))
     return statistics.median(times[2:])
+
+
+def time_of_a_thread() -> float:
+    """Seconds of processor time that this process has used, divided by its threads."""
+    return process_time() / threads()
 
 
 def copy_bandwidth() -> float:
@@ -116,7 +122,9 @@ def copy_bandwidth() -> float:
     return 2 * source.nbytes / (median_ms(lambda: np.copyto(target, source), 5) / 1e3)
 
 
-def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, tuple[float, int]]:
+def stages(
+    splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]
+) -> dict[str, tuple[float, int]]:
     """stage -> (median ms, bytes that it must move at least)."""
     n, (width, height) = len(splats), frames.size.tolist()
     pixels, background = width * height, np.ones(3, np.float32)
@@ -150,7 +158,7 @@ def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str
             count * 8 + n * 24,
         ),
         "blend": (
-            lambda: blend_forward(r.tiles, tiles_x, lists, r.projection, background, r.blended),
+            lambda: blend_forward(r.tiles, tiles_x, r.tile_rows, lists, r.projection, background, r.blended),
             count * 44 + pixels * 20,
         ),
         "L1 + SSIM, both ways": (
@@ -172,7 +180,7 @@ def stages(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str
         ),
         "Adam": (lambda: adam.step(state, rows, RATES), len(rows) * 59 * 4 * 9),
     }  # fmt: skip
-    return {name: (median_ms(call, repeats), moved) for name, (call, moved) in work.items()}
+    return {name: (median_ms(call, repeats, clock), moved) for name, (call, moved) in work.items()}
 
 
 def device_step(
@@ -203,6 +211,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=550)
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--opensplat", type=Path, metavar="FOLDER")
+    parser.add_argument("--processor-time", action="store_true", help="of the CPU, for a loaded machine")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     if options.opensplat and options.device != "cpu":
@@ -215,12 +224,13 @@ def main() -> None:
     chosen, why = choose_device(options.device)
     print(why)
     backend, batch = device_step(chosen, splats, mesh, faces, camera, target)
+    clock = time_of_a_thread if options.processor_time else perf_counter
     if chosen == "cpu":
-        measure = partial(cpu_ms, backend, options.repeats)
+        measure = partial(cpu_ms, backend, options.repeats, clock)
         frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
-        found = cpu_table(splats, frames, target, options.repeats)
+        found = cpu_table(splats, frames, target, options.repeats, clock)
         if options.opensplat:
-            compare_opensplat(options.opensplat, splats, frames, target, found, options.repeats)
+            compare_opensplat(options.opensplat, splats, frames, target, found, options.repeats, clock)
     else:
         import gpu_kernels  # needs wgpu
 
@@ -238,9 +248,9 @@ def main() -> None:
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
-def cpu_ms(backend: Backend, repeats: int, batch: Batch) -> float:
-    """Median wall time in milliseconds of an iteration on the CPU."""
-    return median_ms(lambda: backend.step(batch), repeats)
+def cpu_ms(backend: Backend, repeats: int, clock: Callable[[], float], batch: Batch) -> float:
+    """Median time in milliseconds of an iteration on the CPU."""
+    return median_ms(lambda: backend.step(batch), repeats, clock)
 
 
 def instruction_set() -> str:
@@ -250,11 +260,11 @@ def instruction_set() -> str:
     return f"{config.CPU_NAME or get_host_cpu_name()}: {' '.join(vectors)}"
 
 
-def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[str, float]:
+def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]) -> dict[str, float]:
     """Print the stages beside their floors; returns their times."""
     bandwidth = copy_bandwidth()
     print(f"{threads()} threads, copy {bandwidth / 1e9:.1f} GB/s, {instruction_set()}")
-    found = stages(splats, frames, target, repeats)
+    found = stages(splats, frames, target, repeats, clock)
     print(f"{'stage':<22}{'ms':>8}{'MB':>8}{'floor ms':>10}{'ratio':>7}")
     for name, (ms, moved) in found.items():
         floor = 1e3 * moved / bandwidth
@@ -263,8 +273,9 @@ def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int) -> dict[
 
 
 def compare_opensplat(
-    folder: Path, splats: Splats, frames, target: np.ndarray, found: dict[str, float], repeats: int
-) -> None:
+    folder: Path, splats: Splats, frames, target: np.ndarray, found: dict[str, float], repeats: int,
+    clock: Callable[[], float],
+) -> None:  # fmt: skip
     """Print both rasterizers' times for one image and its gradient; found: stage -> ms of ours."""
     import opensplat  # needs a C++ compiler
 
@@ -281,12 +292,13 @@ def compare_opensplat(
     v_image = np.empty_like(output.image)
     image_gradient(output.image, target, whole_image(*target.shape[:2]), 0.2, v_image)
     peer = opensplat.both_ways_ms(
-        folder, output.projection, output.lists.visible, output.image.copy(), v_image, min(repeats, 5)
-    )
+        folder, output.projection, output.lists.visible, output.image.copy(), v_image, min(repeats, 5),
+        perf_counter if clock is perf_counter else process_time,
+    )  # fmt: skip
     blending = found["blend"] + found["blend backward"]
     print(f"{'OpenSplat, both ways':<22}{peer[1]:8.2f}   forward {peer[0]:.2f}, on one thread, without projection")
     print(f"{'blending, both ways':<22}{blending:8.2f}   {peer[1] / blending:.1f} times as fast")
-    ours = median_ms(both_ways, repeats)
+    ours = median_ms(both_ways, repeats, clock)
     print(f"{'rendering, both ways':<22}{ours:8.2f}   {peer[1] / ours:.1f} times as fast, with projection and sorting")
 
 

@@ -300,15 +300,18 @@ def test_reused_buffers_change_nothing():
             np.testing.assert_array_equal(got, want, err_msg=name)
 
 
-def test_focused_rendering_gives_selected_rows_the_full_images_gradient():
-    """Catches a local iteration whose restricted tiles change the gradient of a selected splat."""
-    scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
-    focus = np.zeros(80, bool)
-    focus[[3, 17, 40]] = True
+@pytest.mark.parametrize("count", [80, 900])
+def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
+    """Catches a local iteration whose restricted tiles change the gradient of a selected splat, and frozen splats in
+    front of it or behind that are left out where it reaches."""
+    scene = cloud(21, count=count, size=(100, 70), log_scale=-3.0)
+    xyz = scene.splats["xyz"]
+    focus = np.isin(np.arange(80), [3, 17, 40]) if count == 80 else np.linalg.norm(xyz - xyz[3], axis=1) < 0.3
     full, expected, _, _ = raw_gradients(scene)
     part, gradients, rows, _ = raw_gradients(scene, focus=focus, reach=10)
     assert 0 < len(part.tiles) < len(full.tiles)
-    assert set(rows) <= {3, 17, 40}
+    assert len(rows)
+    assert focus[rows].all()
     for name in NAMES:
         np.testing.assert_array_equal(getattr(gradients, name)[focus], getattr(expected, name)[focus], err_msg=name)
 
@@ -339,6 +342,14 @@ def test_focused_image_is_the_full_image_within_reach():
     assert not near.all()
     np.testing.assert_array_equal(part.image[:, near], full.image[:, near])
     np.testing.assert_array_equal(part.transmittance[near], full.transmittance[near])
+    rendered = np.zeros_like(touched)
+    for tile, (a, b, c, d) in enumerate(part.tile_rows.tolist()):
+        y, x = 16 * (tile // 7), 16 * (tile % 7)
+        rendered[y + a : y + b, x : x + 8] = rendered[y + c : y + d, x + 8 : x + 16] = True
+    assert rendered[near].all()
+    beyond = rendered & ~np.kron(part.touched, np.ones((16, 16), bool))[:70, :100]
+    beyond[max(0, ys.min() - 14) : ys.max() + 15, max(0, xs.min() - 20) : xs.max() + 21] = False
+    assert not beyond.any()
 
 
 def test_results_do_not_depend_on_threads():

@@ -8,17 +8,19 @@ pytest.importorskip("numba")
 from stga_addon.raster.cpu.layout import TileLists
 from stga_addon.raster.cpu.rasterize import balance_tiles
 from stga_addon.raster.cpu.threads import cut, set_threads, threads
-from stga_addon.raster.cpu.tiles import depth_order, list_visible
+from stga_addon.raster.cpu.tiles import SPLATS_PER_SORT, depth_order, list_visible
 
 
 @pytest.mark.parametrize("most", [1.0, 1.0 + 1e-6, 1.1, 3.0, 1e9, 3e38])
 @pytest.mark.parametrize("least", [1.0, 0.01])
 def test_depths_are_sorted_whatever_their_range(least, most):
-    """Catches a pass left out where depths differ in high bits only, and equal depths that change places."""
+    """Catches a pass left out where depths differ in high bits only, equal depths that change places, and parts that
+    overlap or lose splats where they meet."""
     rng = np.random.default_rng(0)
-    depth = np.geomspace(least, most, 3000).astype(np.float32)[rng.integers(0, 3000, 5000)]
-    candidates = np.flatnonzero(rng.random(5000) < 0.7).astype(np.int32)
+    depth = np.geomspace(least, most, 3000).astype(np.float32)[rng.integers(0, 3000, 60_000)]
+    candidates = np.flatnonzero(rng.random(60_000) < 0.7).astype(np.int32)
     expected = candidates[np.argsort(depth[candidates], kind="stable")]
+    assert len(expected) > 2 * SPLATS_PER_SORT
     np.testing.assert_array_equal(depth_order(depth, candidates), expected)
 
 

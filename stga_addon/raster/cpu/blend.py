@@ -152,12 +152,28 @@ def _blend_pair(first, past, q, order, batch, s):
         s[LAST + p] = np.int32(max(np.float32(s[LAST + p]).view(np.int32), reached)).view(np.float32)
 
 
+@part_jit
+def _begin_tile(s, tile_rows, tile):
+    """Nothing in front of the pixels of a tile's needed rows; those of the others have stopped."""
+    for p in range(np.uint64(PIXELS)):
+        s[p] = np.float32(1.0)
+        s[SUM_RED + p] = s[SUM_GREEN + p] = s[SUM_BLUE + p] = s[LAST + p] = np.float32(0.0)
+    for half in range(2):
+        first, past = _pixel_range(tile_rows, tile, half)
+        begin = np.uint64(half * HALF_PIXELS)
+        for p in range(begin, first):
+            s[p] = np.float32(-1.0)
+        for p in range(past, begin + np.uint64(HALF_PIXELS)):
+            s[p] = np.float32(-1.0)
+
+
 @parallel(lambda tiles, *_: len(tiles))
 @jit
-def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, background, blended):
+def blend_forward(first_tile, past_tile, tiles, tiles_x, tile_rows, lists, projection, background, blended):
     """Render the listed tiles to `blended`; the tuples are those of `layout.py`.
 
-    tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; background (3,): composited behind the splats.
+    tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; tile_rows (tiles, 4): their rows that are needed, see
+    `find_needed_rows`; pixels of the others are undefined. background (3,): composited behind the splats.
     """
     start, pair_splat, projected, extent_y = lists.start, lists.pair_splat, projection.columns, projection.extent_y
     image, transmittance, last, pair_rows = blended.image, blended.transmittance, blended.last, blended.pair_rows
@@ -167,9 +183,7 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, back
     for k in range(first_tile, past_tile):
         tile = tiles[k]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        for p in range(np.uint64(PIXELS)):
-            s[p] = np.float32(1.0)
-            s[SUM_RED + p] = s[SUM_GREEN + p] = s[SUM_BLUE + p] = s[LAST + p] = np.float32(0.0)
+        _begin_tile(s, tile_rows, np.uint64(tile))
         begin, end = start[tile], start[tile + 1]
         for batch_begin in range(begin, end, BATCH_PAIRS):
             low, high = _rows_alive(s, 0)
@@ -208,6 +222,22 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, lists, projection, back
                     image[2, y, x] = s[SUM_BLUE + p] + t * background[2]
                     transmittance[y, x] = t
                     last[y, x] = np.int32(s[LAST + p])
+
+
+@part_jit
+def _find_wanted_rows(first, past, pair_splat, pair_rows, wanted, found):
+    """Which rows of each half of a tile the wanted ones of its pairs reach, to found[0]; laid out like pair_rows."""
+    found[0, 0] = found[0, 2] = TILE
+    found[0, 1] = found[0, 3] = 0
+    for j in range(np.uint64(first), np.uint64(past)):
+        if wanted[pair_splat[j]]:
+            for half in range(2):
+                low, high = pair_rows[j, 2 * half], pair_rows[j, 2 * half + 1]
+                if low < high:
+                    found[0, 2 * half] = min(found[0, 2 * half], low)
+                    found[0, 2 * half + 1] = max(found[0, 2 * half + 1], high)
+            if found[0, 1] - found[0, 0] == TILE and found[0, 3] - found[0, 2] == TILE:
+                break
 
 
 @inline_jit
@@ -287,6 +317,7 @@ def blend_backward(
     transmittance, last, pair_rows = blended.transmittance, blended.last, blended.pair_rows
     height, width = last.shape
     s, batch, sums = np.empty(STATE_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32), np.empty(PROJECTED, np.float32)
+    rows = np.empty((1, 4), np.uint8)
     _set_coordinates(s)
     for k in range(first_tile, past_tile):
         tile = tiles[k]
@@ -318,6 +349,7 @@ def blend_backward(
         nearest = begin  # nothing in front of the first wanted pair needs to be walked
         while nearest < begin + deepest and not wanted[pair_splat[nearest]]:
             nearest += 1
+        _find_wanted_rows(nearest, begin + deepest, pair_splat, pair_rows, wanted, rows)
         batch_end = begin + deepest
         while batch_end > nearest:
             batch_begin = max(nearest, batch_end - BATCH_PAIRS)
@@ -330,10 +362,13 @@ def blend_backward(
                 sums[:] = np.float32(0.0)
                 for half in range(2):
                     first, past = _pixel_range(pair_rows, j, half)
+                    if not is_wanted:  # a frozen one is only stepped through, where a wanted one reaches
+                        low, high = _pixel_range(rows, 0, half)
+                        first, past = max(first, low), min(past, high)
                     if past <= first:
                         continue
                     _unblend_pair(first, past, q, order, batch, s)
-                    if is_wanted:  # a frozen splat only has to be stepped through, in the very same arithmetic
+                    if is_wanted:
                         _sum_falloff_gradient(first, past, q, batch, s, sums)
                         _sum_color_gradient(first, past, s, sums)
                 if is_wanted:

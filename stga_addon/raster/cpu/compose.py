@@ -21,6 +21,7 @@ from .rasterize import (
     tile_grid,
     with_strain_color,
 )
+from .tiles import whole_tiles
 
 
 def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
@@ -37,17 +38,17 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
             camera), splats.sh_degree, False, layer.antialiased, Projection(*(array[rows] for array in projection)),
         )  # fmt: skip
         begin = rows.stop
-    lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
+    lists, whole = sort_into_tiles(projection, tiles_x, tiles_y, buffers), whole_tiles(tiles_x * tiles_y)
     tiles = balance_tiles(np.arange(tiles_x * tiles_y, dtype=np.int32), lists)
     blended = new_image(camera.width, camera.height, lists, buffers)
-    blend_forward(tiles, tiles_x, lists, projection, BLACK_BACKGROUND, blended)
+    blend_forward(tiles, tiles_x, whole, lists, projection, BLACK_BACKGROUND, blended)
     rgb, alpha = blended.image, 1 - blended.transmittance
     if not with_depth:
         return ComposedImage(rgb, alpha, None)
     projection.columns[:, RED] = projection.depth
     projection.columns[:, GREEN] = projection.columns[:, BLUE] = 0
     blended = new_image(camera.width, camera.height, lists, BufferPool())
-    blend_forward(tiles, tiles_x, lists, projection, BLACK_BACKGROUND, blended)
+    blend_forward(tiles, tiles_x, whole, lists, projection, BLACK_BACKGROUND, blended)
     return ComposedImage(rgb, alpha, blended.image[0] / np.maximum(alpha, np.finfo(np.float32).tiny))
 
 

@@ -57,14 +57,18 @@ def adam_rows(first_row, past_row, rows, steps, parameters, options):
         np.empty(ROWS_PER_BLOCK, np.float32),
         np.empty(ROWS_PER_BLOCK, np.float32),
     )
+    latest, first, second, share = np.int32(-1), ZERO, ZERO, ZERO
     for begin in range(first_row, past_row, ROWS_PER_BLOCK):
         end = min(past_row, begin + ROWS_PER_BLOCK)
         for n in range(begin, end):
             steps[rows[n]] += 1
-            count = np.float64(steps[rows[n]])
-            correct1[n - begin] = 1.0 / (1.0 - math.exp(count * log1))
-            correct2[n - begin] = 1.0 / math.sqrt(1.0 - math.exp(count * log2))
-            ema_shares[n - begin] = max(np.float64(options.ema_share), 4.0 / (count + 3.0))
+            if steps[rows[n]] != latest:  # neighbors are mostly trained equally often
+                latest = steps[rows[n]]
+                count = np.float64(latest)
+                first = np.float32(1.0 / (1.0 - math.exp(count * log1)))
+                second = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
+                share = np.float32(max(np.float64(options.ema_share), 4.0 / (count + 3.0)))
+            correct1[n - begin], correct2[n - begin], ema_shares[n - begin] = first, second, share
         for p in range(len(parameters)):
             _adam_block(rows[begin:end], parameters[p], correct1, correct2, ema_shares, options)
 
@@ -173,8 +177,9 @@ def opacity_weight(first_row, past_row, rows, opacity, share, weight, gradient):
     """
     for n in range(first_row, past_row):
         i = rows[n]
-        value = ONE / (ONE + math.exp(-opacity[i]))
-        gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)
+        if share[i] != ZERO:  # bound splats have none
+            value = ONE / (ONE + math.exp(-opacity[i]))
+            gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)
 
 
 @jit

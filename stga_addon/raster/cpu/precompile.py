@@ -30,7 +30,7 @@ from .rasterize import (
     tile_grid,
     with_strain_color,
 )
-from .tiles import mark_tiles
+from .tiles import depth_order, find_needed_rows, whole_tiles
 
 PACKAGE = "stga_addon"
 SIZE = 16
@@ -78,10 +78,11 @@ def compile_rasterizer() -> None:
     face, projection = np.zeros(2, np.int32), new_projection(2, buffers)
     project_forward(np.arange(2), touched, splats, face, frames, 3, False, False, projection)
     projection.rect[:] = 0
-    mark_tiles(projection.rect, np.arange(2), touched)
+    find_needed_rows(projection, np.arange(2), np.float32(0), tiles_x, tiles_y)
+    depth_order(np.arange(1, 3, dtype=np.float32), np.arange(2, dtype=np.int32))
     lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
     blended = new_image(SIZE, SIZE, lists, buffers)
-    blend_forward(tiles, tiles_x, lists, projection, BLACK_BACKGROUND, blended)
+    blend_forward(tiles, tiles_x, whole_tiles(len(tiles)), lists, projection, BLACK_BACKGROUND, blended)
     v_image, v_transmittance = np.zeros((3, SIZE, SIZE), np.float32), np.zeros((SIZE, SIZE), np.float32)
     pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
     blend_backward(

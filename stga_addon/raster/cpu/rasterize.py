@@ -14,7 +14,16 @@ from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .project import compose_frames, project_backward, project_forward
 from .threads import pieces_of
-from .tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs, list_visible, mark_tiles
+from .tiles import (
+    SORT_PARTS,
+    compute_offsets,
+    count_pairs,
+    depth_order,
+    fill_pairs,
+    find_needed_rows,
+    list_visible,
+    whole_tiles,
+)
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
 RUN_TILES = 4
@@ -25,14 +34,16 @@ RUN_TILES = 4
 class RenderOutput:
     """An image and what its backward pass needs; the tuples are those of `layout.py`.
 
-    tiles (T,) int32: the rendered tiles; pixels of all others are undefined. focus (N,) bool: the splats that need a
-    gradient, or None for all; touched (tiles_y, tiles_x) bool: the tiles that they reach.
+    tiles (T,) int32: the rendered tiles, tile_rows (tiles, 4) uint8: their rows that are, see `find_needed_rows`; all
+    other pixels are undefined. focus (N,) bool: the splats that need a gradient, or None for all; touched (tiles_y,
+    tiles_x) bool: the tiles that they reach.
     """
 
     blended: Blended
     projection: Projection
     lists: TileLists
     tiles: np.ndarray
+    tile_rows: np.ndarray
     focus: np.ndarray | None
     touched: np.ndarray
     background: np.ndarray
@@ -59,12 +70,13 @@ class BufferPool:
         self._kept: dict[str, tuple[tuple[int, ...], np.ndarray]] = {}
 
     def get(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
-        """An uninitialized array; the same memory whenever the same name is asked for again."""
+        """An array to be written; the same memory whenever the same name is asked for again."""
         size = prod(shape)
         buffer = self._buffers.get(name)
         if buffer is None or len(buffer) < size:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
-            buffer = self._buffers[name] = np.empty(size + size // 8, dtype)
+            # Zeros, not what memory held: where a local iteration does not render, nothing may be infinite or NaN.
+            buffer = self._buffers[name] = np.zeros(size + size // 8, dtype)
         return buffer[:size].reshape(shape)
 
     def kept(self, name: str, key: tuple[int, ...], make: Callable[..., np.ndarray]) -> np.ndarray:
@@ -106,8 +118,8 @@ def render_forward(
     """Render N embedded splats over a background color (3,).
 
     splats: numpy arrays; face (N,) int32; degree: of the spherical harmonics used.
-    focus (N,) bool: render only the tiles that these splats touch and those at most `reach` pixels away, which is all
-    that can influence their gradient; None renders everything.
+    focus (N,) bool: render only the tiles that these splats touch and what is at most `reach` pixels away from the
+    splats, which is all that can influence their gradient; None renders everything.
     depth_as_color: the first channel blends camera depth, the others are zero.
     antialiased: splats narrower than a pixel, which are rendered a pixel wide, lose the opacity that this adds.
     buffers: memory to reuse; the output is then valid until the next one with the same buffers.
@@ -123,19 +135,21 @@ def render_forward(
     touched = rendered = np.ones((tiles_y, tiles_x), bool)
     if focus is None:
         project(buffers.kept("everything", (len(splats.xyz),), np.arange), rendered)
+        tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), whole_tiles)
     else:
-        project(np.flatnonzero(focus), rendered)
-        touched = np.zeros_like(rendered)
-        mark_tiles(projection.rect, np.flatnonzero(focus), touched)
-        rendered = _dilate(touched, reach)
+        focused = np.flatnonzero(focus)
+        project(focused, rendered)
+        touched, tile_rows = find_needed_rows(projection, focused, np.float32(reach), tiles_x, tiles_y)
+        left, past_left, right, past_right = tile_rows.T
+        rendered = ((left < past_left) | (right < past_right)).reshape(touched.shape)
         project(np.flatnonzero(~focus), rendered)
     lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
     tiles = balance_tiles(np.flatnonzero(rendered).astype(np.int32), lists)
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
-    blend_forward(tiles, tiles_x, lists, projection, background, blended)
+    blend_forward(tiles, tiles_x, tile_rows, lists, projection, background, blended)
     return RenderOutput(
-        blended, projection, lists, tiles, focus, touched, background, degree, depth_as_color, antialiased
+        blended, projection, lists, tiles, tile_rows, focus, touched, background, degree, depth_as_color, antialiased
     )
 
 
@@ -223,16 +237,6 @@ def with_strain_color(splats: Parameters) -> Parameters:
 def tile_grid(width: int, height: int) -> tuple[int, int]:
     """Columns and rows of tiles of an image of width × height pixels."""
     return -(-width // TILE), -(-height // TILE)
-
-
-def _dilate(tiles: np.ndarray, reach: int) -> np.ndarray:
-    """Tiles (rows, columns) bool within `reach` pixels of a marked one."""
-    grown = tiles.copy()
-    for _ in range(-(-reach // TILE)):
-        padded = np.pad(grown, 1)
-        rows = padded[:-2] | padded[1:-1] | padded[2:]
-        grown = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
-    return grown
 
 
 def balance_tiles(tiles: np.ndarray, lists: TileLists) -> np.ndarray:

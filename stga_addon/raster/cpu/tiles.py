@@ -1,11 +1,16 @@
 """Sorting of projected splats into tiles, front to back."""
 
+import math
+
 import numpy as np
 
-from . import inline_jit, jit
-from .threads import parallel
+from . import inline_jit, jit, part_jit
+from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
+from .threads import EVEN_PIECES, parallel
 
 RADIX_BITS = 11
+SPLATS_PER_SORT = 16_384
+"""Splats that a thread sorts at a time."""
 SORT_PARTS = 16
 """Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
 
@@ -20,39 +25,67 @@ def list_visible(rect):
     return found[:count].copy()
 
 
-@jit
-def depth_order(depth, candidates):
+def depth_order(depth: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     """The candidates (M,) int32 sorted by depth, near to far; equal depths keep their order.
 
     Least-significant-digit radix sort on the bits of the float: positive floats order like their bits. Counted from the
     least, the depths of a head have 22 bits, and take two of the three passes.
     """
-    buckets, count = 1 << RADIX_BITS, np.uint64(len(candidates))
-    bits, mask = depth.view(np.uint32), np.uint32(buckets - 1)
-    keys, values = np.empty(len(candidates), np.uint32), candidates.copy()
-    least, most = np.uint32(0xFFFFFFFF), np.uint32(0)
-    for n in range(count):
-        key = bits[np.uint64(candidates[n])]
-        keys[n], least, most = key, min(least, key), max(most, key)
-    next_keys, next_values = np.empty_like(keys), np.empty_like(values)
-    shift = np.uint32(0)
-    while most > least and np.uint32(most - least) >> shift > 0:
-        place = np.zeros(buckets + 1, np.int64)
-        for n in range(count):
-            place[np.uint64((np.uint32(keys[n] - least) >> shift) & mask) + np.uint64(1)] += 1
-        for b in range(buckets):
-            place[b + 1] += place[b]
-        for n in range(count):
-            digit = np.uint64((np.uint32(keys[n] - least) >> shift) & mask)
-            at = np.uint64(place[digit])
-            next_keys[at], next_values[at] = keys[n], values[n]
-            place[digit] += 1
-        keys, next_keys = next_keys, keys
-        values, next_values = next_values, values
-        shift = np.uint32(shift + np.uint32(RADIX_BITS))
-        if shift > np.uint32(2 * RADIX_BITS):
-            break
+    keys, values = depth.view(np.uint32)[candidates], candidates
+    if len(keys) == 0:
+        return candidates
+    least = keys.min()
+    counts = np.empty((-(-len(keys) // SPLATS_PER_SORT), 1 << RADIX_BITS), np.int32)
+    for shift in range(0, int(keys.max() - least).bit_length(), RADIX_BITS):
+        digit, moved_keys, moved = np.uint32(shift), np.empty_like(keys), np.empty_like(values)
+        count_digits(counts, keys, least, digit)
+        sum_digits(counts)
+        move_by_digit(counts, keys, values, least, digit, moved_keys, moved)
+        keys, values = moved_keys, moved
     return values
+
+
+@inline_jit
+def _digit(key, least, shift):
+    return np.uint64((np.uint32(key - least) >> shift) & np.uint32((1 << RADIX_BITS) - 1))
+
+
+@parallel(lambda counts, *_: len(counts), EVEN_PIECES)
+@jit
+def count_digits(part, past_part, counts, keys, least, shift):
+    """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit occurs.
+
+    The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts, digits) int32.
+    """
+    for k in range(part, past_part):
+        row = counts[k]
+        row[:] = 0
+        for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
+            row[_digit(keys[n], least, shift)] += 1
+
+
+@jit
+def sum_digits(counts):
+    """Turn the counts of `count_digits` into the place of each part's first key of each digit."""
+    found = 0
+    for digit in range(counts.shape[1]):
+        for k in range(counts.shape[0]):
+            count = counts[k, digit]
+            counts[k, digit] = found
+            found += count
+
+
+@parallel(lambda counts, *_: len(counts), EVEN_PIECES)
+@jit
+def move_by_digit(part, past_part, place, keys, values, least, shift, moved_keys, moved):
+    """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_digits` and is advanced."""
+    for k in range(part, past_part):
+        row = place[k]
+        for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
+            digit = _digit(keys[n], least, shift)
+            at = np.uint64(row[digit])
+            moved_keys[at], moved[at] = keys[n], values[n]
+            row[digit] += 1
 
 
 @inline_jit
@@ -136,10 +169,71 @@ def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_p
                 tile, column = _next_tile(tile, column, width, tiles_x)
 
 
+def whole_tiles(count: int) -> np.ndarray:
+    """`find_needed_rows` of an image of `count` tiles that is needed everywhere."""
+    return np.tile(np.array([0, TILE, 0, TILE], np.uint8), (count, 1))
+
+
+@part_jit
+def _cell(pixel, size, cells):
+    """The cell of `size` pixels that a coordinate, float32, lies in, of so many cells."""
+    return np.int64(min(np.float32(cells), max(np.float32(0.0), np.floor(pixel / size))))
+
+
+@part_jit
+def _add_box(count, x0, y0, x1, y1):
+    """Count one more from (x0, y0) to before (x1, y1), as differences between neighbors: four whatever the size."""
+    count[y0, x0] += 1
+    count[y0, x1] -= 1
+    count[y1, x0] -= 1
+    count[y1, x1] += 1
+
+
+@part_jit
+def _sum_boxes(count):
+    """Turn the differences of `_add_box` into counts."""
+    for y in range(count.shape[0]):
+        along = 0
+        for x in range(count.shape[1]):
+            along += count[y, x]
+            count[y, x] = along + (count[y - 1, x] if y > 0 else 0)
+
+
 @jit
-def mark_tiles(rect, splats, marked):
-    """Set marked (tiles_y, tiles_x) bool where one of the splats (M,) reaches; rect (N, 4)."""
-    for i in splats:
-        for y in range(rect[i, 1], rect[i, 3]):
-            for x in range(rect[i, 0], rect[i, 2]):
-                marked[y, x] = True
+def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
+    """The tiles that the listed splats (M,) reach, and the rows of tiles in which a pixel may be at most `reach`
+    pixels, float32, away from one that they reach.
+
+    Returns touched (tiles_y, tiles_x) bool, the tiles that they reach, which are needed whole, and tile_rows (tiles, 4)
+    uint8: first and past-the-last row in the left and in the right half of each tile, both even; the first is not
+    before the other where there are none.
+    """
+    projected, extent_y, rect = projection.columns, projection.extent_y, projection.rect
+    two, half, slack = np.float32(2.0), np.float32(TILE // 2), np.float32(1e-4)
+    strips, pairs = 2 * tiles_x, TILE // 2 * tiles_y  # cells: two rows of half a tile
+    near, reached = np.zeros((pairs + 1, strips + 1), np.int32), np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
+    for n in range(len(splats)):
+        i = np.uint64(splats[n])
+        if rect[i, 2] <= rect[i, 0]:
+            continue
+        _add_box(reached, rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3])
+        x, y, ey, shear = projected[i, MEAN_X], projected[i, MEAN_Y], extent_y[i], projected[i, SHEAR]
+        ex = ey * math.sqrt(projected[i, PRECISION_Y] / projected[i, PRECISION_X] + shear * shear)
+        ex, ey = ex + slack * ex + reach + np.float32(0.5), ey + slack * ey + reach + np.float32(0.5)
+        _add_box(
+            near, _cell(x - ex, half, strips), _cell(y - ey, two, pairs), _cell(x + ex + half, half, strips),
+            _cell(y + ey + two, two, pairs),
+        )  # fmt: skip
+    _sum_boxes(reached)
+    _sum_boxes(near)
+    touched, tile_rows = np.empty((tiles_y, tiles_x), np.bool_), np.empty((tiles_y * tiles_x, 4), np.uint8)
+    for tile in range(tiles_y * tiles_x):
+        ty, tx = tile // tiles_x, tile % tiles_x
+        touched[ty, tx] = reached[ty, tx] > 0
+        for side in range(2):
+            first, past = TILE // 2, 0
+            for pair in range(TILE // 2):
+                if touched[ty, tx] or near[ty * (TILE // 2) + pair, 2 * tx + side] > 0:
+                    first, past = min(first, pair), pair + 1
+            tile_rows[tile, 2 * side], tile_rows[tile, 2 * side + 1] = 2 * first, 2 * past
+    return touched, tile_rows

@@ -12,6 +12,9 @@ from ...raster.cpu.layout import TILE
 from ..settings import TrainingSettings
 from .hull_points import voxel_size
 
+BAND_TILES = 12
+"""Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
+
 
 def whole_image(height: int, width: int, parts: tuple[int, int] = (4, 2)) -> np.ndarray:
     """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one thread's work.
@@ -29,9 +32,17 @@ def _edges(side: int, count: int) -> list[int]:
 
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool."""
-    groups = find_objects(label(tiles, np.ones((3, 3)))[0])
-    boxes = [(x.start, y.start, x.stop, y.stop) for y, x in groups]
+    """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool, the largest first.
+
+    Groups of more than BAND_TILES rows are cut into bands, which are narrower and more evenly distributed to threads.
+    """
+    groups, boxes = label(tiles, np.ones((3, 3)))[0], []
+    for number, (y, x) in enumerate(find_objects(groups), 1):
+        group = groups[y, x] == number
+        for top, bottom in pairwise(_edges(len(group), -(-len(group) // BAND_TILES))):
+            columns = np.flatnonzero(group[top:bottom].any(0)) + x.start
+            boxes.append((columns[0], y.start + top, columns[-1] + 1, y.start + bottom))
+    boxes.sort(key=lambda box: (box[0] - box[2]) * (box[3] - box[1]))
     return np.minimum(np.array(boxes, np.int64).reshape(-1, 4) * TILE, [width, height, width, height])
 
 
