@@ -124,7 +124,7 @@ def fit_head(
     found = {t: triangulated(take[t], reliable, neutral, scale) for t in spread}
     world = _average([_aligned(found[t], neutral, reliable, metric) for t in spread])
     seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
-    solved = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE))
+    solved, ordered = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE)), True
     for number in range(ROUNDS):
         report("Fit", number, ROUNDS)
         at = places.on(subject.model.v_template, subject.model.faces)
@@ -139,14 +139,14 @@ def fit_head(
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
             solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
-        solved = solve_take(subject, places, take_observed, solved, ordered=False)
+            alone = solve_take(subject, places, take_observed, solved, ordered=False)
+            ordered = in_order(subject, places, take_observed, alone)
+        solved = solve_take(subject, places, take_observed, solved, ordered)
         seen = {
             t: by_visibility(take[t], subject, places, values, world)
             for t, values in zip(timesteps, solved, strict=True)
         }
     report("Fit", ROUNDS, ROUNDS)
-    ordered = in_order(subject, places, take_observed, solved)
-    solved = solve_take(subject, places, take_observed, solved, ordered)
     return HeadFit(subject, shape, dict(zip(timesteps, solved, strict=True)), world, ordered=ordered)
 
 

@@ -27,7 +27,7 @@ EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.
 """Standard deviations of second differences from one timestep to the next."""
 JUMP_SCALE = 3.0
 """Standard deviations of a second difference beyond which it is a cut rather than a motion."""
-MAX_ORDERED_CHANGE = 0.5
+MAX_ORDERED_CHANGE = 0.7
 """Mean squared change of expression and jaw from one timestep to the next, as a share of that between any two, up to
 which timesteps follow each other in time."""
 IDENTITY_ITERATIONS, TAKE_ITERATIONS = 12, 8
