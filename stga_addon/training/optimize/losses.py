@@ -36,7 +36,8 @@ def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
 
     Groups of more than BAND_TILES rows are cut into bands, which are narrower and more evenly distributed to threads.
     """
-    groups, boxes = label(tiles, np.ones((3, 3)))[0], []
+    groups = label(tiles, np.ones((3, 3)))[0]
+    boxes: list[tuple[int, int, int, int]] = []
     for number, (y, x) in enumerate(find_objects(groups), 1):
         group = groups[y, x] == number
         for top, bottom in pairwise(_edges(len(group), -(-len(group) // BAND_TILES))):
