@@ -16,8 +16,8 @@ from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, r
 
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
-NICENESS = 5
-"""Added to a worker's nice value on Linux and macOS, so that Blender has precedence."""
+NICENESS, BACKGROUND_NICENESS = 5, 15
+"""Added to the priority of a worker, and of what runs in the background, which leaves the processors to workers."""
 PR_SET_PDEATHSIG = 1
 """Of prctl(2)."""
 # Windows: own process group, so that closing the console does not end the worker; no console window; and
@@ -60,7 +60,7 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
         raise
     finally:
         os.close(log)
-    _give_precedence(process)
+    _give_precedence(process, NICENESS)
     return process
 
 
@@ -69,15 +69,15 @@ def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Pop
     the interpreter cannot be started."""
     nothing = subprocess.DEVNULL
     process = start_python(python, arguments, stdin=nothing, stdout=nothing, stderr=nothing, **_DETACHED)
-    _give_precedence(process)
+    _give_precedence(process, BACKGROUND_NICENESS)
     return process
 
 
-def _give_precedence(process: subprocess.Popen[bytes]) -> None:
-    """Lower the priority of a worker on Linux and macOS; Windows starts it with a low one."""
+def _give_precedence(process: subprocess.Popen[bytes], niceness: int) -> None:
+    """Lower the priority of a process on Linux and macOS; Windows starts it with a low one."""
     if os.name != "nt":
         with suppress(OSError):  # the process has ended already
-            os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
+            os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness)
 
 
 def start_python(
