@@ -17,7 +17,8 @@ from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, r
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS, BACKGROUND_NICENESS = 5, 15
-"""Added to the priority of a worker, and of what runs in the background, which leaves the processors to workers."""
+"""Added to the nice value of a worker, so that Blender has precedence, and of what runs in the background, so that
+workers have."""
 PR_SET_PDEATHSIG = 1
 """Of prctl(2)."""
 # Windows: own process group, so that closing the console does not end the worker; no console window; and
