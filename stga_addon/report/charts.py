@@ -61,7 +61,7 @@ def finish_axes(axes: "Axes") -> None:
     if not curves:
         return
     tenth = max(x[-1] for x, _ in curves) / 10
-    lowest = min(min(float(np.interp(tenth, x, y)), *y[x >= tenth].tolist()) for x, y in curves)
+    lowest = min(min([float(np.interp(tenth, x, y)), *y[x >= tenth].tolist()]) for x, y in curves)
     highest = max(float(y.max()) for _, y in curves)
     axes.set_ylim(bottom=lowest - 0.05 * (highest - lowest) - 1e-3)
     axes.set_xlim(left=0)

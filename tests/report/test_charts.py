@@ -45,6 +45,14 @@ def test_the_steep_start_is_cut_off() -> None:
     assert 25 < axes.get_ylim()[0] < lines[1]["psnr"]
 
 
+def test_a_curve_that_ends_before_a_tenth_of_the_time() -> None:
+    """Catches a benchmark without a chart because one of its variants was stopped soon."""
+    long, short = np.linspace(1, 100, 50), np.linspace(1, 5, 5)
+    curves = {n: MeanCurve(x, x, x, x) for n, x in (("long", long), ("short", short))}
+    (axes,) = benchmark_chart(curves, "title").axes
+    assert axes.get_ylim()[0] <= 5
+
+
 def test_the_pareto_front_is_bold_and_bands_belong_to_their_curves() -> None:
     """Catches a front on the wrong curve, and a band of another variant or color."""
     x = np.linspace(1, 10, 50)
