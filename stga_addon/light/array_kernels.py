@@ -136,7 +136,7 @@ def add_lights(
         surface = normal, view, np.maximum(_dot(normal, view), MIN_FACING), roughness[part], reflectance[part]
         arriving, reflected = np.zeros_like(view), np.zeros_like(view)
         for light in lights:
-            toward, strength, width = _toward(light, place)
+            toward, strength, width = toward_light(light, place)
             strength = strength * np.maximum(_dot(normal, toward), 0)
             if light[12] >= 0:
                 strength *= lit[int(light[12]), part]
@@ -154,7 +154,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def _toward(light: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def toward_light(light: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unit vectors (3, N) to a light (a row of `raster.cpu.shade`), factors (N,) of its color, and its width (N,)."""
     if light[0] == SUN:
         ones = np.ones(points.shape[1], np.float32)

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .harmonics import basis
+from .array_kernels import toward_light
+from .harmonics import COUNT, basis
 from .kernels import shade_kernels
 from .shadows import ShadowMap
 from .values import Caster, Light, Lighting
@@ -82,19 +83,8 @@ def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
 
 def distant_light(light: Light, center: np.ndarray) -> np.ndarray:
     """(9, 3) harmonics of a light as if it were far away from a head around `center` (3,), without shadows."""
-    if light.kind == "sun":
-        toward, arriving = -light.direction, light.color
-    else:
-        offset = light.position - center
-        distance = max(float(np.linalg.norm(offset)), 1e-3)
-        toward, along = offset / distance, -float(offset @ light.direction) / distance
-        rows = light_rows(light, center, -1)
-        share = 1.0 if light.kind == "point" else max(along, 0.0) if light.kind == "area" else _in_cone(light, along)
-        arriving = rows[:, 7:10].sum(0) * share / distance**2
-    return np.asarray(basis(toward[None]).T * (arriving * light.diffuse))
-
-
-def _in_cone(light: Light, along: float) -> float:
-    edge = np.cos(light.cone / 2)
-    inside = float(np.clip((along - edge) / max((1 - edge) * light.blend, 1e-4), 0, 1))
-    return inside * inside * (3 - 2 * inside)
+    found = np.zeros((COUNT, 3))
+    for row in light_rows(light, center, -1):
+        toward, strength, _ = toward_light(row, np.asarray(center, np.float32)[:, None])
+        found += basis(toward.T).T * (strength * row[7:10] * row[13])
+    return found

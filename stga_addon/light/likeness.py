@@ -12,7 +12,6 @@ UNLIKE_LIGHT = 0.2
 ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
 """Difference between what arrives at a splat, now and in the capture, up to which all is kept and from which on
 nothing, as a share: other objects' shadows."""
-
 RIDGE = 1e-6
 """Of the mean of a matrix's diagonal, added to it: meshes that receive no light in some harmonics."""
 
