@@ -25,7 +25,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
 from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
-from ..stga_addon.scene.rig.trained import store_range
+from ..stga_addon.scene.rig.trained import store_range, stored_range
 from . import ids
 from .common import (
     FileImport,
@@ -112,11 +112,12 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     )
     neutral: bpy.props.EnumProperty(
         name="Neutral",
-        description="What the motion is taken relative to, so that the performer's own face is not applied",
+        description="What the motion is taken relative to, so that this head's own face is moved, not the performer's",
         items=(
-            ("none", "As Recorded", "Nothing is subtracted"),
-            ("quiet", "Quiet Face", "The median of the frames in which the face rests"),
-            ("first", "First Frame", "The first frame of the file"),
+            ("none", "As Recorded", "Nothing is exchanged"),
+            ("quiet", "Quiet Face", "Both recordings are at rest in the fifth of their frames that are most alike"),
+            ("first", "First Frame", "Both recordings begin at rest"),
+            ("calibrated", "Calibrated", "The motion is relative to the performer's resting face already"),
         ),
         options={"SKIP_SAVE"},
     )
@@ -263,9 +264,15 @@ class ApplyMotion(bpy.types.Operator, FileImport):
 
     def _trained(self, head: Any) -> TrainedRange | None:
         """The range of the head's own recording, where it is asked for."""
-        if not self.stay_trained:
+        if not self.stay_trained and self.neutral == "none":
             return None
-        own = flame_of(capture_of(head), head.name)
+        try:
+            own = flame_of(capture_of(head), head.name)
+        except StgaError as error:
+            if self.stay_trained:
+                raise
+            self._warn(f"{error}; the motion is put on the head without expression, not on its quiet face")
+            return stored_range(head)
         trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
         store_range(head, trained)
         return trained

@@ -250,12 +250,13 @@ def _apply(operator: Any, context: Any, recording: Recording) -> None:
     if warning:
         operator.report({"WARNING"}, warning)
     path = live_session.write_take(recording, folder)
-    options = live_options(scene_settings(context).drive)
+    options = live_options(scene_settings(context).drive, recording.rest is not None)
     try:
         bpy.ops.stga.apply_motion(
             filepath=str(path),
             start=recording.start,
             strength=options.strength,
+            neutral=options.neutral,
             smoothing=options.smoothing,
             mirror=options.mirror,
             stay_trained=options.stay_trained or 0.0,

@@ -123,7 +123,7 @@ class LiveSession:
                 scene.frame_set(scene.frame_current)
 
     def _options(self) -> MotionOptions:
-        return live_options(getattr(bpy.data.scenes[self.scene], ids.SETTINGS).drive)
+        return live_options(getattr(bpy.data.scenes[self.scene], ids.SETTINGS).drive, self.rest is not None)
 
     def _show(self, packet: FacePacket, now: float) -> None:
         options = self._options()
@@ -146,11 +146,12 @@ class LiveSession:
                     area.tag_redraw()
 
 
-def live_options(settings: Any) -> MotionOptions:
-    """The panel's options of a live source."""
+def live_options(settings: Any, calibrated: bool) -> MotionOptions:
+    """The panel's options of a live source, whose resting face is taken off where it is calibrated."""
     exchange = tuple(pair for pair in EXCHANGEABLE if getattr(settings, f"exchange_{pair}"))
     return MotionOptions(
         strength=settings.strength,
+        neutral="calibrated" if calibrated else "none",
         smoothing=settings.smoothing,
         mirror=settings.mirror,
         stay_trained=settings.stay_trained,

@@ -21,7 +21,10 @@ def add_motion_options(parser: ArgumentParser) -> None:
     group = parser.add_argument_group("motion")
     group.add_argument("--strength", type=factor, help="of the motion; 1 (default): as recorded")
     group.add_argument(
-        "--neutral", choices=NEUTRALS, help="take the motion relative to the performer's quiet face or first frame"
+        "--neutral",
+        choices=NEUTRALS,
+        help="take the motion relative to the performer's quiet face or first frame (calibrated: it is already), and "
+        "put it on the head's own",
     )
     group.add_argument("--smooth", type=smoothing, metavar="SECONDS", help="smooth a performance in time")
     group.add_argument("--mirror", action="store_true", help="exchange left and right of a performance")

@@ -48,7 +48,8 @@ class MotionOptions:
     """What is done to a motion on its way to a head.
 
     strength   of expression, jaw, eyes and neck about the neutral face; of the head's motion about its first pose
-    neutral    "none"; "quiet" or "first": the motion is taken relative to the performer's quiet face, or first frame
+    neutral    "none"; "quiet" or "first": the motion is taken relative to the performer's quiet face, or first frame,
+               and put on the head's own; "calibrated": it is relative already, and is put on the head's own
     smoothing  seconds, standard deviation; of performances alone, like the next two
     mirror     exchange left and right
     gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
@@ -148,9 +149,9 @@ def adapted(
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
     """Frames of another person's FLAME motion with the options' neutral, strength and range; and part -> (T,) how far
     they were outside the trained range before they were led back (`transfer.outside`)."""
-    if options.neutral != "none":
-        theirs = quiet_neutral(frames if options.neutral == "quiet" else frames[:1])
-        frames = exchanged_neutral(frames, theirs, None if trained is None else trained.neutral)
+    theirs = {"quiet": frames, "first": frames[:1]}.get(options.neutral)
+    if theirs is not None:
+        frames = exchanged_neutral(frames, quiet_neutral(theirs))
     return _finished(frames, options, trained)
 
 
@@ -164,7 +165,7 @@ def prepared_performance(performance: Performance, options: MotionOptions, fps: 
     if performance.times[-1] * rate > MAX_ROWS:
         raise StgaError(f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is too long")
     rest = None
-    if options.neutral != "none":
+    if options.neutral in ("quiet", "first"):
         weights = quiet_weights(performance) if options.neutral == "quiet" else performance.weights[0]
         rest = replace(performance, weights=weights[None], head=None)
     return smoothed(corrected(resampled(performance, fps), options, rest), options.smoothing)
@@ -191,10 +192,13 @@ def frames_of(
 def _finished(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """The frames at the strength and led back, and how far they were outside the trained range before that."""
+    """The frames on the head's own neutral, where they are relative to the performer's; at the strength, led back, and
+    how far they were outside the trained range before that."""
+    if options.neutral != "none" and trained is not None:
+        frames = exchanged_neutral(frames, None, trained.neutral(options.neutral))
     if options.strength != 1.0:
         frames = strengthened(frames, options.strength)
-    if trained is None:
+    if trained is None or options.stay_trained is None:
         return frames, {}
     beyond = outside(frames, trained)
     return (led_back(frames, trained, options.stay_trained) if options.stay_trained else frames), beyond

@@ -5,15 +5,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..capture.model import evenly_spread
 from ..errors import StgaError
 from ..flame.forward import FlameFrame
 from .performance import Performance
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
-QUIET_SHARE = 0.2
-"""Share of the frames that count as quiet: those of least motion, or of least weight."""
-NEUTRALS = ("none", "quiet", "first")
+QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000
+"""Share of the frames that count as quiet: those most alike, or of least weight; and how many are compared."""
+NEUTRALS = ("none", "quiet", "first", "calibrated")
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
 OUTER_QUANTILE = 0.01
@@ -23,11 +24,16 @@ OUTER_QUANTILE = 0.01
 @dataclass(frozen=True)
 class TrainedRange:
     """Middle and half width, per part of the face (`PART_FIELDS`), of the parameters that an avatar was trained on;
-    `neutral` is the trained person's own quiet face."""
+    quiet and first: the trained person's own quiet face, and that of the first frame."""
 
     middle: dict[str, np.ndarray]
     width: dict[str, np.ndarray]
-    neutral: dict[str, np.ndarray]
+    quiet: dict[str, np.ndarray]
+    first: dict[str, np.ndarray]
+
+    def neutral(self, choice: str) -> dict[str, np.ndarray]:
+        """The face on which a motion is put that is relative to another neutral, one of `NEUTRALS` but "none"."""
+        return self.first if choice == "first" else self.quiet
 
 
 def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
@@ -37,15 +43,22 @@ def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
         values = np.stack([getattr(frame, field) for frame in frames])
         low, high = np.quantile(values, [OUTER_QUANTILE, 1 - OUTER_QUANTILE], axis=0)
         middle[part], width[part] = (low + high) / 2, np.maximum((high - low) / 2, MIN_WIDTH[part])
-    return TrainedRange(middle, width, quiet_neutral(frames))
+    return TrainedRange(middle, width, quiet_neutral(frames), quiet_neutral(frames[:1]))
 
 
 def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
-    """Part -> the median of its parameters over the frames in which the face moves least."""
+    """Part -> the median of its parameters over the frames that are most alike: a face keeps returning to rest.
+
+    Needs no order in time, which recordings of single expressions lack.
+    """
+    frames = evenly_spread(frames, MAX_COMPARED_FRAMES)
     parts = {part: np.stack([getattr(frame, field) for frame in frames]) for part, field in PART_FIELDS.items()}
     face = np.concatenate([parts["face"], parts["jaw"]], axis=1)
-    speed = np.linalg.norm(np.gradient(face, axis=0), axis=1) if len(face) > 1 else np.zeros(1)
-    quiet = np.argsort(speed, kind="stable")[: max(1, round(QUIET_SHARE * len(face)))]
+    squares = (face**2).sum(axis=1)
+    apart = squares[:, None] + squares - 2 * face @ face.T
+    count = max(1, round(QUIET_SHARE * len(face)))
+    center = np.sort(apart, axis=1)[:, :count].sum(axis=1).argmin()
+    quiet = np.argsort(apart[center], kind="stable")[:count]
     return {part: np.median(values[quiet], axis=0) for part, values in parts.items()}
 
 
@@ -63,13 +76,18 @@ def chosen_neutral(where: str, choice: str) -> str:
 
 
 def exchanged_neutral(
-    frames: Sequence[FlameFrame], theirs: dict[str, np.ndarray], own: dict[str, np.ndarray] | None = None
+    frames: Sequence[FlameFrame],
+    theirs: dict[str, np.ndarray] | None = None,
+    own: dict[str, np.ndarray] | None = None,
 ) -> list[FlameFrame]:
-    """The frames with this head's neutral (`own`; None: all zero) in place of the other person's, part by part.
+    """The frames with this head's neutral in place of the other person's, part by part; None: a neutral of zeros.
 
     Parameters of the parts are subtracted and added, rotations as axis-angle: jaw and eyes turn by small angles.
     """
-    change = {PART_FIELDS[part]: (0.0 if own is None else own[part]) - values for part, values in theirs.items()}
+    change = {
+        field: (0.0 if own is None else own[part]) - (0.0 if theirs is None else theirs[part])
+        for part, field in PART_FIELDS.items()
+    }
     return [replace(f, **{field: getattr(f, field) + value for field, value in change.items()}) for f in frames]
 
 

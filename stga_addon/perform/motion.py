@@ -25,9 +25,8 @@ def open_avatar_motion(request: Render | Export, avatar: Avatar, say: Say) -> Mo
     source, options = request.source, request.motion_options
     run = read_run(source) if source.is_dir() else None
     flame = request.flame or (run.flame if run is not None else None)
-    asked = options.stay_trained is not None
-    trained = _trained(source, request.flame) if asked and run is not None else None
-    if asked and trained is None:
+    trained = None if run is None else _trained(source, request, say)
+    if options.stay_trained is not None and trained is None:
         raise StgaError(f"--stay-trained: {source} is no run with a FLAME capture, whose motion would be the range")
     motion = open_motion(request.motion, flame, avatar.neutral, avatar.faces, options, trained, request.fps)
     for line in findings(motion):
@@ -55,9 +54,18 @@ def findings(motion: Motion) -> list[str]:
     return lines
 
 
-def _trained(folder: Path, flame: Path | None) -> TrainedRange | None:
-    """What the run's capture holds; None where it was not tracked with FLAME."""
+def _trained(folder: Path, request: Render | Export, say: Say) -> TrainedRange | None:
+    """What the run's capture holds, where the options ask for it; None where it was not tracked with FLAME."""
     from ..training.run.open_run import open_run
 
-    own = open_run(folder, flame=flame).capture.flame
+    options = request.motion_options
+    if options.neutral == "none" and options.stay_trained is None:
+        return None
+    try:
+        own = open_run(folder, flame=request.flame).capture.flame
+    except StgaError as error:
+        if options.stay_trained is not None:
+            raise
+        say(f"{error}; the motion is put on the head without expression, not on its quiet face")
+        return None
     return None if own is None else trained_range([own.frame(timestep) for timestep in own.timesteps])

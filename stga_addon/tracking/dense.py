@@ -52,8 +52,8 @@ cameras see is the better evidence."""
 KEPT_STIFFNESS = 100.0
 """Of a timestep that keeps what it had, in the stiffness of the smoothness over time."""
 MAX_GROWTH, SMALL_MISS_M, MIN_REGION_GAIN = 1.5, 0.001, 0.1
-"""Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it: lowered brows explain a
-little of raised ones."""
+"""Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it: beyond, landmarks are
+the better evidence there. A forehead in wrinkles looks a little more like lowered brows than like raised ones."""
 
 
 @dataclass(frozen=True)
@@ -68,16 +68,18 @@ class DenseFit:
 
 @dataclass(frozen=True)
 class _Shot:
-    """What is known of a timestep: views, triangulated landmarks, and where the fit so far is."""
+    """What is known of a timestep: views, triangulated landmarks, where the fit so far is, and in which regions of the
+    face (R,) landmarks are the better evidence."""
 
     views: Sequence[PyramidView]
     landmarks: Observation
     start: np.ndarray
+    by_landmarks: np.ndarray
 
 
 @dataclass(frozen=True)
 class _Solved:
-    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit of the regions (3,) in coarse images,
+    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit of the regions (R,) in coarse images,
     misfit, distances of the landmarks (L,), and whether it is better than the start."""
 
     values: np.ndarray
@@ -143,7 +145,7 @@ class _Solver:
         model, places, reliable = self._fit.head.model, self._take.places, self._take.reliable
         seen = by_visibility(self._take.landmarks[timestep], self._fit.head, places, parameters, world)
         found = triangulated(seen, reliable, places.on(model.v_template, model.faces), world.scale)
-        return _Shot(views, observed_landmarks(found, world, reliable), start)
+        return _Shot(views, observed_landmarks(found, world, reliable), start, np.zeros(len(REGIONS), bool))
 
     def texture(self, timesteps: Sequence[int], settled: bool) -> Texture:
         """The texture that these timesteps show."""
@@ -171,33 +173,44 @@ class _Solver:
                     best, error = values, found
         visible = self.head.visibility(best, cameras)
         best = self._descended(shot, texture, best, visible, FINE_STEPS)
+        while (astray := self._astray(shot, texture, visible, best) & ~shot.by_landmarks).any():
+            shot = replace(shot, by_landmarks=shot.by_landmarks | astray)
+            best = self._descended(shot, texture, shot.start, visible, START_STEPS + FINE_STEPS)
         return self._judged(shot, texture, best, visible, error.regions)
 
     def _judged(
         self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, coarse: np.ndarray
     ) -> _Solved:
         """The result, or the start where the result is not better."""
-        old, new = (
-            misfit(self.head, shot.views, visible, texture, own, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
-            for own in (shot.start, values)
-        )
-        was, missed = self._missed(shot.landmarks, shot.start), self._missed(shot.landmarks, values)
-        gain = (old.regions - new.regions).max()
-        better = new.all < old.all and gain > self._min_gain
-        if better and not self._astray(shot.landmarks, was, missed, new.regions > (1 - MIN_REGION_GAIN) * old.regions):
+        by_images = self._by_images(shot, visible)
+        old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, values))
+        better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
+        if better:
             terms = self._terms(shot, texture, values, visible, 0)
-            return _Solved(values, visible, terms, coarse, new, missed, True)
-        stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
-        terms = stiff, self.head.precision * shot.start  # which the prior does not move
-        return _Solved(shot.start, visible, terms, coarse, old, was, False)
+        else:
+            values = shot.start
+            stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
+            terms = stiff, self.head.precision * values  # which the prior does not move
+        found, missed = self._evidence(shot, texture, values, visible), self._missed(shot.landmarks, values)
+        return _Solved(values, visible, terms, coarse, found, missed, better)
 
-    def _astray(self, landmarks: Observation, was: np.ndarray, now: np.ndarray, unsure: np.ndarray) -> bool:
-        """Whether landmarks are missed by much more in one of the regions that are not explained clearly better."""
-        for region in np.flatnonzero(unsure):
-            use = (self.head.landmark_region == region) & (landmarks.weight > 0)
-            if use.any() and np.median(now[use]) > MAX_GROWTH * np.median(was[use]) + SMALL_MISS_M:
-                return True
-        return False
+    def _evidence(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray) -> Misfit:
+        """How badly the points that are not fitted are explained."""
+        return misfit(self.head, shot.views, visible, texture, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
+
+    def _by_images(self, shot: _Shot, visible: np.ndarray) -> np.ndarray:
+        """Visibility (C, N), 0 for points in regions where landmarks are the better evidence."""
+        return np.where(shot.by_landmarks[self.head.region], 0.0, visible)
+
+    def _astray(self, shot: _Shot, texture: Texture, visible: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """(R,) bool: regions that are not explained clearly better, and whose landmarks are missed by much more."""
+        old, new = (self._evidence(shot, texture, own, visible).regions for own in (shot.start, values))
+        was, now = (self._missed(shot.landmarks, own) for own in (shot.start, values))
+        astray = new > (1 - MIN_REGION_GAIN) * old
+        for region in np.flatnonzero(astray):
+            use = (self.head.landmark_region == region) & (shot.landmarks.weight > 0)
+            astray[region] = use.any() and np.median(now[use]) > MAX_GROWTH * np.median(was[use]) + SMALL_MISS_M
+        return astray
 
     def _started(
         self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
@@ -231,23 +244,25 @@ class _Solver:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior."""
         at, jacobian = self.head.linearized(values, level)
-        curvature, slope = photo_term(self.head, shot.views, visible, texture, values, at, level)
+        curvature, slope = photo_term(self.head, shot.views, self._by_images(shot, visible), texture, values, at, level)
         share = len(self.head.rows[0]) / len(at)  # a level weighs the same with fewer points
         flat = jacobian.reshape(-1, len(values))
-        weighted = replace(shot.landmarks, weight=self._landmark_weight(shot.landmarks, values))
+        weighted = replace(shot.landmarks, weight=self._landmark_weight(shot, values))
         matrix, right = normal_equations(self.head.landmarks, values, weighted)
         return matrix + share * flat.T @ (curvature @ jacobian).reshape(
             flat.shape
         ), right + share * flat.T @ slope.ravel()
 
-    def _landmark_weight(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
-        """(L,): of regions whose landmarks are far from the head, less."""
-        missed, weight = self._missed(landmarks, values), landmarks.weight.copy()
-        for region in range(len(REGIONS)):
+    def _landmark_weight(self, shot: _Shot, values: np.ndarray) -> np.ndarray:
+        """(L,): whole where landmarks are the better evidence; of other regions whose landmarks are far from the head,
+        less."""
+        missed, weight = self._missed(shot.landmarks, values), shot.landmarks.weight.copy()
+        for region in np.flatnonzero(~shot.by_landmarks):
             own = self.head.landmark_region == region
             if (own & (weight > 0)).any():
                 weight[own] *= robust(np.median(missed[own & (weight > 0)]), REGION_SCALE_M)
-        return np.asarray(weight * np.where(self.head.skin, LANDMARK_SHARE, INNER_SHARE))
+            weight[own] *= np.where(self.head.skin[own], LANDMARK_SHARE, INNER_SHARE)
+        return np.asarray(weight)
 
     def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
         """(L,) distance in meters of the landmarks from the head, as far as the cameras determine it."""

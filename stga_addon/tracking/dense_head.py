@@ -25,9 +25,11 @@ HELD_OUT = 8
 """One point of so many is not fitted, and tells whether the fit is better."""
 STEPS = (1, 1, 2, 3)
 """By level: one point of so many is fitted."""
-REGIONS = ("lower face", "middle face", "upper face")
-REGION_EDGES = (0.4, 0.7)
+REGIONS = ("lower face", "middle face", "eyes", "brows")
+REGION_EDGES = (0.4, 0.62, 0.735)
 """Of the landmarks' height on the neutral head."""
+UPPER_FACE = 2
+"""Regions from this one on stay where they are when the mouth opens."""
 CHIN_SHARE = 0.12
 """Landmarks in this lowest share of the landmarks' height are the chin's."""
 CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])
@@ -78,7 +80,7 @@ class DenseHead:
         self.landmark_region = np.digitize(height, edges)
         self.region = np.digitize(self.points.on(template, faces)[:, 1], edges)
         self._chin = reliable & (height < low + CHIN_SHARE * (high - low))
-        self._fixed = reliable & (self.landmark_region == len(REGIONS) - 1)
+        self._fixed = reliable & (self.landmark_region >= UPPER_FACE)
 
     def reduced(self, parameters: np.ndarray) -> np.ndarray:
         """The active ones of parameters (E + 18,) of a `HeadFit`."""

@@ -31,7 +31,7 @@ class PyramidView:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How badly points are explained, from 0 to 1: over all, and by region (3,); 0 where no point is seen."""
+    """How badly points are explained, from 0 to 1: over all, and by region (R,); 0 where no point is seen."""
 
     all: float
     regions: np.ndarray

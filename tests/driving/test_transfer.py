@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from stga_addon.driving.open_motion import MotionOptions, adapted
 from stga_addon.driving.performance import Performance, relative_to
 from stga_addon.driving.transfer import (
     exchanged_neutral,
@@ -37,6 +39,26 @@ def test_the_performers_own_face_is_left_out():
     for frame, expected in zip(moved, talking(own), strict=True):
         np.testing.assert_allclose(frame.expr, expected.expr, atol=1e-12)
         np.testing.assert_allclose(frame.jaw_pose, expected.jaw_pose, atol=1e-12)
+
+
+def test_a_quiet_face_needs_no_order():
+    """Catches a neutral that is sought by speed, which single expressions recorded one after another do not have."""
+    frames = talking(np.array([0.5, 0.0, 0.0, 0.0]), 3000)
+    shuffled = [frames[row] for row in np.random.default_rng(0).permutation(len(frames))]
+    np.testing.assert_allclose(quiet_neutral(shuffled)["face"], [0.5, 0, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("choice", ["quiet", "first", "calibrated"])
+def test_a_motion_begins_on_the_heads_own_face(choice):
+    """Catches a head that is put at rest on coefficients of zero, where it was never seen."""
+    own = talking(np.array([0.2, 0.0, -0.1, 0.4]))
+    own[0] = replace(own[0], expr=own[0].expr + 1)
+    trained = trained_range(own)
+    rest = np.zeros(4) if choice == "calibrated" else np.array([1.0, 2.0, 3.0, 4.0])
+    moved, _ = adapted(talking(rest), MotionOptions(neutral=choice), trained)
+    expected = own[0].expr if choice == "first" else own[1].expr
+    np.testing.assert_allclose(moved[0].expr, expected, atol=1e-12)
+    np.testing.assert_allclose(moved[-1].expr - moved[0].expr, talking(rest)[-1].expr - rest, atol=1e-12)
 
 
 def test_a_resting_face_that_is_not_zero():

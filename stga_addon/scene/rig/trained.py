@@ -11,7 +11,7 @@ from .names import expression_key
 
 TRAINED = "stga_trained"
 """Property of the head: the arrays of a `TrainedRange`, by field and part."""
-FIELDS = ("middle", "width", "neutral")
+FIELDS = ("middle", "width", "quiet", "first")
 
 
 def store_range(head: Any, trained: TrainedRange) -> None:
