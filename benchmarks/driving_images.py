@@ -6,6 +6,7 @@ CAPTURE and OTHER are two people tracked with FLAME who do the same, timestep by
 tracer from the same weights of expressions, then tracked. RUN was trained on CAPTURE. Prints PSNR inside the head mask
 of CAPTURE's left-out timesteps (left-out views where it has none), mean over views: driven by its own parameters, and
 by OTHER's in several ways, each with CAPTURE's own head pose, and how much that is below its own.
+"On a head without expression": not on CAPTURE's own resting face.
 """
 
 import argparse
@@ -19,7 +20,10 @@ from PIL import Image
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.driving.open_motion import MotionOptions, adapted
+from stga_addon.driving.head_map import head_map
+from stga_addon.driving.inverse import arkit_weights
+from stga_addon.driving.open_motion import MotionOptions, adapted, frames_of
+from stga_addon.driving.performance import Performance
 from stga_addon.driving.transfer import PART_FIELDS, trained_range
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.sequence import sequence_mesh
@@ -27,23 +31,35 @@ from stga_addon.render.render import render_avatar
 from stga_addon.training.evaluate.evaluation_views import read_evaluation_view
 from stga_addon.training.evaluate.metrics import psnr
 
+FIRST = MotionOptions(neutral="first")
+BARE = "on a head without expression"
 WAYS = {
     "no motion of the face": MotionOptions(strength=0.0),
     "coefficients copied": MotionOptions(),
-    "relative to the first frame": MotionOptions(neutral="first"),
-    "relative to the quiet face": MotionOptions(neutral="quiet"),
+    "relative to the first frame": FIRST,
+    f"relative to the first frame, {BARE}": FIRST,
     "relative to the first frame, half led back": MotionOptions(neutral="first", stay_trained=0.5),
+    "relative to the quiet face": MotionOptions(neutral="quiet"),
+    "ARKit weights, relative to the first frame": FIRST,
+    f"ARKit weights, relative to the first frame, {BARE}": FIRST,
 }
 
 Frames = Mapping[int, FlameFrame]
 
 
-def driven(capture: Capture, other: Capture, options: MotionOptions) -> Frames:
+def driven(capture: Capture, other: Capture, way: str) -> Frames:
     """Timestep -> the capture's frame with the other's face, jaw and eyes."""
-    own, theirs = capture.flame, other.flame
+    own, theirs, options = capture.flame, other.flame, WAYS[way]
     seen = sorted({view.timestep for view in capture.views["train"]})
-    trained = trained_range([own.frame(timestep) for timestep in seen])
-    frames, _ = adapted([theirs.frame(timestep) for timestep in theirs.timesteps], options, trained)
+    trained = None if BARE in way else trained_range([own.frame(timestep) for timestep in seen])
+    frames = [theirs.frame(timestep) for timestep in theirs.timesteps]
+    if "ARKit" in way:
+        relative, _ = adapted(frames, options)
+        weights = arkit_weights(relative, head_map(theirs, "other"), theirs)
+        performance = Performance(np.arange(len(weights)) / 25.0, weights, None, 25.0)
+        frames, _ = frames_of(head_map(own, "own"), performance, options, trained)
+    else:
+        frames, _ = adapted(frames, options, trained)
     return {
         timestep: replace(own.frame(timestep), **{name: getattr(frame, name) for name in PART_FIELDS.values()})
         for timestep, frame in zip(theirs.timesteps, frames, strict=True)
@@ -78,9 +94,9 @@ def main() -> None:
     own = {timestep: capture.flame.frame(timestep) for timestep in capture.flame.timesteps}
     best = np.mean(scores(capture, avatar, own))
     print(f"| driven by | PSNR dB | below its own |\n|---|---|---|\n| own parameters | {best:.2f} | 0 |", flush=True)
-    for number, (name, motion) in enumerate(WAYS.items()):
+    for number, name in enumerate(WAYS):
         pictures = None if options.pictures is None else options.pictures / f"way_{number}"
-        found = np.mean(scores(capture, avatar, driven(capture, other, motion), pictures))
+        found = np.mean(scores(capture, avatar, driven(capture, other, name), pictures))
         print(f"| {name} | {found:.2f} | {best - found:.2f} |", flush=True)
 
 
