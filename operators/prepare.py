@@ -9,7 +9,7 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.raster.kernel_cache import has_kernels
-from ..stga_addon.worker.cache import CACHE_VARIABLE, cache_folder
+from ..stga_addon.worker.cache import CACHE_VARIABLE, KERNELS, cache_folder
 from ..stga_addon.worker.launch import start_in_background
 from .common import package
 from .training_python import training_python
@@ -24,7 +24,7 @@ _processes: list["subprocess.Popen[bytes]"] = []
 def begin_preparing(context: Any) -> None:
     """Compile in the background what the first training would wait for; nothing without a window, without a training
     environment, or where it is compiled or is being compiled."""
-    if bpy.app.background or CACHE_VARIABLE not in os.environ or has_kernels(cache_folder()):
+    if bpy.app.background or CACHE_VARIABLE not in os.environ or has_kernels(cache_folder() / KERNELS):
         return
     if any(process.poll() is None for process in _processes):
         return

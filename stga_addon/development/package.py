@@ -15,6 +15,7 @@ from typing import Any
 
 from ..errors import StgaError, exit_code
 from ..files import replacing
+from .compiled_kernels import compile_kernels
 from .demo.capture import CaptureOptions, make_capture
 from .editions import DEMO_FOLDER, PLATFORM, SMALL, Edition, complete, edition_manifest
 from .wheels import TARGETS, Target, collect_wheels, this_platform
@@ -29,14 +30,18 @@ WHEELS = {
 }
 DEMO_SEED, DEMO_OPTIONS = 0, CaptureOptions(train=6, test=2, cameras=8)
 """Of the capture in the complete edition: that of `make demo`."""
+KERNELS_FOLDER = "stga_addon/raster/cpu/compiled"
+"""In the zip; `raster.cpu.bundled.BUNDLE`."""
 ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
 """Modification time of every entry, the earliest that a zip can hold: equal sources give an equal zip."""
 
 
-def build_zip(out: Path, root: Path = ROOT, edition: Edition = SMALL, demo: Path | None = None) -> Path:
+def build_zip(
+    out: Path, root: Path = ROOT, edition: Edition = SMALL, demo: Path | None = None, kernels: Sequence[Path] = ()
+) -> Path:
     """Write `<id>-<version><suffix>.zip` into the folder `out`, atomically; equal sources give equal bytes.
 
-    demo: a capture to put into the zip.
+    demo: a capture to put into the zip. kernels: files of compiled kernels (`raster.cpu.bundled`).
     Downloads the wheels into `root/wheels` where they are missing. Raises StgaError where `root` is not a checkout or
     a wheel cannot be downloaded.
     """
@@ -46,6 +51,7 @@ def build_zip(out: Path, root: Path = ROOT, edition: Edition = SMALL, demo: Path
     files |= {f"wheels/{wheel.name}": wheel for wheel in wheels}
     if demo is not None:
         files |= {f"{DEMO_FOLDER}/{file.relative_to(demo).as_posix()}": file for file in _walk(demo, demo, [])}
+    files |= {f"{KERNELS_FOLDER}/{file.name}": file for file in kernels}
     path = out / f"{manifest['id']}-{manifest['version']}{edition.suffix}.zip"
     with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         _add(archive, MANIFEST, edition_manifest(manifest, edition, [wheel.name for wheel in wheels]).encode())
@@ -163,7 +169,14 @@ def build_editions(options: argparse.Namespace) -> list[Path]:
     demo = options.out / DEMO_FOLDER
     if not (demo / "transforms.json").exists():
         make_capture(demo, DEMO_SEED, DEMO_OPTIONS)
-    return [build_zip(options.out, edition=complete(target), demo=demo) for target in targets]
+    made = []
+    for target in targets:
+        collect_wheels(wheel_folder(target), target)
+        kernels = compile_kernels(target, wheel_folder(target), shlex.split(options.blender))
+        if not kernels:
+            print(f"{target.name}: no Python of it is here; kernels are compiled when they are first used")
+        made.append(build_zip(options.out, edition=complete(target), demo=demo, kernels=kernels))
+    return made
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

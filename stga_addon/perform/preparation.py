@@ -3,10 +3,12 @@
 The first training on a machine compiles Numba's kernels, and bytecode of the packages that an extension brings.
 """
 
+import os
 from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
 
+from ..raster.kernel_cache import OWN_KERNELS
 from ..worker.cache import PREPARING, cache_folder
 from ..worker.lock import hold_lock
 from .perform import load_ahead
@@ -14,6 +16,7 @@ from .perform import load_ahead
 
 def prepare() -> None:
     """Compile what a training runs; without an effect while another process does, or where nothing can be written."""
+    os.environ[OWN_KERNELS] = "1"
     folder = cache_folder()
     with suppress(OSError):  # BlockingIOError among them
         folder.mkdir(parents=True, exist_ok=True)

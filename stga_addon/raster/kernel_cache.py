@@ -4,6 +4,8 @@ from pathlib import Path
 
 LAST_COMPILED = Path(__file__).with_name("cpu") / "image_loss.py"
 """Module of a kernel that takes long to compile; its index file shows that kernels are compiled."""
+OWN_KERNELS = "STGA_OWN_KERNELS"
+"""Environment variable of a process that compiles for its own processor (`cpu.bundled`)."""
 
 
 def has_kernels(folder: Path) -> bool:

@@ -7,8 +7,9 @@ from .lock import is_locked
 
 CACHE_VARIABLE = "STGA_CACHE"
 """Environment variable that names the folder. Blender's extension sets it to one that uninstalling removes."""
-KERNELS, BYTECODE, CHARTS = "kernels", "bytecode", "matplotlib"
-"""Folders in it: of Numba, of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
+KERNELS, BUNDLED, BYTECODE, CHARTS = "kernels", "bundled kernels", "bytecode", "matplotlib"
+"""Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with its own
+(`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
 PREPARING = "preparing.lock"
 """Held in it by the process that compiles ahead of a training (`perform.preparation`)."""
 

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("bpy")
 
 
+from stga_addon.development.compiled_kernels import compile_kernels
 from stga_addon.development.editions import complete
 from stga_addon.development.package import build_zip, wheel_folder
 from stga_addon.development.wheels import Target, check_wheels, collect_wheels, this_platform
@@ -83,7 +84,8 @@ def archive(target: Target, demo: Path, tmp_path_factory: pytest.TempPathFactory
         check_wheels(collect_wheels(wheel_folder(target), target), target)
     except StgaError as error:
         pytest.skip(f"wheels not present and not downloadable: {error}")
-    return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo)
+    kernels = compile_kernels(target, wheel_folder(target))
+    return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo, kernels=kernels)
 
 
 def bare_python(folder: Path) -> Path:

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from stga_addon import __version__
+from stga_addon.development.compiled_kernels import compile_kernels
 from stga_addon.development.editions import complete
 from stga_addon.development.package import ROOT, build_zip, target_of, wheel_folder
 from stga_addon.development.wheels import collect_wheels
@@ -59,7 +60,8 @@ def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
         collect_wheels(wheel_folder(target), target)
     except StgaError as error:
         pytest.skip(f"wheels not present and not downloadable: {error}")
-    return build_zip(out, edition=complete(target), demo=demo)
+    kernels = compile_kernels(target, wheel_folder(target), command)
+    return build_zip(out, edition=complete(target), demo=demo, kernels=kernels)
 
 
 def blender(command: list[str], home: Path, *arguments: object, background: bool = True) -> None:

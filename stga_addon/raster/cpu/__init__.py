@@ -7,12 +7,14 @@ reads the assembly for several processors.
 """
 
 import os
+from pathlib import Path
 from typing import Any
 
 import numba
 from numba.core import config
 
-from ...worker.cache import KERNELS, cache_folder
+from ...worker.cache import BUNDLED, KERNELS, cache_folder
+from .bundled import kernel_folder
 
 # Reassociation and contraction let reductions vectorize; NaN and infinity keep their meaning, because a broken
 # splat must be recognised and dropped.
@@ -21,15 +23,15 @@ FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 # Compiled kernels are kept between processes, but never in the package's own folder: an installed extension must
 # not write there. One folder per package name, because a cached kernel refers to its modules by name, and the same
 # files may be imported as `stga_addon` and as part of an extension.
-KERNEL_CACHE_FOLDER = os.environ.get("NUMBA_CACHE_DIR") or str(cache_folder() / KERNELS / __name__)
+KERNEL_CACHE_FOLDER, USES_BUNDLED_KERNELS = kernel_folder(
+    Path(os.environ.get("NUMBA_CACHE_DIR") or cache_folder() / KERNELS / __name__), cache_folder() / BUNDLED / __name__
+)
 
 
 def _cached(**options: Any) -> Any:
     def decorate(function: Any) -> Any:
         previous = vars(config)["CACHE_DIR"]
-        vars(config)["CACHE_DIR"] = (
-            KERNEL_CACHE_FOLDER  # read by the decorator; other users of Numba keep their setting
-        )
+        vars(config)["CACHE_DIR"] = str(KERNEL_CACHE_FOLDER)  # read by the decorator; others keep their setting
         try:
             return numba.njit(fastmath=FASTMATH, error_model="numpy", cache=True, **options)(function)
         finally:

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from ...worker.launch import end_with_this_process, same_interpreter_environment
 from ..kernel_cache import has_kernels
 from . import KERNEL_CACHE_FOLDER
 from .blend import blend_backward, blend_forward
+from .bundled import PACKAGE
 from .layout import PROJECTED, Parameters
 from .project import project_backward, project_forward
 from .rasterize import (
@@ -32,7 +32,6 @@ from .rasterize import (
 )
 from .tiles import depth_order, find_needed_rows, whole_tiles
 
-PACKAGE = "stga_addon"
 SIZE = 16
 """Width and height of the image, in pixels: one tile."""
 SHAPES = ((3,), (4,), (3,), (), (16, 3))
@@ -50,8 +49,7 @@ def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
     """The process that runs `compile_rasterizer`, started by the first call; None if the kernels are cached already or
     a second process would not help.
     """
-    # As part of an extension, the package has another name and another cache.
-    if has_kernels(Path(KERNEL_CACHE_FOLDER)) or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
+    if has_kernels(KERNEL_CACHE_FOLDER) or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
         return None
     try:
         return subprocess.Popen(

@@ -9,6 +9,7 @@ from ...avatar.embedding import WORLD
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
+from ...raster.cpu import USES_BUNDLED_KERNELS
 from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
@@ -30,9 +31,10 @@ def precompile_kernels(device: str = "cpu") -> None:
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
     second process compiles the rasterizer at the same time (`raster.cpu.precompile`). While a process compiles
-    ahead (`perform.preparation`), this one waits for it.
+    ahead (`perform.preparation`), this one waits for it, unless it has kernels that are bundled (`raster.cpu.bundled`).
     """
-    _await_preparation()
+    if not USES_BUNDLED_KERNELS:
+        _await_preparation()
     compile_for_cpu()
     if device != "cpu":
         from ...raster.gpu.device import Device
