@@ -36,6 +36,8 @@ START_STEPS, START_LEVEL = ((3, 2), (2, 2)), 2
 """Levels of the pyramid and Gauss–Newton steps in each, for every start; and the level in which starts are compared."""
 FINE_STEPS, EVIDENCE_LEVEL = ((2, 3), (1, 8), (0, 3)), 1
 """The same for the best start; and the level in which points that were not fitted tell whether it is better."""
+LAST_STEPS, LAST_ROUNDS = ((1, 6), (0, 4)), 2
+"""The same for its result where other points are visible than at the start, as in a mouth that opens."""
 OPENINGS_M = 0.008, 0.016
 """By which the chin is moved for further starts."""
 USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
@@ -46,7 +48,7 @@ CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which a level is done."""
 MAX_TURN = 0.3
 """Of a joint in one step, in radians."""
-SETTLED_GAIN = 0.02
+SETTLED_GAIN = 0.01
 """By which a region's misfit has to fall for a settled timestep to be changed: below it, the surface that several
 cameras see is the better evidence."""
 KEPT_STIFFNESS = 100.0
@@ -171,11 +173,11 @@ class _Solver:
                 values, found = self._started(shot, texture, other, visible)
                 if found.all < error.all:
                     best, error = values, found
-        visible = self.head.visibility(best, cameras)
-        best = self._descended(shot, texture, best, visible, FINE_STEPS)
+        best, visible = self._refined(shot, texture, best)
         while (astray := self._astray(shot, texture, visible, best) & ~shot.by_landmarks).any():
             shot = replace(shot, by_landmarks=shot.by_landmarks | astray)
-            best = self._descended(shot, texture, shot.start, visible, START_STEPS + FINE_STEPS)
+            best = self._descended(shot, texture, shot.start, visible, START_STEPS)
+            best, visible = self._refined(shot, texture, best)
         return self._judged(shot, texture, best, visible, error.regions)
 
     def _judged(
@@ -211,6 +213,18 @@ class _Solver:
             use = (self.head.landmark_region == region) & (shot.landmarks.weight > 0)
             astray[region] = use.any() and np.median(now[use]) > MAX_GROWTH * np.median(was[use]) + SMALL_MISS_M
         return astray
+
+    def _refined(self, shot: _Shot, texture: Texture, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters after the steps in fine images, and the visibility (C, N) of which they are."""
+        cameras = [view.camera for view in shot.views]
+        visible = self.head.visibility(values, cameras)
+        values = self._descended(shot, texture, values, visible, FINE_STEPS)
+        for _ in range(LAST_ROUNDS):
+            assumed, visible = visible, self.head.visibility(values, cameras)
+            if np.array_equal(assumed, visible):
+                break
+            values = self._descended(shot, texture, values, visible, LAST_STEPS)
+        return values, visible
 
     def _started(
         self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray

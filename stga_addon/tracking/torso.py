@@ -3,7 +3,8 @@
 Landmarks of a face cannot tell the neck's rotation from the head's, so that a tracked head and the ring of shoulders
 that its neck ends in turn as one. Here the root joint, which carries that ring, gets the orientation that explains the
 images below the head best; the neck turns back by as much, and the head stays where it was tracked. Skin between both
-is blended by the model's own weights.
+is blended by the model's own weights. Where that leaves much unexplained, because shoulders were lifted or a chin was
+pushed forward, the torso is shifted as well.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,16 @@ from .landmarks import Report
 from .posed_points import cross_matrices
 from .torso_motion import TorsoMotion
 from .torso_points import Carrier, Motion, SeenPoints, at_depth, compared, seen_points
-from .torso_take import NECK, TorsoShot, TorsoTake, axis_angle, head_turn, joint_rotation
+from .torso_take import (
+    NECK,
+    PosedTorso,
+    TorsoPose,
+    TorsoShot,
+    TorsoTake,
+    axis_angle,
+    head_turn,
+    joint_rotation,
+)
 
 MIN_TIMESTEPS, MAX_CAMERAS = 4, 4
 """Below it, there is no motion to tell apart; cameras, spread over the rig, whose images are compared."""
@@ -41,19 +51,22 @@ START_LEVEL = 2
 """Level of the pyramid in which starts are compared."""
 COARSE_STEPS, FINE_STEPS = ((3, 3), (2, 3)), ((1, 4), (0, 2))
 """Levels and Gauss–Newton steps in each, for every start, and for the best one."""
-CHANGE_SIGMA_RAD = 0.1
-"""Standard deviation of the torso's rotation from one timestep to the next."""
-MAX_STEP_RAD, CONVERGED_RAD = 0.15, 1e-4
+CHANGE_SIGMA_RAD, CHANGE_SIGMA_M = 0.1, 0.01
+"""Standard deviations of the torso's rotation and shift from one timestep to the next."""
+MAX_STEP, CONVERGED_STEP = 0.15, 1e-4
+"""Radians, meters."""
 COMPARED_TIMESTEPS = 24
 """Spread over the take, at which motions are compared; depths are found at some of them."""
 MIN_GAIN, MIN_OWN_GAIN = 0.1, 0.05
-"""Share by which the misfit has to fall for the torso not to ride on the head, and to move instead of being still."""
+"""Share by which the misfit has to fall for the torso not to ride on the head, and to move instead of being still, or
+to be shifted as well."""
 
 
 def follow_torso(
     fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Footage, report: Report
-) -> tuple[dict[int, np.ndarray], TorsoMotion | None]:
-    """Parameters (E + 18,) of every timestep with the torso's motion, and how it was decided.
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], TorsoMotion | None]:
+    """Parameters (E + 18,) of every timestep with the torso's motion, vertex offsets (V, 3) that shift the torso, none
+    where it is not shifted, and how that was decided.
 
     The torso turns about the neck's joint; the head is not moved. Parameters are returned as they are where the torso
     rides on the head. None where that cannot be told: without masks, in takes shorter than MIN_TIMESTEPS, of models
@@ -62,26 +75,42 @@ def follow_torso(
     unchanged = dict(parameters)
     torso = torso_faces(fit.head.model)
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
-        return unchanged, None
+        return unchanged, {}, None
     middle = _middle_timestep(parameters)
     take = TorsoTake(fit, unchanged, _cameras(footage, middle), torso)
     seen = seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
-        return unchanged, None
+        return unchanged, {}, None
     some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
-    seen = at_depth(take, seen, {})["stereo"]
-    turns = _Follower(take, seen).follow(some, report)
-    rough = {t: take.with_torso(t, turn) for t, turn in turns.items()}
-    turns = _Follower(take, at_depth(take, seen, {"own": rough})["own"]).follow(sorted(unchanged), report)
-    motions: dict[str, Motion] = {
-        "head": unchanged,
-        "still": {t: take.with_torso(t, turns[middle]) for t in unchanged},
-        "own": {t: take.with_torso(t, turns[t]) for t in unchanged},
-    }
-    misfit = compared(take, at_depth(take, seen, motions), motions, some)
+    motions = _motions(take, seen, some, report)
+    found = compared(take, at_depth(take, seen, motions), motions, some)
+    own = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
+    misfit = {"head": found["head"], "still": found["still"], "own": found[own]}
     motion = _chosen(misfit)
-    turn = max(float(np.degrees(np.linalg.norm(joint_rotation(values, NECK)))) for values in motions[motion].values())
-    return dict(motions[motion]), TorsoMotion(motion, misfit, turn)
+    if motion == "head":
+        return unchanged, {}, TorsoMotion(motion, misfit, 0.0)
+    chosen = motions[own if motion == "own" else motion]
+    turn = max(float(np.degrees(np.linalg.norm(joint_rotation(posed.parameters, NECK)))) for posed in chosen.values())
+    offsets = {t: take.with_offset(posed) for t, posed in chosen.items() if posed.shift is not None}
+    heads = {t: offsets[t][0] if t in offsets else posed.parameters for t, posed in chosen.items()}
+    shift = max((float(np.linalg.norm(p.shift)) for p in chosen.values() if p.shift is not None), default=0.0)
+    return heads, {t: own for t, (_, own) in offsets.items()}, TorsoMotion(motion, misfit, turn, 1000 * shift)
+
+
+def _motions(take: TorsoTake, seen: SeenPoints, some: Sequence[int], report: Report) -> dict[str, Motion]:
+    """The motions that the torso may have; some: timesteps at which it is followed first, to find the points' depth."""
+    everything = sorted(take.parameters)
+    seen = at_depth(take, seen, {})["stereo"]
+    rough = take.motion(_Follower(take, seen, shifts=False).follow(some, report), rigid=False)
+    seen = at_depth(take, seen, {"own": rough})["own"]
+    turned = _Follower(take, seen, shifts=False).follow(everything, report)
+    shifted = _Follower(take, seen, shifts=True).follow(everything, report)
+    return {
+        "head": {t: PosedTorso(values) for t, values in take.parameters.items()},
+        "still": take.motion(dict.fromkeys(everything, turned[seen.timestep]), rigid=False),
+        "turned": take.motion(turned, rigid=False),
+        "shifted": take.motion(shifted, rigid=True),
+    }
 
 
 def _chosen(misfit: Mapping[str, float]) -> str:
@@ -105,83 +134,87 @@ def _cameras(footage: Footage, timestep: int) -> list[FootageCamera]:
 
 
 class _Follower:
-    """The orientation of the torso over a take, by Gauss–Newton on the images of points below the head."""
+    """The pose of the torso over a take, by Gauss–Newton on the images of points below the head."""
 
-    def __init__(self, take: TorsoTake, seen: SeenPoints) -> None:
-        self._take, self._seen = take, seen
-        self._first = head_turn(take.parameters[seen.timestep])
-        self._carrier = Carrier(take, take.with_torso(seen.timestep, self._first), seen.at)
+    def __init__(self, take: TorsoTake, seen: SeenPoints, shifts: bool) -> None:
+        """shifts: whether the torso is rigid, and shifted as well as turned."""
+        self._take, self._seen, self._shifts = take, seen, shifts
+        self._first = TorsoPose(head_turn(take.parameters[seen.timestep]), np.zeros(3))
+        self._carrier = Carrier(take, take.with_torso(seen.timestep, self._first, shifts), seen.at)
 
-    def follow(self, timesteps: Sequence[int], report: Report) -> dict[int, np.ndarray]:
-        """Timestep -> orientation (3, 3), from the timestep whose points are followed to both ends of the take."""
-        middle, turns = self._seen.timestep, {self._seen.timestep: self._first}
+    def follow(self, timesteps: Sequence[int], report: Report) -> dict[int, TorsoPose]:
+        """By timestep, from the one whose points are followed to both ends of the take."""
+        middle, poses = self._seen.timestep, {self._seen.timestep: self._first}
         later = [timestep for timestep in timesteps if timestep > middle]
         earlier = [timestep for timestep in reversed(timesteps) if timestep < middle]
         for way in (later, earlier):
             before, shot = middle, self._take.shot(middle)
             for timestep in way:
-                report("Torso", len(turns), len(timesteps))
+                report("Torso", len(poses), len(timesteps))
                 now = self._take.shot(timestep)
-                turns[timestep] = self._solved(timestep, now, before, shot, turns[before])
+                poses[timestep] = self._solved(timestep, now, before, shot, poses[before])
                 before, shot = timestep, now
-        return turns
+        return {timestep: poses[timestep] for timestep in sorted(poses)}
 
     def _solved(
-        self, timestep: int, shot: TorsoShot, before: int, shot_before: TorsoShot, turn: np.ndarray
-    ) -> np.ndarray:
-        """The orientation at a timestep, from that at the one before."""
-        starts = [turn, self._by_flow(timestep, shot, before, shot_before, turn)]
-        starts = [self._descended(timestep, shot, start, turn, COARSE_STEPS) for start in starts]
+        self, timestep: int, shot: TorsoShot, before: int, shot_before: TorsoShot, pose: TorsoPose
+    ) -> TorsoPose:
+        """The pose at a timestep, from that at the one before."""
+        starts = [pose, self._by_flow(timestep, shot, before, shot_before, pose)]
+        if self._shifts:  # where it was in the world
+            moved = self._take.pivot(before) - self._take.pivot(timestep)
+            starts.append(TorsoPose(pose.turn, pose.shift + moved))
+        starts = [self._descended(timestep, shot, start, pose, COARSE_STEPS) for start in starts]
         misfits = [self._misfit(timestep, shot, start) for start in starts]
-        return self._descended(timestep, shot, starts[int(np.argmin(misfits))], turn, FINE_STEPS)
+        return self._descended(timestep, shot, starts[int(np.argmin(misfits))], pose, FINE_STEPS)
 
-    def _misfit(self, timestep: int, shot: TorsoShot, turn: np.ndarray) -> float:
-        share, shown = self._seen.unexplained(shot, self._posed(timestep, turn), START_LEVEL)
+    def _misfit(self, timestep: int, shot: TorsoShot, pose: TorsoPose) -> float:
+        share, shown = self._seen.unexplained(shot, self._posed(timestep, pose), START_LEVEL)
         use = shown & self._seen.fitted
         return float(share[use].mean()) if use.any() else 1.0
 
     def _descended(
-        self, timestep: int, shot: TorsoShot, turn: np.ndarray, usual: np.ndarray, plan: Sequence[tuple[int, int]]
-    ) -> np.ndarray:
-        """The orientation after up to so many steps in each level of the plan; usual (3, 3): the prior's."""
+        self, timestep: int, shot: TorsoShot, pose: TorsoPose, usual: TorsoPose, plan: Sequence[tuple[int, int]]
+    ) -> TorsoPose:
+        """The pose after up to so many steps in each level of the plan; usual: the prior's."""
         for level, steps in plan:
             for _ in range(steps):
-                at, by_turn = self._linearized(timestep, turn)
-                matrix, right = _prior(turn, usual)
+                at, by_pose = self._linearized(timestep, pose)
+                matrix, right = _prior(pose, usual)
                 for number, rows in self._visible(shot, at):
                     own = shot.views[number].levels[level]
                     residual = self._seen.residual(shot, number, rows, at[rows], level)
                     pixels, _ = own.camera.project(at[rows])
                     slope = np.stack([sampled(part, pixels) for part in own.gradient], axis=2) / NOISE_LEVELS
-                    rate = slope @ projection_derivative(own.camera, at[rows]) @ by_turn[rows]
+                    rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
                     used = POINT_SHARE / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
                     weight = used[:, None] * CHANNEL_WEIGHTS
                     matrix = matrix + np.einsum("nc,nci,ncj->ij", weight, rate, rate)
                     right = right - np.einsum("nc,nci,nc->i", weight, rate, residual)
-                turn, size = _stepped(turn, matrix, right)
-                if size < CONVERGED_RAD:
+                pose, size = self._stepped(pose, matrix, right)
+                if size < CONVERGED_STEP:
                     break
-        return turn
+        return pose
 
     def _by_flow(
-        self, timestep: int, shot: TorsoShot, before: int, shot_before: TorsoShot, turn: np.ndarray
-    ) -> np.ndarray:
-        """The orientation to which optical flow leads from `turn`, that at the timestep before."""
-        old, found = self._posed(before, turn), turn
+        self, timestep: int, shot: TorsoShot, before: int, shot_before: TorsoShot, pose: TorsoPose
+    ) -> TorsoPose:
+        """The pose to which optical flow leads from `pose`, that at the timestep before."""
+        old, found = self._posed(before, pose), pose
         flows = flow_targets(old, list(shot_before.views.values()), list(shot.views.values()))
         targets = {key[0]: (camera, target) for key, camera, target in flows}
         shown = [(number, rows) for number, rows in self._visible(shot_before, old) if number in targets]
         for _ in range(FLOW_ITERATIONS):
-            at, by_turn = self._linearized(timestep, found)
-            matrix, right = _prior(found, turn)
+            at, by_pose = self._linearized(timestep, found)
+            matrix, right = _prior(found, pose)
             for number, rows in shown:
                 camera, target = targets[number]
                 miss = camera.project(at[rows])[0] - target[rows]
                 weight = FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
-                rate = projection_derivative(camera, at[rows]) @ by_turn[rows]
+                rate = projection_derivative(camera, at[rows]) @ by_pose[rows]
                 matrix = matrix + np.einsum("n,nci,ncj->ij", weight, rate, rate)
                 right = right - np.einsum("n,nci,nc->i", weight, rate, miss)
-            found, _ = _stepped(found, matrix, right)
+            found, _ = self._stepped(found, matrix, right)
         return found
 
     def _visible(self, shot: TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
@@ -193,25 +226,28 @@ class _Follower:
         ]
         return [(number, rows) for number, rows in chosen if len(rows)]
 
-    def _posed(self, timestep: int, turn: np.ndarray) -> np.ndarray:
-        return self._carrier.carried(self._take.with_torso(timestep, turn))(self._seen.at)
+    def _posed(self, timestep: int, pose: TorsoPose) -> np.ndarray:
+        return self._carrier.carried(self._take.with_torso(timestep, pose, self._shifts))(self._seen.at)
 
-    def _linearized(self, timestep: int, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3), and derivatives (N, 3, 3) by a small rotation in front of the orientation, as if they were
-        the root joint's alone."""
-        at = self._posed(timestep, turn)
-        return at, -cross_matrices(at - self._take.pivot(timestep))
+    def _linearized(self, timestep: int, pose: TorsoPose) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, 3), and derivatives (N, 3, 6) by a small rotation in front of the orientation, as if they were
+        the root joint's alone, and by a shift."""
+        at = self._posed(timestep, pose)
+        by_turn = -cross_matrices(at - pose.shift - self._take.pivot(timestep))
+        return at, np.concatenate([by_turn, np.broadcast_to(np.eye(3), by_turn.shape)], axis=2)
+
+    def _stepped(self, pose: TorsoPose, matrix: np.ndarray, right: np.ndarray) -> tuple[TorsoPose, float]:
+        """The pose after a Gauss–Newton step by 6 numbers, and the step's length."""
+        free = 6 if self._shifts else 3
+        step = np.zeros(6)
+        step[:free] = np.linalg.solve(matrix[:free, :free], right[:free])
+        size = float(np.linalg.norm(step))
+        step *= min(1.0, MAX_STEP / max(size, 1e-12))
+        return TorsoPose(axis_angle_matrices(step[None, :3])[0] @ pose.turn, pose.shift + step[3:]), size
 
 
-def _prior(turn: np.ndarray, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right-hand side (3,) of a small rotation, by which the orientation is near the usual one."""
-    precision = CHANGE_SIGMA_RAD**-2
-    return precision * np.eye(3), -precision * axis_angle(turn @ usual.T)
-
-
-def _stepped(turn: np.ndarray, matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, float]:
-    """The orientation after a Gauss–Newton step, and the step's angle."""
-    step = np.linalg.solve(matrix, right)
-    size = float(np.linalg.norm(step))
-    step *= min(1.0, MAX_STEP_RAD / max(size, 1e-12))
-    return np.asarray(axis_angle_matrices(step[None])[0] @ turn), size
+def _prior(pose: TorsoPose, usual: TorsoPose) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix (6, 6) and right-hand side (6,) of a step, by which the pose is near the usual one."""
+    precision = np.repeat([CHANGE_SIGMA_RAD**-2, CHANGE_SIGMA_M**-2], 3)
+    away = np.concatenate([axis_angle(pose.turn @ usual.turn.T), pose.shift - usual.shift])
+    return np.diag(precision), -precision * away

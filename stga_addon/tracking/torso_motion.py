@@ -20,16 +20,19 @@ class TorsoMotion:
 
     misfit    motion -> share of the points below the head, held out from fitting, that images do not explain
     turn_deg  largest angle between torso and head
+    shift_mm  largest distance of the torso from where the neck's joint holds it; 0 where a rotation explains enough
     """
 
     motion: str = setting(choices=MOTIONS)
     misfit: Mapping[str, float] = setting(minimum=0, maximum=1)
     turn_deg: float = setting(minimum=0)
+    shift_mm: float = setting(0.0, minimum=0)
 
     @property
     def description(self) -> str:
         """A clause with the figures that decided."""
-        apart = "" if self.motion == "head" else f", up to {self.turn_deg:.0f}° apart from the head"
+        shift = f" and {self.shift_mm:.0f} mm" if self.shift_mm else ""
+        apart = "" if self.motion == "head" else f", up to {self.turn_deg:.0f}°{shift} apart from the head"
         shares = {name: f"{self.misfit[name]:.0%}" for name in MOTIONS}
         return (
             f"the torso {MOTIONS[self.motion]}{apart}; images below the head are not explained by {shares['head']} if "

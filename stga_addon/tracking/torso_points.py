@@ -11,7 +11,7 @@ from ..capture.model import evenly_spread
 from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, sampled
 from .dense_terms import OUTLIER_SQUARED
 from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
-from .torso_take import EVIDENCE_LEVEL, TorsoShot, TorsoTake, grown
+from .torso_take import EVIDENCE_LEVEL, PosedTorso, TorsoShot, TorsoTake, grown
 
 POINT_STEP_M, MAX_POINTS = 0.005, 800
 """Distance between points at the torso, and how many of them a camera has at most."""
@@ -27,8 +27,8 @@ sight."""
 ALONG_CAMERAS = CHANNEL_WEIGHTS * [0, 1, 1]
 """Weights of channels between cameras, from which surfaces are not equally bright."""
 
-Motion = Mapping[int, np.ndarray]
-"""Timestep -> parameters (E + 18,)."""
+Motion = Mapping[int, PosedTorso]
+"""By timestep."""
 
 
 @dataclass(frozen=True)
@@ -127,26 +127,30 @@ def _below_head(
 class Carrier:
     """The torso's triangles, which carry points as they carry splats: each the nearest one."""
 
-    def __init__(self, take: TorsoTake, parameters: np.ndarray, at: np.ndarray) -> None:
-        """at (N, 3): where the points are with these parameters."""
+    def __init__(self, take: TorsoTake, first: PosedTorso, at: np.ndarray) -> None:
+        """at (N, 3): where the points are at first."""
         from scipy.spatial import cKDTree
 
         candidates = np.flatnonzero(take.torso)
-        centers = take.mesh(parameters)[take.model.faces[candidates]].mean(1)
+        centers = take.mesh(first.parameters)[take.model.faces[candidates]].mean(1)
         used, self._face = np.unique(candidates[cKDTree(centers).query(at)[1]], return_inverse=True)
         self._corners = PosedPoints(take.model, SurfacePoints(np.repeat(used, 3), np.tile(np.eye(3), (len(used), 1))))
-        self._neutral = take.model.v_template[take.model.faces[used]].reshape(-1, 3)
+        self._take, self._vertices = take, take.model.faces[used].ravel()
+        self._neutral = take.model.v_template[self._vertices]
         self._triangles = np.arange(3 * len(used)).reshape(-1, 3)
-        self._first = self._frames(parameters)
+        self._first = self._frames(first)
 
-    def carried(self, parameters: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """What brings the points (N, 3), from where they are with the first parameters, to where these ones do."""
-        before, after, face = self._first, self._frames(parameters), self._face
+    def carried(self, torso: PosedTorso) -> Callable[[np.ndarray], np.ndarray]:
+        """What brings the points (N, 3) from where they are at first to where this torso has them."""
+        before, after, face = self._first, self._frames(torso), self._face
         turn = (after.scale / before.scale)[:, None, None] * after.rotation @ before.rotation.swapaxes(1, 2)
         return lambda at: np.einsum("nij,nj->ni", turn[face], at - before.origin[face]) + after.origin[face]
 
-    def _frames(self, parameters: np.ndarray) -> FaceFrames:
-        corners = self._corners.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+    def _frames(self, torso: PosedTorso) -> FaceFrames:
+        if torso.shift is None:
+            corners = self._corners.positions(torso.parameters[:-RIGID_SIZE], torso.parameters[-RIGID_SIZE:])
+        else:
+            corners = self._take.rigid(torso.parameters, self._vertices) + torso.shift
         return face_frames(corners, self._triangles, self._neutral)
 
 

@@ -9,6 +9,7 @@ from scipy.ndimage import binary_dilation
 from ..capture.camera import Camera
 from ..capture.mesh_raster import silhouette
 from ..flame.forward import axis_angle_matrices
+from ..flame.masks import MIN_TORSO_WEIGHT
 from ..flame.model import JOINTS
 from ..flame.quaternions import from_matrices, to_axis_angle
 from .appearance import pyramid
@@ -23,8 +24,30 @@ HEAD_MARGIN = 0.03
 """Around the head's silhouette, where hair and chin may be; share of the image's height."""
 PLAIN_LEVEL = 128
 """Gray that stands for everything outside the mask."""
+OFFSET_STEPS = 6
+"""After which offsets, which move joints, which move vertices, are those wanted."""
 EVIDENCE_LEVEL = 1
 """Level of the pyramid in which motions are compared."""
+
+
+@dataclass(frozen=True)
+class PosedTorso:
+    """Parameters (E + 18,) of a head with its torso.
+
+    shift  (3,) meters, from where the neck's joint holds the torso, which is rigid then; None: the model's weights
+           blend it with the neck
+    """
+
+    parameters: np.ndarray
+    shift: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class TorsoPose:
+    """Orientation (3, 3) of the torso in the world, and its shift (3,) in meters, 0 where it is only turned."""
+
+    turn: np.ndarray
+    shift: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -58,10 +81,45 @@ class TorsoTake:
         self._joint_dirs = np.einsum("jv,vak->jak", regressor, self.model.shapedirs)
         self._center = posed_mesh(fit, next(iter(parameters.values()))).mean(0)
 
-    def with_torso(self, timestep: int, turn: np.ndarray) -> np.ndarray:
-        """The timestep's parameters with the torso in an orientation (3, 3)."""
+    def with_torso(self, timestep: int, pose: TorsoPose, rigid: bool) -> PosedTorso:
+        """The timestep's head, where it is, on the torso; rigid: which may be shifted as well."""
         root, neck = self._unposed_joints(timestep)
-        return with_root(self.parameters[timestep], turn, neck - root)
+        parameters = with_root(self.parameters[timestep], pose.turn, neck - root)
+        return PosedTorso(parameters, pose.shift if rigid else None)
+
+    def motion(self, poses: Mapping[int, TorsoPose], rigid: bool) -> dict[int, PosedTorso]:
+        """The torso posed at each timestep."""
+        return {timestep: self.with_torso(timestep, pose, rigid) for timestep, pose in poses.items()}
+
+    def rigid(self, parameters: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """(N, 3) where the root joint alone carries some vertices (N,)."""
+        expr, rigid = parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
+        root = self._joints[0] + self._joint_dirs[0] @ expr
+        rest = self.model.v_template[vertices] + self.model.shapedirs[vertices] @ expr
+        return np.asarray((rest - root) @ axis_angle_matrices(rigid[None, :3])[0].T + root + rigid[-3:])
+
+    def with_offset(self, torso: PosedTorso) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters (E + 18,) and vertex offsets (V, 3) by which a torso is rigid and shifted.
+
+        Offsets move the joints as well, which FLAME finds from vertices; the translation undoes that for the head.
+        """
+        assert torso.shift is not None
+        model, parameters, offset = self.model, torso.parameters.copy(), np.zeros_like(self.model.v_template)
+        share = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
+        moved = np.flatnonzero(share)
+        before = posed_mesh(self._fit, parameters)[moved]
+        wanted = before + share[moved, None] * (self.rigid(parameters, moved) + torso.shift - before)
+        turns = axis_angle_matrices(parameters[-RIGID_SIZE:-3].reshape(-1, 3))
+        for joint, parent in enumerate(model.parents.tolist()):
+            turns[joint] = turns[parent] @ turns[joint] if parent >= 0 else turns[joint]
+        skin = np.einsum("vj,jab->vab", model.weights[moved], turns)
+        for _ in range(OFFSET_STEPS):
+            missed = wanted - posed_mesh(self._fit, parameters, offset)[moved]
+            offset[moved] += np.linalg.solve(skin, missed[..., None])[..., 0]
+            root, neck = model.j_regressor[[ROOT, NECK]] @ offset
+            by_offset = root + turns[ROOT] @ (neck - root) - turns[NECK] @ neck
+            parameters[-3:] = torso.parameters[-3:] - by_offset
+        return parameters, offset
 
     def pivot(self, timestep: int) -> np.ndarray:
         """(3,) what the torso turns about: the joint of the neck."""

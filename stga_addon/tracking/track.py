@@ -153,7 +153,7 @@ def track(
 
         source = _source(footage, head_file, task if landmarks is None else landmarks)
         footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
-    parameters, torso = follow_torso(fit, parameters, footage, report)
+    parameters, offsets, torso = follow_torso(fit, parameters, footage, report)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
@@ -170,14 +170,14 @@ def track(
         out / SHEET_FILE,
         footage,
         cameras,
-        lambda timestep: posed_mesh(fit, parameters[timestep]),
+        lambda timestep: posed_mesh(fit, parameters[timestep], offsets.get(timestep)),
         fit.head.model.faces,
         result.reprojection_px,
         result.image_misfit,
     )
     if landmarks is not None:  # what a correction of the capture starts from
         write_landmarks(out / LANDMARKS_FOLDER, detected, places, reliable)
-    write_capture(out, footage, fit, parameters, meshes, report)
+    write_capture(out, footage, fit, parameters, offsets, meshes, report)
     return result
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,19 @@ MIN_CAMERAS_TO_HOLD_OUT = 4
 
 
 def write_capture(
-    out: Path, footage: Footage, fit: HeadFit, parameters: Mapping[int, np.ndarray], meshes: bool, report: Report
+    out: Path,
+    footage: Footage,
+    fit: HeadFit,
+    parameters: Mapping[int, np.ndarray],
+    offsets: Mapping[int, np.ndarray],
+    meshes: bool,
+    report: Report,
 ) -> None:
     """Write images, masks, the tracked head of each timestep, and at last the transforms that make it a capture.
 
-    parameters: timestep -> (E + 18,), interpolated ones included. With four cameras or more, the one nearest to the
-    middle is held out as `val`. Raises StgaError where `out` cannot be written.
+    parameters: timestep -> (E + 18,), interpolated ones included; offsets: timestep -> (V, 3), where there are any.
+    With four cameras or more, the one nearest to the middle is held out as `val`. Raises StgaError where `out` cannot
+    be written.
     """
     views = [view for view in footage.views() if view[0] in parameters]
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
@@ -41,16 +49,16 @@ def write_capture(
         entry["flame_param_path" if folder[1] == "npz" else "mesh_path"] = f"{folder[0]}/{timestep:05d}.{folder[1]}"
         frames["val" if camera.name == held_out else "train"].append(entry)
         report("Images", number + 1, len(views))
-    top: dict[str, Any] = {**_write_heads(out, fit, parameters, meshes or fit.head.layout == "mesh", report)}
+    top: dict[str, Any] = {**_write_heads(out, fit, parameters, offsets, meshes or fit.head.layout == "mesh", report)}
     if footage.fps is not None:
         top["fps"] = footage.fps
     for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):  # train last: see is_written
         write_json(out / name, {**top, "frames": entries})
 
 
-def posed_mesh(fit: HeadFit, parameters: np.ndarray) -> np.ndarray:
-    """The head's vertices (V, 3) in the capture's world, in meters."""
-    return flame_forward(fit.head.model, np.zeros(0), flame_frame(parameters))
+def posed_mesh(fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None) -> np.ndarray:
+    """The head's vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this timestep."""
+    return flame_forward(fit.head.model, np.zeros(0), replace(flame_frame(parameters), dynamic_offset=offset))
 
 
 def flame_frame(parameters: np.ndarray) -> FlameFrame:
@@ -98,15 +106,24 @@ def _entry(out: Path, timestep: int, source: FootageCamera, number: int, camera:
 
 
 def _write_heads(
-    out: Path, fit: HeadFit, parameters: Mapping[int, np.ndarray], meshes: bool, report: Report
+    out: Path,
+    fit: HeadFit,
+    parameters: Mapping[int, np.ndarray],
+    offsets: Mapping[int, np.ndarray],
+    meshes: bool,
+    report: Report,
 ) -> dict[str, str]:
     """Write every timestep's head; returns the top level of the transforms."""
     faces, neutral = fit.head.model.faces, np.zeros_like(next(iter(parameters.values())))
     for number, (timestep, values) in enumerate(parameters.items()):
         if fit.head.layout == "flame":
-            write_npz(out / PARAMETERS / f"{timestep:05d}.npz", _flame_arrays(fit, values))
+            arrays = _flame_arrays(fit, values)
+            if timestep in offsets:
+                arrays["dynamic_offset"] = offsets[timestep][None].astype(np.float32)
+            write_npz(out / PARAMETERS / f"{timestep:05d}.npz", arrays)
         if meshes:
-            write_obj(out / "meshes" / f"{timestep:05d}.obj", posed_mesh(fit, values), faces)
+            mesh = posed_mesh(fit, values, offsets.get(timestep))
+            write_obj(out / "meshes" / f"{timestep:05d}.obj", mesh, faces)
         report("Heads", number + 1, len(parameters))
     if meshes:
         write_obj(out / "meshes" / "neutral.obj", posed_mesh(fit, neutral), faces)

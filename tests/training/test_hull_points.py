@@ -16,7 +16,14 @@ from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.masks import torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
-from stga_addon.training.optimize.hull_points import MIN_MESH_DISTANCE_M, VOXEL_SIZE_M, flat_points, hull_points
+from stga_addon.training.optimize.hull_points import (
+    GAP_VOXELS,
+    MIN_MESH_DISTANCE_M,
+    VOXEL_SIZE_M,
+    flat_layers,
+    flat_points,
+    hull_points,
+)
 
 SIZE, FOCAL, FAR = 120, 300.0, 1.0
 CENTRE, RADIUS = np.array([0.06, 0.075, 0.02]), 0.03
@@ -204,6 +211,23 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside: Capture, conve
     assert np.linalg.norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
     assert world.unbound.all()
     np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
+
+
+def test_what_a_single_camera_shows_later_is_added(beside: Capture, tmp_path: Path) -> None:
+    """Catches shoulders that end where the first image ended, and a layer doubled by every further timestep."""
+    later = replace(next(view for view in beside.views["train"] if _gap(view.camera) > 0.02), timestep=TIMESTEP + 1)
+    posed = beside.mesh(TIMESTEP)
+    capture = replace(beside, mesh=lambda timestep: posed)
+    mask = silhouette(later.camera, CENTRE, RADIUS)
+    middle = int(np.flatnonzero(mask.any(axis=0)).mean())
+    mask[:, middle:] = False
+    Image.fromarray(mask.astype(np.uint8) * 255).save(tmp_path / "half.png")
+    first = replace(later, timestep=TIMESTEP, mask=tmp_path / "half.png")
+    half, both, whole = (flat_layers(capture, views, "stga", 0) for views in ((first,), (first, later), (later, first)))
+    assert len(whole) == len(flat_points(capture, later, "stga", 0))
+    assert 1.2 * len(half) < len(both) <= len(whole)
+    added = later.camera.project(in_world(capture, both.rows(slice(len(half), None))).xyz.astype(np.float64))[0]
+    assert added[:, 0].min() > middle + (GAP_VOXELS - 1) * VOXEL_SIZE_M * FOCAL / FAR
 
 
 def _gap(camera: Camera) -> float:

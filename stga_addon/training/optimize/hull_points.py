@@ -6,13 +6,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
-from ...avatar.embedding import face_frames, to_local
+from ...avatar.embedding import face_frames, to_local, to_world
 from ...avatar.lattice import lattice_weights
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask
 from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, evenly_spread
 from ...flame.masks import torso_faces
 from ...flame.sequence import below_neck
 
@@ -31,6 +31,9 @@ MIN_EXPOSED_SHARE = 0.125
 contradicts would become floaters in other views."""
 SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
+LAYER_TIMESTEPS, GAP_VOXELS = 8, 3.0
+"""Further timesteps of a single camera at which it is looked for what the layer lacks, and the distance beside the
+layer, in voxels, from which something is missing: less is motion that the mesh does not follow."""
 
 
 def hull_points(
@@ -79,6 +82,28 @@ def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, t
         face = _carried(capture, view.timestep, points, face)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(_new_splats(points, voxel, sh_degree), frames, face)
+
+
+def flat_layers(
+    capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
+) -> Splats:
+    """`flat_points` of a single camera's first view, and those of its further ones (`LAYER_TIMESTEPS`) that show what
+    lies farther from the layer so far than GAP_VOXELS: a shoulder that was out of the image at first."""
+    timesteps = {view.timestep: view for view in reversed(views)}
+    layer = flat_points(capture, views[0], convention, sh_degree, torso)
+    for view in evenly_spread([timesteps[t] for t in sorted(timesteps) if t != views[0].timestep], LAYER_TIMESTEPS):
+        mesh, added = capture.mesh(view.timestep), flat_points(capture, view, convention, sh_degree, torso)
+        if not len(added):
+            continue
+        if len(layer):
+            frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+            points, known = (to_world(own, frames).xyz.astype(np.float64) for own in (added, layer))
+            pixels, depth = view.camera.project(points)
+            gap = GAP_VOXELS * voxel_size(mesh) * view.camera.fl_x / float(np.median(depth))
+            distance, _ = cKDTree(view.camera.project(known)[0]).query(pixels)
+            added = added.rows(distance > gap)
+        layer = Splats(*(np.concatenate([getattr(own, name) for own in (layer, added)]) for name in vars(layer)))
+    return layer
 
 
 def voxel_size(mesh: np.ndarray) -> float:
