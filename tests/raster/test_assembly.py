@@ -111,6 +111,7 @@ def faults(text: str, cpu: str, loops: int, spills: int) -> str:
 
 STATE = "f4[::1]"
 PIXELS = "u8, u8"
+LIST = "u2[::1]"
 LIMITS = "UniTuple(f4, 4)"
 TABLE = np.zeros((2, 3), np.float32)
 ADAM = numba.types.void(
@@ -120,11 +121,10 @@ ADAM = numba.types.void(
     numba.typeof(optimizer.AdamOptions(*np.zeros(4, np.float32))),
 )
 LOOPS = {
-    "falloff": (blend._falloff, f"void({PIXELS}, u8, {STATE}, {STATE})", 1, 4),
-    "blend": (blend._blend_pair, f"void({PIXELS}, u8, f4, {STATE}, {STATE})", 2, 4),
-    "unblend": (blend._unblend_pair, f"void({PIXELS}, u8, f4, {STATE}, {STATE})", 2, 4),
-    "gradient of the falloff": (blend._sum_falloff_gradient, f"void({PIXELS}, u8, {STATE}, {STATE}, {STATE})", 1, 0),
-    "gradient of the color": (blend._sum_color_gradient, f"void({PIXELS}, {STATE}, {STATE})", 1, 0),
+    "falloff": (blend._falloff, f"void(u8, {LIST}, {STATE}, b1, {STATE})", 1, 8),
+    "blend": (blend._blend, f"void(u8, {LIST}, i8, {STATE}, {STATE})", 1, 4),
+    "unblend": (blend._unblend, f"void(u8, {LIST}, i8, {STATE}, {STATE})", 1, 4),
+    "gradient of a splat": (blend._sum_gradient, f"void({PIXELS}, {STATE}, {STATE})", 1, 0),
     "horizontal blur": (image_loss._blur_row, f"void({STATE}, i8, {STATE}, i8, i8)", 1, 0),
     "vertical blur": (image_loss._blur_column, f"void({STATE}, i8, i8, i8, {STATE}, i8, i8)", 1, 0),
     "SSIM": (image_loss._similarity_row, f"f4({STATE}, i8, i8, i8, i8, i8, {STATE})", 1, 8),
