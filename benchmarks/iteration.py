@@ -190,7 +190,7 @@ def stages(
         ),
         "blend": (
             lambda: blend_forward(r.tiles, tiles_x, r.tile_rows, lists, r.projection, background, r.blended),
-            count * 44 + pixels * 20,
+            count * 42 + pixels * 20,
         ),
         "L1 + SSIM, both ways": (
             lambda: image_gradient(r.image, target, bands, 0.2, v_image),
@@ -200,7 +200,7 @@ def stages(
             lambda: blend_backward(
                 r.tiles, tiles_x, lists, r.blended, wanted, columns, background, v_image, zero, pair_gradients
             ),
-            count * (48 + 36) + pixels * 24,
+            count * (46 + 36) + pixels * 24,
         ),
         "project backward": (
             lambda: project_backward(
