@@ -6,10 +6,11 @@
 Splats of SH degree 3 on the demo's head (16,000 triangles, denser at eyes and mouth, as heads are), or on an evenly
 covered ellipsoid, for which a selection costs most. On the CPU: the instruction set, and medians over repeats in one
 process; beside each stage the bytes it must at least move and the time that takes at this machine's measured copy
-bandwidth. On a GPU, whose queue is never waited for: means over all repeats, the same table by kernel, the dispatches,
-submits, waits and milliseconds that an iteration takes of the host, and the device's memory. --opensplat: a checkout of
-OpenSplat, whose CPU rasterizer is compiled and run on the same splats. Run it on an idle machine, or with
---processor-time: instead of time that passes, that of the processor, of ours divided by its threads.
+bandwidth, and for the image loss its arithmetic at the measured rate of multiply-adds. On a GPU, whose queue is never
+waited for: means over all repeats, the same table by kernel, the dispatches, submits, waits and milliseconds that an
+iteration takes of the host, and the device's memory. --opensplat: a checkout of OpenSplat, whose CPU rasterizer is
+compiled and run on the same splats. Run it on an idle machine, or with --processor-time: instead of time that passes,
+that of the processor, of ours divided by its threads.
 """
 
 import argparse
@@ -32,6 +33,7 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 from stga_addon.development.demo.head import synthetic_head
+from stga_addon.raster.cpu import jit
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
 from stga_addon.raster.cpu.layout import PROJECTED, Parameters
 from stga_addon.raster.cpu.project import project_backward, project_forward
@@ -43,7 +45,7 @@ from stga_addon.raster.cpu.rasterize import (
     tile_grid,
     with_strain_color,
 )
-from stga_addon.raster.cpu.threads import threads
+from stga_addon.raster.cpu.threads import parallel, threads
 from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
@@ -56,6 +58,10 @@ from stga_addon.training.settings import make_settings
 
 RATES = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-9)
 
+
+LOSS_OPERATIONS = 3 * (14 * 11 + 28 + 12)
+"""Additions, multiplications, multiply-adds and the like that the image loss needs of a pixel: in each channel 14 blurs
+of 11, SSIM with its derivatives, and the rest. `tests/raster/test_assembly.py` counts them in the assembly."""
 
 REGIONS = {"demo": ([0.03, 0.02, 0.08], [0.0, -0.05, 0.09]), "ellipsoid": ([0.03, -0.04, 0.08], [0.0, 0.06, 0.07])}
 """Where each head's selected regions lie: an eye and the mouth."""
@@ -122,6 +128,31 @@ def copy_bandwidth() -> float:
     return 2 * source.nbytes / (median_ms(lambda: np.copyto(target, source), 5) / 1e3)
 
 
+MULTIPLY_ADDS = 16
+"""Of one value in `multiply_add_rows`, one after the other."""
+
+
+@parallel(lambda rows: len(rows))
+@jit
+def multiply_add_rows(first, past, rows):
+    """Sixteen multiply-adds of each value of rows (R, 256) float32, 100 times over."""
+    for n in range(first, past):
+        row = rows[n]
+        for _ in range(100):
+            for p in range(np.uint64(row.shape[0])):
+                x = row[p]
+                value = x
+                for _ in range(MULTIPLY_ADDS):
+                    value = value * x - x
+                row[p] = value
+
+
+def arithmetic_rate(clock: Callable[[], float]) -> float:
+    """Multiply-adds of single floats a second, by all threads, on values that stay in the nearest cache."""
+    rows = np.full((512, 256), 0.5, np.float32)
+    return 100 * MULTIPLY_ADDS * rows.size / (median_ms(lambda: multiply_add_rows(rows), 5, clock) / 1e3)
+
+
 def stages(
     splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]
 ) -> dict[str, tuple[float, int]]:
@@ -159,7 +190,7 @@ def stages(
         ),
         "blend": (
             lambda: blend_forward(r.tiles, tiles_x, r.tile_rows, lists, r.projection, background, r.blended),
-            count * 44 + pixels * 20,
+            count * 42 + pixels * 20,
         ),
         "L1 + SSIM, both ways": (
             lambda: image_gradient(r.image, target, bands, 0.2, v_image),
@@ -169,7 +200,7 @@ def stages(
             lambda: blend_backward(
                 r.tiles, tiles_x, lists, r.blended, wanted, columns, background, v_image, zero, pair_gradients
             ),
-            count * (48 + 36) + pixels * 24,
+            count * (46 + 36) + pixels * 24,
         ),
         "project backward": (
             lambda: project_backward(
@@ -269,6 +300,9 @@ def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int, clock: C
     for name, (ms, moved) in found.items():
         floor = 1e3 * moved / bandwidth
         print(f"{name:<22}{ms:8.2f}{moved / 1e6:8.1f}{floor:10.2f}{ms / floor:7.1f}")
+    rate, ms = arithmetic_rate(clock), found["L1 + SSIM, both ways"][0]
+    floor = 1e3 * target.shape[0] * target.shape[1] * LOSS_OPERATIONS / rate
+    print(f"{rate / 1e9:.0f} billion multiply-adds a second: L1 + SSIM at least {floor:.2f} ms, ratio {ms / floor:.1f}")
     return {name: ms for name, (ms, _) in found.items()}
 
 

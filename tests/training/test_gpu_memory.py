@@ -59,7 +59,7 @@ def cpu_bytes(capture: Capture, count: int, size: tuple[int, int], log_scale: fl
     backend.step(batch_of(capture, *size))
     buffers = backend._buffers._buffers
     arrays = [tensor.numpy() for tensor in tensors_of(backend.state).values()] + list(buffers.values())
-    pairs = buffers["pair_rows"].size // 4 * 8 // 9  # an eighth to spare
+    pairs = buffers["pair_blocks"].size * 8 // 9  # an eighth to spare
     return (count, size[0] * size[1], pairs), sum(array.nbytes for array in arrays)
 
 

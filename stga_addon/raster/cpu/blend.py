@@ -4,6 +4,10 @@ A pixel takes splats front to back and stops before the one whose transmittance 
 stores each pixel's last contributing pair and the backward obeys it, so transmittance never underflows behind
 many opaque splats.
 
+The unit of work is a block of 4×4 pixels that a splat reaches. The blocks of several splats are listed first, and each
+step then is one loop over the list: loops over the pixels of one splat are so short that the processor loses more time
+where they end than in them. A block's 16 pixels are one to four vectors on every processor.
+
 Loops over pixels neither load nor store under a condition: NEON and AVX2 have no fast instruction for either, so LLVM
 would emit masked stores or no vectors at all. Both sides of a choice are computed, and every pixel is stored.
 """
@@ -11,6 +15,7 @@ would emit masked stores or no vectors at all. Both sides of a choice are comput
 import numpy as np
 
 from . import inline_jit, jit, part_jit
+from .elementary import prefetch
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PIXELS, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, TILE
 from .outline import outline, rows_within
 from .threads import parallel
@@ -20,26 +25,36 @@ MIN_ALPHA = np.float32(1 / 255)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 LOG2E = np.float32(1.4426950408889634)
 
-# A tile is two halves, eight pixels wide, stored one after the other row by row: a vector of sixteen pixels holds two
-# short rows, and where a splat only grazes one half, little of that half is computed.
-HALF_WIDTH = TILE // 2
-HALF_PIXELS = PIXELS // 2
+SIDE = 4
+"""Of a block, pixels."""
+BLOCK_PIXELS = SIDE * SIDE
+BLOCKS_ALONG = TILE // SIDE
+BLOCKS = BLOCKS_ALONG * BLOCKS_ALONG
+"""Of a tile, column by column; the pixels of each are stored one after the other, row by row."""
 
 # Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be negative wraps
 # around in Python, and the test for it keeps LLVM from vectorizing (12 times slower).
 # The first values are the transmittance: in the forward pass negative once the pixel has stopped.
-SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, ALPHA, WEIGHT, BEHIND = (np.uint64(n * PIXELS) for n in range(1, 10))
-V_RED, V_GREEN, V_BLUE, V_POWER = SUM_RED, SUM_GREEN, SUM_BLUE, ALPHA
-STATE_SIZE = 10 * PIXELS
+SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, BEHIND = (np.uint64(n * PIXELS) for n in range(1, 8))
+V_RED, V_GREEN, V_BLUE = SUM_RED, SUM_GREEN, SUM_BLUE
+PAIRS_PER_GROUP = 8
+"""Splats whose blocks are listed together; after each group, the forward pass looks again which blocks are not yet
+behind something opaque."""
+LISTED = PAIRS_PER_GROUP * BLOCKS
+"""Blocks that a list holds at most."""
+# Behind the tile's values, those of the listed blocks; the forward pass has only the first.
+(ALPHA, DX, DY, V_POWER, PART_RED, PART_GREEN, PART_BLUE) = (
+    np.uint64(8 * PIXELS + n * LISTED * BLOCK_PIXELS) for n in range(7)
+)  # fmt: skip
+FORWARD_SIZE = 8 * PIXELS + LISTED * BLOCK_PIXELS
+BACKWARD_SIZE = 8 * PIXELS + 7 * LISTED * BLOCK_PIXELS
 
-# A tile's splats are copied a batch at a time: memory is asked for many of them at once instead of one after the other,
-# and the rows that they reach are computed in vectors. Column c of splat q lies at c·BATCH_PAIRS + q of a flat array.
+# A tile's splats are copied a batch at a time, while memory is asked for the next ones, which lie all over it. The
+# blocks that a batch reaches are computed in vectors. Column c of splat q lies at c·BATCH_PAIRS + q of a flat array.
 BATCH_PAIRS = 32
-PAIRS_PER_ALIVE_CHECK = 8
-"""After so many pairs the forward pass looks again which rows are not yet behind something opaque."""
 (AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN, AT_BLUE, AT_EXTENT_Y,
- AT_FIRST, AT_PAST, AT_FIRST_RIGHT, AT_PAST_RIGHT) = (np.uint64(n * BATCH_PAIRS) for n in range(14))  # fmt: skip
-BATCH_SIZE = 14 * BATCH_PAIRS
+ AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip
+BATCH_SIZE = 13 * BATCH_PAIRS
 
 
 @inline_jit
@@ -58,6 +73,15 @@ def _exp2(x):
 
 
 @part_jit
+def _prefetch_batch(pair_splat, first, past, projected):
+    """Ask memory for the projected splats of the pairs from `first` to `past`: each in one or two cache lines."""
+    for j in range(np.uint64(first), np.uint64(past)):
+        row = np.uint64(pair_splat[j]) * np.uint64(PROJECTED)
+        prefetch(projected, row)
+        prefetch(projected, row + np.uint64(PROJECTED - 1))
+
+
+@part_jit
 def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
     """Copy the projected splats of `count` pairs from `first` on; centers relative to the tile's corner (x0, y0)."""
     for q in range(np.uint64(count)):
@@ -67,89 +91,115 @@ def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
         batch[AT_PRECISION_Y + q], batch[AT_OPACITY + q] = projected[i, PRECISION_Y], projected[i, OPACITY]
         batch[AT_RED + q], batch[AT_GREEN + q] = projected[i, RED], projected[i, GREEN]
         batch[AT_BLUE + q] = projected[i, BLUE]
+        batch[AT_RATE_X + q] = np.float32(-0.5) * LOG2E * projected[i, PRECISION_X]
+        batch[AT_RATE_Y + q] = np.float32(-0.5) * LOG2E * projected[i, PRECISION_Y]
 
 
 @part_jit
-def _find_rows(count, batch):
-    """Which rows of each half of the tile a batch's splats reach: whole vectors of 16 pixels, so pairs of rows."""
-    two, rows, width = np.float32(2.0), np.float32(TILE), np.float32(HALF_WIDTH)
+def _find_blocks(count, batch):
+    """Which blocks of the tile a batch's splats reach, a bit each."""
+    rows, side, one = np.float32(TILE), np.float32(SIDE), np.int32(1)
     for q in range(np.uint64(count)):
         ellipse = outline(
             batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_PRECISION_X + q], batch[AT_SHEAR + q],
             batch[AT_PRECISION_Y + q], batch[AT_EXTENT_Y + q],
         )  # fmt: skip
-        first, past = rows_within(ellipse, np.float32(0.0), width, rows)
-        batch[AT_FIRST + q], batch[AT_PAST + q] = two * np.floor(first / two), two * np.ceil(past / two)
-        first, past = rows_within(ellipse, width, width, rows)
-        batch[AT_FIRST_RIGHT + q], batch[AT_PAST_RIGHT + q] = two * np.floor(first / two), two * np.ceil(past / two)
+        bits = np.int32(0)
+        for column in range(BLOCKS_ALONG):
+            first, past = rows_within(ellipse, np.float32(column * SIDE), side, rows)
+            low, high = np.int32(np.floor(first / side)), np.int32(np.ceil(past / side))
+            reached = np.int32(max(np.int32(0), np.int32(np.int32(one << high) - np.int32(one << low))))
+            bits = np.int32(bits | np.int32(reached << np.int32(column * BLOCKS_ALONG)))
+        batch[AT_BLOCKS + q] = np.float32(bits)  # of 16 bits, exact
 
 
 @part_jit
-def _rows_alive(s, half):
-    """First and past-the-last row of a half of the tile in which a pixel has not stopped, in pairs of rows; (16, 0)
-    where all have."""
-    first, past = np.float32(TILE), np.float32(0.0)
-    for pair in range(TILE // 2):
-        begin, bits = np.uint64(half * HALF_PIXELS + pair * 2 * HALF_WIDTH), np.int32(-1)
-        for p in range(np.uint64(2 * HALF_WIDTH)):
+def _blocks_alive(s):
+    """The blocks of the tile in which a pixel has not stopped, a bit each."""
+    found = np.uint16(0)
+    for block in range(BLOCKS):
+        begin, bits = np.uint64(block * BLOCK_PIXELS), np.int32(-1)
+        for p in range(np.uint64(BLOCK_PIXELS)):
             bits &= np.float32(s[begin + p]).view(np.int32)
-        if bits >= 0:  # not all sign bits are set
-            first, past = min(first, np.float32(2 * pair)), np.float32(2 * pair + 2)
-    return first, past
+        found |= np.uint16(bits >= 0) << np.uint16(block)  # not all sign bits are set
+    return np.uint16(found)
+
+
+@part_jit
+def _list_blocks(listed, count, q, reached):
+    """Append the blocks of splat q of a batch to the list; returns how many it then holds. One is q·256 + the index of
+    its first pixel. Without a branch: the processor could not foresee which bits are set."""
+    for block in range(np.uint64(BLOCKS)):
+        listed[count] = np.uint16(q * np.uint64(PIXELS) + block * np.uint64(BLOCK_PIXELS))
+        count += (np.uint64(reached) >> block) & np.uint64(1)
+    return count
+
+
+@part_jit
+def _pixel(column, row):
+    """Where the pixel of a tile stands in its flat array."""
+    block = column // SIDE * BLOCKS_ALONG + row // SIDE
+    return np.uint64(block * BLOCK_PIXELS + row % SIDE * SIDE + column % SIDE)
 
 
 @part_jit
 def _set_coordinates(s):
     """Write the centers of a tile's pixels, relative to its corner."""
-    for p in range(np.uint64(PIXELS)):
-        half, within = np.int64(p) // HALF_PIXELS, np.int64(p) % HALF_PIXELS
-        s[X + p] = np.float32(half * HALF_WIDTH + within % HALF_WIDTH) + np.float32(0.5)
-        s[Y + p] = np.float32(within // HALF_WIDTH) + np.float32(0.5)
-
-
-@part_jit
-def _pixel_range(pair_rows, j, half):
-    """Where the pixels of a half that pair j may reach begin and end in the tile's flat array."""
-    base = half * HALF_PIXELS
-    first, past = base + pair_rows[j, 2 * half] * HALF_WIDTH, base + pair_rows[j, 2 * half + 1] * HALF_WIDTH
-    return np.uint64(first), np.uint64(past)
+    for row in range(TILE):
+        for column in range(TILE):
+            p = _pixel(column, row)
+            s[X + p], s[Y + p] = np.float32(column) + np.float32(0.5), np.float32(row) + np.float32(0.5)
 
 
 @inline_jit
-def _falloff(first, past, q, batch, s):
-    """Write opacity · exp(power) of splat q of a batch to s[ALPHA]. A loop of its own: together with blending, it needs
-    more registers than AVX2 has."""
-    mean_x, mean_y, shear = batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_SHEAR + q]
-    qx = np.float32(-0.5) * LOG2E * batch[AT_PRECISION_X + q]
-    qy = np.float32(-0.5) * LOG2E * batch[AT_PRECISION_Y + q]
-    opacity = batch[AT_OPACITY + q]
-    for p in range(first, past):
-        dy = s[Y + p] - mean_y
-        dx = s[X + p] - mean_x - shear * dy
-        power = qx * dx * dx + qy * dy * dy
-        s[ALPHA + p] = opacity * _exp2(power)
+def _listed(listed, n):
+    """Of the n-th listed block: its splat, its first pixel in the tile, and where its own values begin. The bounds that
+    LLVM sees here tell it that these do not overlap the tile's."""
+    entry = np.uint64(listed[n])
+    at = (n % np.uint64(LISTED)) * np.uint64(BLOCK_PIXELS)
+    return entry // np.uint64(PIXELS), entry % np.uint64(PIXELS), at
 
 
 @inline_jit
-def _blend_pair(first, past, q, order, batch, s):
-    """Blend splat q of a batch over the pixels from `first` to `past`; order: its place in the tile's list, from 1."""
-    _falloff(first, past, q, batch, s)
-    red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
-    bits = np.float32(order).view(np.int32)
-    for p in range(first, past):
-        a = min(MAX_ALPHA, s[ALPHA + p])
-        a = a if a >= MIN_ALPHA else np.float32(0.0)
-        t = s[p]
-        after = t * (np.float32(1.0) - a)
-        continues = after > MIN_TRANSMITTANCE
-        weight = a * t if continues else np.float32(0.0)
-        s[p] = after if continues else -abs(t)
-        s[SUM_RED + p] += weight * red
-        s[SUM_GREEN + p] += weight * green
-        s[SUM_BLUE + p] += weight * blue
-        # Positive floats order like their bits; of integers LLVM takes the maximum without a conditional store.
-        reached = bits if weight > np.float32(0.0) else np.int32(0)
-        s[LAST + p] = np.int32(max(np.float32(s[LAST + p]).view(np.int32), reached)).view(np.float32)
+def _falloff(count, listed, batch, keeps_offsets, s):
+    """Write opacity · exp(power) of the listed blocks to s[ALPHA], and if wished the offsets that the power is made of
+    to s[DX] and s[DY]. A loop of its own: together with blending, it needs more registers than AVX2 has."""
+    for n in range(np.uint64(count)):
+        q, first, at = _listed(listed, n)
+        mean_x, mean_y, shear = batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_SHEAR + q]
+        qx, qy, opacity = batch[AT_RATE_X + q], batch[AT_RATE_Y + q], batch[AT_OPACITY + q]
+        for p in range(np.uint64(BLOCK_PIXELS)):
+            dy = s[Y + first + p] - mean_y
+            dx = s[X + first + p] - mean_x - shear * dy
+            power = qx * dx * dx + qy * dy * dy
+            s[ALPHA + at + p] = opacity * _exp2(power)
+            if keeps_offsets:
+                s[DX + at + p] = dx
+                s[DY + at + p] = dy
+
+
+@inline_jit
+def _blend(count, listed, before, batch, s):
+    """Blend the listed blocks; before: how many splats of the tile's list precede the batch's first one."""
+    for n in range(np.uint64(count)):
+        q, first, at = _listed(listed, n)
+        red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
+        order = np.float32(before + np.int64(q) + 1).view(np.int32)
+        for k in range(np.uint64(BLOCK_PIXELS)):
+            p = first + k
+            a = min(MAX_ALPHA, s[ALPHA + at + k])
+            a = a if a >= MIN_ALPHA else np.float32(0.0)
+            t = s[p]
+            after = t * (np.float32(1.0) - a)
+            continues = after > MIN_TRANSMITTANCE
+            weight = a * t if continues else np.float32(0.0)
+            s[p] = after if continues else -abs(t)
+            s[SUM_RED + p] += weight * red
+            s[SUM_GREEN + p] += weight * green
+            s[SUM_BLUE + p] += weight * blue
+            # Positive floats order like their bits; of integers LLVM takes the maximum without a conditional store.
+            reached = order if weight > np.float32(0.0) else np.int32(0)
+            s[LAST + p] = np.int32(max(np.float32(s[LAST + p]).view(np.int32), reached)).view(np.float32)
 
 
 @part_jit
@@ -159,12 +209,46 @@ def _begin_tile(s, tile_rows, tile):
         s[p] = np.float32(1.0)
         s[SUM_RED + p] = s[SUM_GREEN + p] = s[SUM_BLUE + p] = s[LAST + p] = np.float32(0.0)
     for half in range(2):
-        first, past = _pixel_range(tile_rows, tile, half)
-        begin = np.uint64(half * HALF_PIXELS)
-        for p in range(begin, first):
-            s[p] = np.float32(-1.0)
-        for p in range(past, begin + np.uint64(HALF_PIXELS)):
-            s[p] = np.float32(-1.0)
+        first, past = tile_rows[tile, 2 * half], tile_rows[tile, 2 * half + 1]
+        if past - first == TILE:
+            continue
+        for row in range(TILE):
+            if row < first or row >= past:
+                for column in range(half * TILE // 2, (half + 1) * TILE // 2):
+                    s[_pixel(column, row)] = np.float32(-1.0)
+
+
+@part_jit
+def _store_empty_tile(left, top, background, blended):
+    """Write the pixels of a tile without splats."""
+    image, transmittance, last = blended.image, blended.transmittance, blended.last
+    height, width = last.shape
+    red, green, blue = background[0], background[1], background[2]
+    for y in range(np.uint64(top), np.uint64(min(top + TILE, height))):
+        for x in range(np.uint64(left), np.uint64(min(left + TILE, width))):
+            image[0, y, x], image[1, y, x], image[2, y, x] = red, green, blue
+            transmittance[y, x] = np.float32(1.0)
+            last[y, x] = 0
+
+
+@part_jit
+def _store_tile(s, left, top, background, blended):
+    """Write the pixels of a tile that are in the image."""
+    image, transmittance, last = blended.image, blended.transmittance, blended.last
+    height, width = last.shape
+    for y in range(np.uint64(top), np.uint64(min(top + TILE, height))):
+        for x0 in range(left, min(left + TILE, width), SIDE):
+            first = _pixel(x0 - left, np.int64(y) - top)
+            for column in range(np.uint64(SIDE)):
+                p, x = first + column, np.uint64(x0) + column
+                if x >= np.uint64(width):
+                    break
+                t = abs(s[p])
+                image[0, y, x] = s[SUM_RED + p] + t * background[0]
+                image[1, y, x] = s[SUM_GREEN + p] + t * background[1]
+                image[2, y, x] = s[SUM_BLUE + p] + t * background[2]
+                transmittance[y, x] = t
+                last[y, x] = np.int32(s[LAST + p])
 
 
 @parallel(lambda tiles, *_: len(tiles))
@@ -176,101 +260,88 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, tile_rows, lists, proje
     `find_needed_rows`; pixels of the others are undefined. background (3,): composited behind the splats.
     """
     start, pair_splat, projected, extent_y = lists.start, lists.pair_splat, projection.columns, projection.extent_y
-    image, transmittance, last, pair_rows = blended.image, blended.transmittance, blended.last, blended.pair_rows
-    height, width = last.shape
-    s, batch = np.empty(STATE_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
+    pair_blocks = blended.pair_blocks
+    s, batch = np.empty(FORWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
+    listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
     for k in range(first_tile, past_tile):
         tile = tiles[k]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        _begin_tile(s, tile_rows, np.uint64(tile))
         begin, end = start[tile], start[tile + 1]
+        if begin == end:
+            _store_empty_tile(left, top, background, blended)
+            continue
+        _begin_tile(s, tile_rows, np.uint64(tile))
         for batch_begin in range(begin, end, BATCH_PAIRS):
-            low, high = _rows_alive(s, 0)
-            low_right, high_right = _rows_alive(s, 1)
-            if low >= high and low_right >= high_right:
+            alive = _blocks_alive(s)
+            if alive == 0:
                 break
             count = min(BATCH_PAIRS, end - batch_begin)
+            next_end = min(end, batch_begin + count + BATCH_PAIRS)
+            _prefetch_batch(pair_splat, batch_begin + count, next_end, projected)
+            for j in range(np.uint64(batch_begin + count), np.uint64(next_end)):
+                prefetch(extent_y, np.uint64(pair_splat[j]))
             _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
             for q in range(np.uint64(count)):
                 batch[AT_EXTENT_Y + q] = extent_y[np.uint64(pair_splat[np.uint64(batch_begin) + q])]
-            _find_rows(count, batch)
-            for q in range(np.uint64(count)):
-                if q > 0 and q % np.uint64(PAIRS_PER_ALIVE_CHECK) == 0:
-                    low, high = _rows_alive(s, 0)
-                    low_right, high_right = _rows_alive(s, 1)
-                j = np.uint64(batch_begin) + q
-                pair_rows[j, 0], pair_rows[j, 1] = max(low, batch[AT_FIRST + q]), min(high, batch[AT_PAST + q])
-                pair_rows[j, 2] = max(low_right, batch[AT_FIRST_RIGHT + q])
-                pair_rows[j, 3] = min(high_right, batch[AT_PAST_RIGHT + q])
-                for half in range(2):
-                    first, past = _pixel_range(pair_rows, j, half)
-                    if past > first:
-                        _blend_pair(first, past, q, np.float32(np.int64(j) - begin + 1), batch, s)
-        for half in range(2):
-            for row in range(min(TILE, height - top)):
-                first, x0, y = (
-                    np.uint64(half * HALF_PIXELS + row * HALF_WIDTH),
-                    left + half * HALF_WIDTH,
-                    np.uint64(top + row),
-                )
-                for column in range(np.uint64(max(0, min(HALF_WIDTH, width - x0)))):
-                    p, x = first + column, np.uint64(x0) + column
-                    t = abs(s[p])
-                    image[0, y, x] = s[SUM_RED + p] + t * background[0]
-                    image[1, y, x] = s[SUM_GREEN + p] + t * background[1]
-                    image[2, y, x] = s[SUM_BLUE + p] + t * background[2]
-                    transmittance[y, x] = t
-                    last[y, x] = np.int32(s[LAST + p])
+            _find_blocks(count, batch)
+            for group in range(0, count, PAIRS_PER_GROUP):
+                if group > 0:
+                    alive = _blocks_alive(s)
+                blocks = np.uint64(0)
+                for q in range(np.uint64(group), np.uint64(min(count, group + PAIRS_PER_GROUP))):
+                    reached = np.uint16(np.uint16(batch[AT_BLOCKS + q]) & alive)
+                    pair_blocks[np.uint64(batch_begin) + q] = reached
+                    blocks = _list_blocks(listed, blocks, q, reached)
+                _falloff(blocks, listed, batch, False, s)
+                _blend(blocks, listed, batch_begin - begin, batch, s)
+        _store_tile(s, left, top, background, blended)
 
 
 @part_jit
-def _find_wanted_rows(first, past, pair_splat, pair_rows, wanted, found):
-    """Which rows of each half of a tile the wanted ones of its pairs reach, to found[0]; laid out like pair_rows."""
-    found[0, 0] = found[0, 2] = TILE
-    found[0, 1] = found[0, 3] = 0
+def _blocks_of_wanted(first, past, pair_splat, pair_blocks, wanted):
+    """The blocks of a tile that the wanted ones of its pairs reach, a bit each."""
+    found = np.uint16(0)
     for j in range(np.uint64(first), np.uint64(past)):
-        if wanted[pair_splat[j]]:
-            for half in range(2):
-                low, high = pair_rows[j, 2 * half], pair_rows[j, 2 * half + 1]
-                if low < high:
-                    found[0, 2 * half] = min(found[0, 2 * half], low)
-                    found[0, 2 * half + 1] = max(found[0, 2 * half + 1], high)
-            if found[0, 1] - found[0, 0] == TILE and found[0, 3] - found[0, 2] == TILE:
-                break
+        found |= pair_blocks[j] if wanted[pair_splat[j]] else np.uint16(0)
+    return np.uint16(found)
 
 
 @inline_jit
-def _unblend_pair(first, past, q, order, batch, s):
-    """Take splat q of a batch off the pixels again: its weight and the gradient of its power, to s[WEIGHT] and
-    s[V_POWER]."""
-    _falloff(first, past, q, batch, s)
-    red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
-    for p in range(first, past):
-        raw = s[ALPHA + p]
-        a = min(MAX_ALPHA, raw)
-        a = a if (a >= MIN_ALPHA) & (order <= s[LAST + p]) else np.float32(0.0)
-        ra = np.float32(1.0) / (np.float32(1.0) - a)
-        t = s[p] * ra
-        weight = a * t
-        along = red * s[V_RED + p] + green * s[V_GREEN + p] + blue * s[V_BLUE + p]
-        v_a = t * along - ra * s[BEHIND + p]
-        s[p] = t
-        s[BEHIND + p] += weight * along
-        s[WEIGHT + p] = weight
-        # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
-        s[V_POWER + p] = a * v_a if raw < MAX_ALPHA else np.float32(0.0)
+def _unblend(count, listed, before, batch, s):
+    """Take the listed blocks off again: the gradient of their power to s[V_POWER], those of the splat's color to
+    s[PART_RED], s[PART_GREEN] and s[PART_BLUE]."""
+    for n in range(np.uint64(count)):
+        q, first, at = _listed(listed, n)
+        red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
+        order = np.float32(before + np.int64(q) + 1)
+        for k in range(np.uint64(BLOCK_PIXELS)):
+            p, own = first + k, at + k
+            raw = s[ALPHA + own]
+            a = min(MAX_ALPHA, raw)
+            a = a if (a >= MIN_ALPHA) & (order <= s[LAST + p]) else np.float32(0.0)
+            ra = np.float32(1.0) / (np.float32(1.0) - a)
+            t = s[p] * ra
+            weight = a * t
+            v_red, v_green, v_blue = s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p]
+            along = red * v_red + green * v_green + blue * v_blue
+            v_a = t * along - ra * s[BEHIND + p]
+            s[p] = t
+            s[BEHIND + p] += weight * along
+            s[PART_RED + own] = weight * v_red
+            s[PART_GREEN + own] = weight * v_green
+            s[PART_BLUE + own] = weight * v_blue
+            # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
+            s[V_POWER + own] = a * v_a if raw < MAX_ALPHA else np.float32(0.0)
 
 
 @inline_jit
-def _sum_falloff_gradient(first, past, q, batch, s, sums):
-    """Add the sums over pixels of the power's gradient times 1, dx, dy, dx², dx·dy and dy² to sums[:6]."""
-    mean_x, mean_y, shear = batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_SHEAR + q]
-    g0 = gx = gy = gxx = gxy = gyy = np.float32(0.0)
+def _sum_gradient(first, past, s, sums):
+    """Write the sums of a splat's blocks, from value `first` to before `past`: of the power's gradient times 1, dx, dy,
+    dx², dx·dy and dy², and of the color's gradients."""
+    g0 = gx = gy = gxx = gxy = gyy = red = green = blue = np.float32(0.0)
     for p in range(first, past):
-        dy = s[Y + p] - mean_y
-        dx = s[X + p] - mean_x - shear * dy
-        g = s[V_POWER + p]
+        dx, dy, g = s[DX + p], s[DY + p], s[V_POWER + p]
         g_dx, g_dy = g * dx, g * dy
         g0 += g
         gx += g_dx
@@ -278,27 +349,52 @@ def _sum_falloff_gradient(first, past, q, batch, s, sums):
         gxx += g_dx * dx
         gxy += g_dx * dy
         gyy += g_dy * dy
-    sums[0] += g0
-    sums[1] += gx
-    sums[2] += gy
-    sums[3] += gxx
-    sums[4] += gxy
-    sums[5] += gyy
+        red += s[PART_RED + p]
+        green += s[PART_GREEN + p]
+        blue += s[PART_BLUE + p]
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = g0, gx, gy, gxx, gxy, gyy
+    sums[6], sums[7], sums[8] = red, green, blue
 
 
-@inline_jit
-def _sum_color_gradient(first, past, s, sums):
-    """Add the sums over pixels of the weight times the image's gradient to sums[6:]; apart from the other six, because
-    nine sums need more registers than AVX2 has."""
-    red = green = blue = np.float32(0.0)
-    for p in range(first, past):
-        weight = s[WEIGHT + p]
-        red += weight * s[V_RED + p]
-        green += weight * s[V_GREEN + p]
-        blue += weight * s[V_BLUE + p]
-    sums[6] += red
-    sums[7] += green
-    sums[8] += blue
+@part_jit
+def _store_pair(grads, j, q, batch, sums):
+    """Write the gradient of pair j, splat q of a batch, from the sums of `_sum_gradient`."""
+    precision_x, precision_y, shear = batch[AT_PRECISION_X + q], batch[AT_PRECISION_Y + q], batch[AT_SHEAR + q]
+    grads[j, MEAN_X] = precision_x * sums[1]
+    grads[j, MEAN_Y] = precision_y * sums[2] - shear * precision_x * sums[1]
+    grads[j, PRECISION_X] = np.float32(-0.5) * sums[3]
+    grads[j, SHEAR] = precision_x * sums[4]
+    grads[j, PRECISION_Y] = np.float32(-0.5) * sums[5]
+    grads[j, OPACITY] = sums[0] / batch[AT_OPACITY + q]
+    grads[j, RED], grads[j, GREEN], grads[j, BLUE] = sums[6], sums[7], sums[8]
+
+
+@part_jit
+def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
+    """Copy what the backward pass needs of a tile's pixels. Returns the deepest of their last pairs, counted from 1."""
+    transmittance, last = blended.transmittance, blended.last
+    height, width = last.shape
+    if left + TILE > width or top + TILE > height:  # pixels outside the image
+        for p in range(np.uint64(PIXELS)):
+            s[p] = np.float32(1.0)
+            s[BEHIND + p] = s[V_RED + p] = s[V_GREEN + p] = s[V_BLUE + p] = s[LAST + p] = np.float32(0.0)
+    deepest = np.int32(0)
+    for y in range(np.uint64(top), np.uint64(min(top + TILE, height))):
+        for x0 in range(left, min(left + TILE, width), SIDE):
+            first = _pixel(x0 - left, np.int64(y) - top)
+            for column in range(np.uint64(SIDE)):
+                p, x = first + column, np.uint64(x0) + column
+                if x >= np.uint64(width):
+                    break
+                t = transmittance[y, x]
+                s[p] = t
+                vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
+                behind = background[0] * vr + background[1] * vg + background[2] * vb
+                s[BEHIND + p] = t * (behind + v_transmittance[y, x])
+                s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p] = vr, vg, vb
+                s[LAST + p] = np.float32(last[y, x])
+                deepest = max(deepest, last[y, x])
+    return np.int64(deepest)
 
 
 @parallel(lambda tiles, *_: len(tiles))
@@ -313,75 +409,44 @@ def blend_backward(
     (3, H, W), v_transmittance (H, W): gradients of the image over the background and of the transmittance. Each pair
     has a row of its own, so that the sum over a splat's pairs has one order whatever the threads do.
     """
-    start, pair_splat, grads = lists.start, lists.pair_splat, pair_gradients
-    transmittance, last, pair_rows = blended.transmittance, blended.last, blended.pair_rows
-    height, width = last.shape
-    s, batch, sums = np.empty(STATE_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32), np.empty(PROJECTED, np.float32)
-    rows = np.empty((1, 4), np.uint8)
+    start, pair_splat, pair_blocks = lists.start, lists.pair_splat, blended.pair_blocks
+    s, batch = np.empty(BACKWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
+    sums, places = np.empty(PROJECTED, np.float32), np.empty(PAIRS_PER_GROUP + 1, np.uint64)
+    listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
     for k in range(first_tile, past_tile):
         tile = tiles[k]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        if left + TILE > width or top + TILE > height:  # pixels outside the image
-            for p in range(np.uint64(PIXELS)):
-                s[p] = np.float32(1.0)
-                s[BEHIND + p] = s[V_RED + p] = s[V_GREEN + p] = s[V_BLUE + p] = s[LAST + p] = np.float32(0.0)
-        deepest = np.int64(0)
-        for half in range(2):
-            for row in range(min(TILE, height - top)):
-                first, x0, y = (
-                    np.uint64(half * HALF_PIXELS + row * HALF_WIDTH),
-                    left + half * HALF_WIDTH,
-                    np.uint64(top + row),
-                )
-                for column in range(np.uint64(max(0, min(HALF_WIDTH, width - x0)))):
-                    p, x = first + column, np.uint64(x0) + column
-                    t = transmittance[y, x]
-                    s[p] = t
-                    vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
-                    behind = background[0] * vr + background[1] * vg + background[2] * vb
-                    s[BEHIND + p] = t * (behind + v_transmittance[y, x])
-                    s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p] = vr, vg, vb
-                    s[LAST + p] = np.float32(last[y, x])
-                    deepest = max(deepest, np.int64(last[y, x]))
         begin = start[tile]
-        grads[begin + deepest : start[tile + 1], :] = np.float32(0.0)
+        if begin == start[tile + 1]:
+            continue
+        deepest = begin + _load_tile(s, left, top, background, v_image, v_transmittance, blended)
+        pair_gradients[deepest : start[tile + 1], :] = np.float32(0.0)
         nearest = begin  # nothing in front of the first wanted pair needs to be walked
-        while nearest < begin + deepest and not wanted[pair_splat[nearest]]:
+        while nearest < deepest and not wanted[pair_splat[nearest]]:
             nearest += 1
-        _find_wanted_rows(nearest, begin + deepest, pair_splat, pair_rows, wanted, rows)
-        batch_end = begin + deepest
-        while batch_end > nearest:
+        stepped = _blocks_of_wanted(nearest, deepest, pair_splat, pair_blocks, wanted)
+        for batch_end in range(deepest, nearest, -BATCH_PAIRS):
             batch_begin = max(nearest, batch_end - BATCH_PAIRS)
             count = batch_end - batch_begin
+            _prefetch_batch(pair_splat, max(nearest, batch_begin - BATCH_PAIRS), batch_begin, projected)
             _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
-            for n in range(count):
-                q = np.uint64(count - 1 - n)
-                j = np.uint64(batch_begin) + q
-                order, is_wanted = np.float32(np.int64(j) - begin + 1), wanted[pair_splat[j]]
-                sums[:] = np.float32(0.0)
-                for half in range(2):
-                    first, past = _pixel_range(pair_rows, j, half)
-                    if not is_wanted:  # a frozen one is only stepped through, where a wanted one reaches
-                        low, high = _pixel_range(rows, 0, half)
-                        first, past = max(first, low), min(past, high)
-                    if past <= first:
-                        continue
-                    _unblend_pair(first, past, q, order, batch, s)
-                    if is_wanted:
-                        _sum_falloff_gradient(first, past, q, batch, s, sums)
-                        _sum_color_gradient(first, past, s, sums)
-                if is_wanted:
-                    precision_x, precision_y, shear = (
-                        batch[AT_PRECISION_X + q],
-                        batch[AT_PRECISION_Y + q],
-                        batch[AT_SHEAR + q],
-                    )
-                    grads[j, MEAN_X] = precision_x * sums[1]
-                    grads[j, MEAN_Y] = precision_y * sums[2] - shear * precision_x * sums[1]
-                    grads[j, PRECISION_X] = np.float32(-0.5) * sums[3]
-                    grads[j, SHEAR] = precision_x * sums[4]
-                    grads[j, PRECISION_Y] = np.float32(-0.5) * sums[5]
-                    grads[j, OPACITY] = sums[0] / batch[AT_OPACITY + q]
-                    grads[j, RED], grads[j, GREEN], grads[j, BLUE] = sums[6], sums[7], sums[8]
-            batch_end = batch_begin
+            for group_end in range(count, 0, -PAIRS_PER_GROUP):
+                group = min(group_end, PAIRS_PER_GROUP)
+                blocks = np.uint64(0)
+                for n in range(group):
+                    q = np.uint64(group_end - 1 - n)
+                    j = np.uint64(batch_begin) + q
+                    # A frozen one is only stepped through, where a wanted one reaches.
+                    reached = np.uint16(pair_blocks[j] & stepped)
+                    places[n] = blocks * np.uint64(BLOCK_PIXELS)
+                    blocks = _list_blocks(listed, blocks, q, reached)
+                places[group] = blocks * np.uint64(BLOCK_PIXELS)
+                _falloff(blocks, listed, batch, True, s)
+                _unblend(blocks, listed, batch_begin - begin, batch, s)
+                for n in range(group):
+                    q = np.uint64(group_end - 1 - n)
+                    j = np.uint64(batch_begin) + q
+                    if wanted[pair_splat[j]]:
+                        _sum_gradient(places[n], places[n + 1], s, sums)
+                        _store_pair(pair_gradients, j, q, batch, sums)

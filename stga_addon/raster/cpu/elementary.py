@@ -1,6 +1,12 @@
-"""Exponential and logarithm for loops that LLVM vectorizes: the C library's are calls, one value at a time."""
+"""Exponential and logarithm for loops that LLVM vectorizes: the C library's are calls, one value at a time. And
+prefetching."""
+
+from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from . import inline_jit
 
@@ -41,3 +47,19 @@ def logarithm(x):
     p = p * ss + np.float32(2 / 5)
     p = p * ss + np.float32(2 / 3)
     return np.float32(whole) * LN2 + (p * ss * s + np.float32(2.0) * s)
+
+
+@intrinsic
+def prefetch(typing: Any, array: Any, index: Any) -> Any:
+    """Ask memory for the element of a contiguous array that has the given index in its flat form; does not wait."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.bitcast(builder.gep(data, [arguments[1]]), ir.PointerType(ir.IntType(8)))
+        integer = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [address.type, integer, integer, integer])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
+        builder.call(function, [address, integer(0), integer(3), integer(1)])  # to read, keep, data
+        return context.get_dummy_value()
+
+    return types.void(array, index), generate

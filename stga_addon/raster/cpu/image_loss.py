@@ -15,6 +15,8 @@ LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
 """A pixel's gradient depends on image pixels up to this far away."""
 ROW_UNIT_PX = 32
 """Rows of this length have no remainder for LLVM to compute pixel by pixel."""
+PADDING_PX = 8
+"""Zeros before and after each row: WINDOW_RADIUS_PX are needed, and with eight, rows begin where vectors do."""
 RING_ROWS = 2 * WINDOW_RADIUS_PX + 1
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 _window = np.exp(-0.5 * (np.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1) / 1.5) ** 2)
@@ -32,10 +34,10 @@ def _blur(a, i0, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10):
 
 @part_jit
 def _blur_row(source, offset, out, at, count):
-    """Horizontal blur of source[offset + WINDOW_RADIUS_PX : …] to out[at : at + count]; the source row is padded by
-    WINDOW_RADIUS_PX."""
+    """Horizontal blur of source[offset + PADDING_PX : …] to out[at : at + count]; the source row is padded by
+    PADDING_PX."""
     for x in range(np.uint64(count)):
-        i = np.uint64(offset) + x
+        i = np.uint64(offset + PADDING_PX - WINDOW_RADIUS_PX) + x
         one = np.uint64(1)
         i1 = i + one
         i2 = i1 + one
@@ -72,14 +74,9 @@ def _blur_column(ring, plane, stride, row, out, at, count):
 
 
 @inline_jit
-def _similarity_row(moments, stride, padded, span, first, past, slopes):
-    """SSIM of a row of `span` pixels from its four blurred values, and its derivatives by three of them to `slopes`,
-    which are zero from there to `padded`.
-
-    Both hold one value behind the other, `stride` apart; slopes from WINDOW_RADIUS_PX on. Returns the sum over the
-    pixels from `first` to `past`.
-    """
-    total = ZERO
+def _similarity_row(moments, stride, padded, similarity, slopes):
+    """Write SSIM of a row of `padded` pixels to `similarity`, and its derivatives by three of the four blurred values
+    to `slopes`. Both others hold one value behind the other, `stride` apart; slopes from PADDING_PX on."""
     for n in range(np.uint64(padded)):
         mx, my = moments[n], moments[np.uint64(stride) + n]
         squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
@@ -95,11 +92,17 @@ def _similarity_row(moments, stride, padded, span, first, past, slopes):
         by_product = TWO * luminance * over_e
         by_squares = -ssim * over_e
         by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
-        inside = n < np.uint64(span)
-        slopes[np.uint64(WINDOW_RADIUS_PX) + n] = by_mean if inside else ZERO
-        slopes[np.uint64(stride + WINDOW_RADIUS_PX) + n] = by_squares if inside else ZERO
-        slopes[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = by_product if inside else ZERO
-        total += ssim if (n >= np.uint64(first)) & (n < np.uint64(past)) else ZERO
+        slopes[np.uint64(PADDING_PX) + n] = by_mean
+        slopes[np.uint64(stride + PADDING_PX) + n] = by_squares
+        slopes[np.uint64(2 * stride + PADDING_PX) + n] = by_product
+        similarity[n] = ssim
+
+
+@part_jit
+def _sum_row(values, first, past):
+    total = ZERO
+    for n in range(np.uint64(first), np.uint64(past)):
+        total += values[n]
     return total
 
 
@@ -133,18 +136,18 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
     for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
         r, c = job // 3, job % 3
         x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
-        # Columns [left, right) hold everything that matters; each row buffer is padded by WINDOW_RADIUS_PX zeros.
+        # Columns [left, right) hold everything that matters; each row buffer is padded by PADDING_PX zeros.
         left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
         span = right - left
         padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX  # blurs go beyond the span, where nothing reads
-        stride = padded + 2 * WINDOW_RADIUS_PX
+        stride = padded + 2 * PADDING_PX
         target_row = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
         source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
         first = np.zeros(4 * RING_ROWS * stride, np.float32)
         moments = np.zeros(4 * stride, np.float32)
         slopes = np.zeros(3 * stride, np.float32)
         second = np.zeros(3 * RING_ROWS * stride, np.float32)
-        blurred = np.zeros(3 * stride, np.float32)
+        blurred, similarities = np.zeros(3 * stride, np.float32), np.empty(padded, np.float32)
         difference, similarity = 0.0, 0.0
         for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
             # 1. horizontal blur of this row's four values
@@ -156,10 +159,10 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
                     target_row[np.uint64(keep) + n] = np.float32(value) * np.float32(1 / 255)
                 for n in range(np.uint64(span)):
                     x, y = image[c, row, np.uint64(left) + n], target_row[np.uint64(keep) + n]
-                    source[np.uint64(WINDOW_RADIUS_PX) + n] = x
-                    source[np.uint64(stride + WINDOW_RADIUS_PX) + n] = y
-                    source[np.uint64(2 * stride + WINDOW_RADIUS_PX) + n] = x * x + y * y
-                    source[np.uint64(3 * stride + WINDOW_RADIUS_PX) + n] = x * y
+                    source[np.uint64(PADDING_PX) + n] = x
+                    source[np.uint64(stride + PADDING_PX) + n] = y
+                    source[np.uint64(2 * stride + PADDING_PX) + n] = x * x + y * y
+                    source[np.uint64(3 * stride + PADDING_PX) + n] = x * y
             for plane in range(4):
                 into = (plane * RING_ROWS + row % RING_ROWS) * stride
                 if inside:
@@ -174,10 +177,12 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
             if inside:
                 for plane in range(4):
                     _blur_column(first, plane, stride, middle, moments, plane * stride, padded)
-                counted = y0 <= middle < y1
-                total = _similarity_row(moments, stride, padded, span, x0 - left, x1 - left, slopes)
-                if counted:
-                    similarity += total
+                _similarity_row(moments, stride, padded, similarities, slopes)
+                for plane in range(3):  # what lies beyond the image has no slope
+                    beyond = plane * stride + PADDING_PX
+                    slopes[beyond + span : beyond + padded] = ZERO
+                if y0 <= middle < y1:
+                    similarity += _sum_row(similarities, x0 - left, x1 - left)
             for plane in range(3):
                 into = (plane * RING_ROWS + middle % RING_ROWS) * stride
                 if inside:

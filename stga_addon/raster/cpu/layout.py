@@ -89,12 +89,12 @@ class Blended(NamedTuple):
     """The image, and what the backward pass of blending needs.
 
     image (3, H, W) over the background; transmittance (H, W) = 1 − alpha, whose small values alpha would round away;
-    last (H, W) int32: one past the pixel's last contributing pair, counted from its tile's first. pair_rows (P, 4)
-    uint8: first and past-the-last row that the splat may reach in the left and in the right half of the tile; undefined
-    for pairs behind all of a tile's pixels.
+    last (H, W) int32: one past the pixel's last contributing pair, counted from its tile's first. pair_blocks (P,)
+    uint16: the blocks of the tile that the splat may reach, a bit each; undefined for pairs behind all of a tile's
+    pixels.
     """
 
     image: np.ndarray
     transmittance: np.ndarray
     last: np.ndarray
-    pair_rows: np.ndarray
+    pair_blocks: np.ndarray

@@ -209,7 +209,7 @@ def new_image(width: int, height: int, lists: TileLists, buffers: BufferPool) ->
         image=buffers.get("image", (3, height, width)),
         transmittance=buffers.get("transmittance", (height, width)),
         last=buffers.get("last", (height, width), np.int32),
-        pair_rows=buffers.get("pair_rows", (len(lists.pair_splat), 4), np.uint8),
+        pair_blocks=buffers.get("pair_blocks", lists.pair_splat.shape, np.uint16),
     )
 
 

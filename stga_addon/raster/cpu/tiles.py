@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from . import inline_jit, jit, part_jit
+from .elementary import prefetch
 from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
 from .threads import EVEN_PIECES, parallel
 
@@ -88,6 +89,16 @@ def move_by_digit(part, past_part, place, keys, values, least, shift, moved_keys
             row[digit] += 1
 
 
+SPLATS_AHEAD = 16
+"""So many splats ahead, memory is asked for what lies in no order."""
+
+
+@part_jit
+def _prefetch_rect(rect, order, n, past):
+    """Ask memory for the bounds of the splat SPLATS_AHEAD after the n-th in order: they lie anywhere."""
+    prefetch(rect, np.uint64(order[min(n + np.uint64(SPLATS_AHEAD), past - np.uint64(1))]) * np.uint64(4))
+
+
 @inline_jit
 def _tiles_of(rect, i, tiles_x):
     """The first tile of splat i, how many it has in a row of tiles, and how many in all."""
@@ -115,7 +126,9 @@ def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
     for k in range(part, past_part):
         row = counts[k]
         row[:] = 0
-        for n in range(np.uint64(k * len(order) // SORT_PARTS), np.uint64((k + 1) * len(order) // SORT_PARTS)):
+        past = np.uint64((k + 1) * len(order) // SORT_PARTS)
+        for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
+            _prefetch_rect(rect, order, n, past)
             i = np.uint64(order[n])
             tile, width, total = _tiles_of(rect, i, tiles_x)
             pairs[i] = total
@@ -157,7 +170,9 @@ def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_p
     """
     for k in range(part, past_part):
         row = place[k]
-        for n in range(np.uint64(k * len(order) // SORT_PARTS), np.uint64((k + 1) * len(order) // SORT_PARTS)):
+        past = np.uint64((k + 1) * len(order) // SORT_PARTS)
+        for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
+            _prefetch_rect(rect, order, n, past)
             i = np.uint64(order[n])
             tile, width, total = _tiles_of(rect, i, tiles_x)
             first, column = np.uint64(first_pair[i]), np.uint64(1)
