@@ -14,6 +14,8 @@ from stga_addon.light.relight import Relighter
 from stga_addon.light.surface import vertex_normals
 from stga_addon.light.transfer import transfer_of
 from stga_addon.light.values import Light, Lighting
+from stga_addon.scene.gpu.relit_packing import relit_scene
+from stga_addon.scene.layers import Relit, SceneLayer
 
 EYE_RADIUS, LID_HEIGHT = 0.012, 0.016
 EYE = np.array([0.0, 0.0, 1.0])
@@ -85,6 +87,19 @@ def test_a_lash_shades_the_eye_as_cast_rays_say():
     open_ = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0, shadows=False))[eye, 1]
     assert ((lit < 0.5 * open_) == dark).mean() > 0.9  # but for the soft edge
     assert (lit[dark & ~alone] < 0.5 * open_[dark & ~alone]).mean() > 0.9
+
+
+def test_the_viewport_draws_lashes_into_its_shadow_maps():
+    """Catches a viewport whose lashes throw no shadow while a rendered image's do."""
+    avatar = avatar_with((0, 0.003, 0.006))
+    mesh = avatar.neutral.astype(np.float64) + 0.1
+    relit = Relit(Relighter(avatar), mesh, Lighting(lights=(SUN,)))
+    layer = SceneLayer(avatar.splats, avatar.frames(mesh), np.eye(4), relit=relit)
+    head, cards = relit_scene([layer]).maps[0].meshes
+    assert head[0] is mesh
+    np.testing.assert_array_equal(cards[0], relit.relighter.lashes.caster(mesh).vertices)
+    still = replace(relit, lighting=Lighting(lights=(SUN,), shadows=False))
+    assert relit_scene([replace(layer, relit=still)]).maps == ()
 
 
 def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
