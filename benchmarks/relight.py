@@ -163,6 +163,7 @@ def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> Non
     rows = {
         "as trained": (None, {}),
         "studio taken as even": (Relighter(replace(avatar, light=even)), {}),
+        "  undamped": (Relighter(replace(avatar, light=replace(even, damping=0.0))), {}),
         "relit": (relighter, {}),
         "  without shadows": (relighter, {"shadows": False}),
         "  without highlights": (relighter, {"specular": 0.0}),

@@ -10,13 +10,17 @@ from ..errors import StgaError
 from ..progress import Report, ignore
 from .bounce import Bounce
 from .eyes import wet_roughness
-from .harmonics import COUNT, LAMBERT, basis, rotated, uniform
-from .observe import Observed, observe
+from .harmonics import COUNT, LAMBERT, basis, uniform
+from .observe import observe, views_by_time
 from .transfer import transfer_of
 
 ITERATIONS = 40
 PRIOR = 0.7
 """Weight of alike albedos, as a multiple of the observations of a triangle that is seen at every timestep."""
+POSED_DIRECTIONS = 96
+"""By which the transfer of a posed mesh is found, at each timestep."""
+UNSEEN_WEIGHT = 1e-3
+"""Of a timestep at which no camera sees a vertex, where each camera counts 1."""
 MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
 """Transfer of the constant harmonic below which a triangle counts for nothing: its own shadow hides the light."""
 LOSS_SCALE = 3.0
@@ -53,17 +57,18 @@ def estimate_light(capture: Capture, known: Known = Known(), report: Report = ig
         raise StgaError(f"{capture.root}: has no training views, from which its light could be estimated")
     transfer, occlusion = transfer_of(capture.neutral, capture.faces)
     observed = observe(capture, report)
-    by_face = transfer[capture.faces].mean(1)
-    radiance, residual = fit_light(observed, by_face, known.radiance)
+    posed = np.stack(
+        [transfer_of(capture.mesh(time), capture.faces, POSED_DIRECTIONS)[0] for time in views_by_time(capture)]
+    )
+    radiance, residual = fit_light(observed.color, posed[:, capture.faces].mean(2), known.radiance)
     source = "estimated"
     if known.radiance is not None:
         source = "file"
     elif known.card is not None:
         assert known.toward is not None
         radiance, source = _level_with(radiance, known.card, known.toward), "gray_card"
-    mean = np.mean([transfer @ rotated(radiance, rotation) for rotation in observed.rotation], axis=0)
-    mean = np.maximum(mean, DARK)
-    irradiance = mean + Bounce(capture.neutral, capture.faces, occlusion).light(mean)
+    bounce = Bounce(capture.neutral, capture.faces, occlusion)
+    irradiance = recorded_irradiance(np.maximum(posed @ radiance, DARK), observed.cameras, capture.faces, bounce)
     damping = MAX_DAMPING * float(np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1))
     return AvatarLight(
         radiance=radiance.astype(np.float32),
@@ -77,29 +82,42 @@ def estimate_light(capture: Capture, known: Known = Known(), report: Report = ig
     )
 
 
-def fit_light(observed: Observed, transfer: np.ndarray, given: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Radiance (9, 3) in the world's axes and residual; transfer (F, 9) of triangles. given: only the residual is new.
+def recorded_irradiance(direct: np.ndarray, cameras: np.ndarray, faces: np.ndarray, bounce: Bounce) -> np.ndarray:
+    """(V, 3): mean over timesteps of what arrived at vertices, direct (T, V, 3) and by skin around.
+
+    Timesteps count as many times as cameras (T, F) see the vertex then: teeth where the mouth is open, eyeballs where
+    the lids are.
+    """
+    total, count = np.zeros(direct.shape[1:]), np.zeros((direct.shape[1], 1))
+    for arriving, seen in zip(direct, cameras, strict=True):
+        weight = np.bincount(faces.ravel(), np.repeat(seen, 3), len(arriving))[:, None] + UNSEEN_WEIGHT
+        total += weight * (arriving + bounce.light(arriving))
+        count += weight
+    return np.asarray(total / count)
+
+
+def fit_light(color: np.ndarray, received: np.ndarray, given: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Radiance (9, 3) and residual, by linear colors (T, F, 3) of triangles, NaN where they are not seen.
+
+    received (T, F, 9): transfer of the posed triangles. given: only the residual is new.
 
     Minimizes Σ w (color − albedo · transfer · radiance)² over triangles and timesteps, alternating between light and
     albedo, which is drawn to the median; weights w are those of the Cauchy loss. The level is such that the median
     albedo is TYPICAL_ALBEDO in an even, white light: mean irradiance is the same in all channels.
     """
-    color = observed.color
-    # transfer · rotated(radiance) as a matrix of radiance in the world's axes
-    turns = np.stack([rotated(np.eye(COUNT), rotation) for rotation in observed.rotation])
-    received = np.einsum("fk,tkl->tfl", transfer, turns)
-    usable = np.isfinite(color[..., 0]) & (transfer[:, 0] > MIN_OPEN_TRANSFER)
+    times, faces = color.shape[:2]
+    usable = np.isfinite(color[..., 0]) & (received[..., 0] > MIN_OPEN_TRANSFER)
     if usable.sum() < 10 * COUNT:
         raise StgaError("light: too few triangles are seen in the images to estimate it")
-    color, received = color[usable], received[usable]
-    face = np.broadcast_to(np.arange(len(transfer)), usable.shape)[usable]
+    color, received = color[usable], received[usable].astype(np.float64)
+    face = np.broadcast_to(np.arange(faces), usable.shape)[usable]
     radiance = uniform(np.ones(3) / np.pi) if given is None else given
     weight = np.ones_like(color)
     for _ in range(ITERATIONS):
         arriving = received @ radiance
         arriving = np.maximum(arriving, np.maximum(MIN_ARRIVING * arriving.mean(0), DARK))
         typical = np.maximum(np.median(color / arriving, axis=0), DARK)
-        albedo = _albedo(color, arriving, weight, face, typical, len(transfer), len(turns))
+        albedo = _albedo(color, arriving, weight, face, typical, faces, times)
         error = np.abs(color - albedo * arriving)
         weight = 1 / (1 + (error / (LOSS_SCALE * np.median(error, axis=0) + 1e-9)) ** 2)
         if given is None:

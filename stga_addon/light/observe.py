@@ -7,7 +7,6 @@ import numpy as np
 from ..capture.color import srgb_to_linear
 from ..capture.images import read_view
 from ..capture.model import Capture, View, evenly_spread
-from ..capture.rigid import weighted_procrustes
 from ..progress import Progress, Report, ignore
 from .shadows import ShadowMap
 from .values import Light
@@ -28,31 +27,36 @@ SATURATED, DARK = 252, 4
 class Observed:
     """Triangles' colors at T timesteps.
 
-    color     (T, F, 3) linear; NaN where no camera sees the triangle
-    rotation  (T, 3, 3) from the axes of the world to those of the neutral mesh
+    color    (T, F, 3) linear; NaN where no camera sees the triangle
+    cameras  (T, F) how many see it
     """
 
     color: np.ndarray
-    rotation: np.ndarray
+    cameras: np.ndarray
+
+
+def views_by_time(capture: Capture) -> dict[int, list[View]]:
+    """The training views that are looked at: up to MAX_CAMERAS of each of up to MAX_TIMESTEPS."""
+    found: dict[int, list[View]] = {}
+    for view in capture.views.get("train", ()):
+        found.setdefault(view.timestep, []).append(view)
+    return {time: evenly_spread(found[time], MAX_CAMERAS) for time in evenly_spread(sorted(found), MAX_TIMESTEPS)}
 
 
 def observe(capture: Capture, report: Report = ignore) -> Observed:
     """Mean color of each triangle in the darker half of the cameras that face it, which have the fewest highlights.
 
-    Reads up to MAX_TIMESTEPS × MAX_CAMERAS images.
+    T are those of `views_by_time`, in its order; reads all their images.
     """
-    by_time: dict[int, list[View]] = {}
-    for view in capture.views.get("train", ()):
-        by_time.setdefault(view.timestep, []).append(view)
-    times = evenly_spread(sorted(by_time), MAX_TIMESTEPS)
-    colors, rotations = [], []
-    for n, time in enumerate(times):
-        report(Progress(n / max(len(times), 1), "Estimating the light"))
+    by_time = views_by_time(capture)
+    colors, cameras = [], []
+    for n, (time, views) in enumerate(by_time.items()):
+        report(Progress(n / max(len(by_time), 1), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
-        seen = [_view_colors(capture, mesh, view) for view in evenly_spread(by_time[time], MAX_CAMERAS)]
-        colors.append(_darker_half(np.stack(seen)))
-        rotations.append(weighted_procrustes(mesh, capture.neutral, np.ones(len(mesh)))[0])
-    return Observed(np.stack(colors), np.stack(rotations))
+        seen = np.stack([_view_colors(capture, mesh, view) for view in views])
+        colors.append(_darker_half(seen))
+        cameras.append(np.isfinite(seen[..., 0]).sum(0))
+    return Observed(np.stack(colors), np.stack(cameras))
 
 
 def _view_colors(capture: Capture, mesh: np.ndarray, view: View) -> np.ndarray:

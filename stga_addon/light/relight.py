@@ -15,6 +15,7 @@ from ..errors import StgaError
 from .bounce import Bounce
 from .harmonics import GLOSSY, basis, even_directions, rotated, sh_color
 from .lamps import Lamps, distant_light
+from .lashes import Lashes, find_lashes
 from .likeness import Kept, kept, kept_shares, recorded_light
 from .shadows import LIFT_M
 from .surface import at_splats, surface_points, vertex_normals
@@ -24,7 +25,7 @@ REFLECTANCE = 0.04
 """Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
 MIN_IRRADIANCE = 0.15
 """Least irradiance of the capture that color is divided by, as a share of its mean: what was darker is noise."""
-HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.038, 0.14, 0.1
+HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.034, 0.14, 0.1
 """Part of what arrived in the capture that came back as highlights, from skin and from wet eyes, which mirror what is
 in front of them; it is taken from the recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
 VIEW_DIRECTIONS, MIN_VIEW_COSINE = 96, 0.3
@@ -98,6 +99,16 @@ class Relighter:
         normals = self._unit(self._at_splats(vertex_normals(mesh, self.avatar.faces)))
         return np.asarray(np.einsum("nji,nj->ni", frames.rotation[self.avatar.splats.face], normals).astype(np.float32))
 
+    @cached_property
+    def lashes(self) -> Lashes:
+        """What throws shadows beside the mesh."""
+        return find_lashes(self.avatar, self.corners, self.weights, self.roughness, self.albedo)
+
+    def lash_casters(self, mesh: np.ndarray, lighting: Lighting) -> tuple[Caster, ...]:
+        """The lashes of a head posed as `mesh` (V, 3), where there are any and a light throws shadows."""
+        shadowed = lighting.shadows and any(light.casts_shadow for light in lighting.lights)
+        return (self.lashes.caster(mesh),) if shadowed and len(self.lashes.face) else ()
+
     def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
         """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh` (V, 3): what
         `transfer` is multiplied with."""
@@ -140,7 +151,7 @@ class Relighter:
         vertex_normal = vertex_normals(mesh, self.avatar.faces)
         distant, likeness = self.distant_in_head(mesh, lighting)
         world = distant[:, :3]
-        lamps = Lamps(lighting, mesh, self.avatar.faces, casters)
+        lamps = Lamps(lighting, mesh, self.avatar.faces, (*casters, *self.lash_casters(mesh, lighting)))
         at_vertices = np.maximum(self.light.transfer @ world, 0)
         at_vertices += lamps.irradiance(mesh + LIFT_M * vertex_normal, vertex_normal)
         # All at once, because the places of the vertices in memory are what takes time.

@@ -1,15 +1,16 @@
 """The estimate of a capture's light, from colors made with a known one."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from light.scenes import ball_and_plate
-from stga_addon.light.estimate import HARD_RESIDUAL, fit_light
+from stga_addon.light.bounce import Bounce
+from stga_addon.light.estimate import HARD_RESIDUAL, fit_light, recorded_irradiance
 from stga_addon.light.eyes import wet_roughness
 from stga_addon.light.harmonics import LAMBERT, basis, even_directions, project, rotated, uniform
-from stga_addon.light.observe import Observed
 from stga_addon.light.surface import vertex_normals
 from stga_addon.light.transfer import transfer_of
 
@@ -29,16 +30,19 @@ def received() -> np.ndarray:
     return np.asarray(transfer_of(vertices, faces, 96)[0][faces].mean(1), np.float64)
 
 
-def recorded(received: np.ndarray, light: np.ndarray, turns: list[np.ndarray]) -> Observed:
-    """Colors of skin with spots of other colors and highlights on some triangles."""
+def recorded(
+    received: np.ndarray, light: np.ndarray, turns: Sequence[np.ndarray] = (np.eye(3),)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colors (T, F, 3) of skin with spots of other colors and highlights on some triangles, and transfer (T, F, 9)."""
     rng = np.random.default_rng(1)
     albedo = SKIN * rng.uniform(0.9, 1.1, (len(received), 1))
     albedo[rng.random(len(received)) < 0.15] *= 0.2
-    colors = np.stack([albedo / np.pi * (received @ rotated(light, turn)) for turn in turns])
+    posed = np.stack([received @ rotated(np.eye(9), turn) for turn in turns])
+    colors = albedo / np.pi * (posed @ light)
     colors *= rng.normal(1, 0.02, colors.shape)
     colors[:, rng.random(len(received)) < 0.05] += 0.3
     colors[:, rng.random(len(received)) < 0.2] = np.nan
-    return Observed(np.maximum(colors, 1e-3), np.stack(turns))
+    return np.maximum(colors, 1e-3), posed
 
 
 def test_a_soft_light_is_found_despite_spots_and_highlights(received):
@@ -46,7 +50,7 @@ def test_a_soft_light_is_found_despite_spots_and_highlights(received):
     angle = np.radians(25)
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     light = soft_light()
-    found, residual = fit_light(recorded(received, light, [np.eye(3), turn, turn.T]), received)
+    found, residual = fit_light(*recorded(received, light, [np.eye(3), turn, turn.T]))
     normals = even_directions(200)
     have, want = (np.maximum(basis(normals) * LAMBERT @ each, 0)[:, 1] for each in (found, light))
     have *= want.mean() / have.mean()
@@ -61,15 +65,30 @@ def test_a_hard_light_is_told(received):
     toward = np.array([0.9, 0.1, 0.3]) / np.linalg.norm([0.9, 0.1, 0.3])
     lit = np.maximum(normals @ toward, 0) + 0.05
     colors = (SKIN / np.pi * 3 * lit[:, None])[None]
-    _, residual = fit_light(Observed(np.maximum(colors, 1e-3), np.eye(3)[None]), received)
+    _, residual = fit_light(np.maximum(colors, 1e-3), received[None])
     assert residual > HARD_RESIDUAL
 
 
 def test_a_known_light_is_kept(received):
     """Catches an estimate in place of the environment that was given."""
     light = soft_light()
-    found, _ = fit_light(recorded(received, light, [np.eye(3)]), received, light)
+    found, _ = fit_light(*recorded(received, light), light)
     np.testing.assert_array_equal(found, light)
+
+
+def test_what_is_rarely_seen_is_lit_as_when_it_is_seen():
+    """Catches teeth whose colors are divided by the light in a closed mouth."""
+    vertices, faces = ball_and_plate(2)
+    direct = np.stack([np.full((len(vertices), 3), 0.1), np.full((len(vertices), 3), 2.0)])
+    cameras = np.full((2, len(faces)), 4)
+    hidden = vertices[faces].mean(1)[:, 0] < 0
+    cameras[0, hidden], cameras[:, vertices[faces].mean(1)[:, 0] < -0.08] = 0, 0
+    open_sky = Bounce(vertices, faces, np.ones(len(vertices)))
+    found = recorded_irradiance(direct, cameras, faces, open_sky)
+    at = vertices[:, 0]
+    np.testing.assert_allclose(found[at > 0.03], (0.1 + 2.0) / 2)
+    np.testing.assert_allclose(found[(at < -0.03) & (at > -0.07)], 2.0, rtol=1e-3)
+    np.testing.assert_allclose(found[at < -0.098], (0.1 + 2.0) / 2)  # never seen
 
 
 def test_eyeballs_are_found(shared_data: Path):

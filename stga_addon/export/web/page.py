@@ -28,6 +28,7 @@ MODULES = (
     "light_shaders.js",
     "gl.js",
     "camera.js",
+    "lashes.js",
     "light_pass.js",
     "renderer.js",
     "player.js",

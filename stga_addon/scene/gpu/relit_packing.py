@@ -109,12 +109,13 @@ def _lights(relit: Relit, maps: list[ShadowView], map_rows: list[np.ndarray]) ->
     """(points · LIGHT_TEXELS, 4); adds the shadow maps that they need. Lights beyond MAX_MAPS throw no shadow."""
     bounds = head_bounds(relit.mesh)
     faces = relit.relighter.avatar.faces
+    casters = *relit.casters, *relit.relighter.lash_casters(relit.mesh, relit.lighting)
     found = [np.zeros((0, 16), np.float32)]
     for light in relit.lighting.lights:
         shadowed = relit.lighting.shadows and light.casts_shadow and len(maps) < MAX_MAPS
         if shadowed:
             view = light_view(bounds, light)
-            meshes = (relit.mesh, faces), *((caster.vertices, caster.faces) for caster in relit.casters)
+            meshes = (relit.mesh, faces), *((caster.vertices, caster.faces) for caster in casters)
             maps.append(ShadowView(view, meshes))
             map_rows.append(_map_row(view, texel_meters(bounds)))
         found.append(light_rows(light, bounds.center, len(maps) - 1 if shadowed else -1))

@@ -5,7 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stga_addon.avatar.embedding import face_frames
+from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.light import AvatarLight
+from stga_addon.avatar.splats import Splats
 from stga_addon.development.browser import Browser
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
@@ -20,6 +23,7 @@ from .conftest import Head, make_head, show
 from .test_page import difference, picture, snapshot
 from .web_data import read_web_data
 
+LASHES = 40
 MIN_PSNR = 55.0
 """Of relit pictures against the renderer's, which also lets the sun's shadow dim the light between skin and skin."""
 SUN = {"toward": [0.5, 0.6, 0.62], "color": [2.4, 2.1, 1.6]}
@@ -34,8 +38,9 @@ COLORS = """(() => {
 })()"""
 
 
-def lit_head(damping: float = 0.0, **options: object) -> Head:
-    """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes."""
+def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> Head:
+    """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes. lashes: around a nose
+    that is wet as well."""
     head = make_head(**options)  # type: ignore[arg-type]
     neutral, faces = head.avatar.neutral.astype(np.float64), head.avatar.faces
     transfer, occlusion = transfer_of(neutral, faces, 48)
@@ -43,11 +48,29 @@ def lit_head(damping: float = 0.0, **options: object) -> Head:
     radiance[1] = 0.3
     arriving = np.maximum(transfer @ radiance, 0.02)
     arriving = arriving + Bounce(neutral, faces, occlusion).light(arriving)
-    wet = np.where(neutral[:, 0] > 0.05, 0.2, 0).astype(np.float32)
+    eye = lashes & (np.linalg.norm(neutral - neutral[neutral[:, 2].argmax()], axis=1) < 0.012)
+    wet = np.where((neutral[:, 0] > 0.05) | eye, 0.2, 0).astype(np.float32)
     light = AvatarLight(
         radiance.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), wet, 0.05, damping
     )
-    return replace(head, avatar=replace(head.avatar, light=light))
+    splats = with_lashes(head.avatar, eye) if lashes else head.avatar.splats
+    return replace(head, avatar=replace(head.avatar, light=light, splats=splats))
+
+
+def with_lashes(avatar: Avatar, eye: np.ndarray) -> Splats:
+    """The splats of an avatar, the first LASHES of them black and 5 mm above the triangles around an eye (V,) bool."""
+    middle, centers = avatar.neutral[eye].mean(0), avatar.neutral[avatar.faces].mean(1)
+    around = np.flatnonzero(~eye[avatar.faces].any(1) & (np.linalg.norm(centers - middle, axis=1) < 0.02))
+    unit = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention).scale
+    splats = avatar.splats.rows(np.arange(len(avatar.splats)))
+    chosen = np.resize(around, LASHES)
+    splats.face[:LASHES], splats.opacity[:LASHES] = chosen, 2
+    splats.xyz[:LASHES] = 0
+    splats.xyz[:LASHES, 1 if avatar.convention == "gaussian_avatars" else 2] = 0.005 / unit[chosen]
+    splats.log_scale[:LASHES] = np.log([0.003, 0.001, 0.0002]) - np.log(unit[chosen])[:, None]
+    splats.sh[:LASHES] = 0
+    splats.sh[:LASHES, 0] = -1.6
+    return splats
 
 
 def harmonics() -> np.ndarray:
@@ -71,10 +94,10 @@ def set_lighting(browser: Browser, lighting: str) -> None:
     ],
 )
 def test_colors_are_the_relighters(options, exact, browser, tmp_path):
-    """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows, highlights or a share of
-    recorded colors that differ from Python's, and a picture that shows other colors."""
+    """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows (of lashes as well),
+    highlights or a share of recorded colors that differ from Python's, and a picture that shows other colors."""
     alike = options.pop("alike", False)
-    head = lit_head(**options)
+    head = lit_head(lashes=True, **options)
     show(browser, tmp_path, head.data(exact=exact))
     world, sun_light = harmonics(), SUN
     if alike:
@@ -82,6 +105,7 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     set_lighting(browser, str({"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5}))
     order = np.argsort(head.avatar.splats.face, kind="stable")
     relighter = Relighter(head.avatar)
+    assert len(relighter.lashes.face) == LASHES
     sun = Light("sun", sun_light["color"], direction=-np.array(SUN["toward"]))
     share = relighter.distant_in_head(head.meshes[0], Lighting(world, (sun,)))[1].share
     assert 0.3 < share < 0.95 if alike else share < 0.1

@@ -16,7 +16,7 @@ export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of ma
 export class FaceFrames {
   /**
    * Arrays of the data file, and the convention of the embedding; strain is computed where splats follow it.
-   * @param {Arrays} arrays
+   * @param {Pick<Arrays, 'faces' | 'neutral'> & Partial<Arrays>} arrays
    * @param {string} convention
    */
   constructor(arrays, convention) {

@@ -7,6 +7,7 @@ import { Bounce } from './bounce.js';
 import { bounds } from './camera.js';
 import { bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength, program } from './gl.js';
 import { HARMONICS, addPoint, rotatedLight } from './harmonics.js';
+import { Lashes } from './lashes.js';
 import {
   LIFT_M,
   LIGHT_VERTEX_SHADER,
@@ -43,9 +44,13 @@ export class LightPass {
     this.surface = new Surface(data);
     this.bounce = new Bounce(this.neutral, this.faces, this.surface.areas, occlusion);
     this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(this.surface));
-    this.vertexValues = new Float32Array(paddedLength((this.neutral.length / 3) * VERTEX_TEXELS));
+    this.lashes = new Lashes(data, this.surface);
+    const points = this.neutral.length / 3 + 4 * this.lashes.count;
+    this.vertexValues = new Float32Array(paddedLength(points * VERTEX_TEXELS));
     this.vertexTexture = floatTexture(gl, gl.RGBA32F, this.vertexValues);
-    this.shadows = makeShadowMap(gl, this.faces);
+    const corners = this.lashes.faces.map((corner) => this.neutral.length / 3 + corner);
+    this.casters = Uint32Array.from([...this.faces, ...corners]);
+    this.shadows = makeShadowMap(gl, this.casters);
     this.colors = makeTarget(gl, gl.RGBA32F, TEXTURE_WIDTH, Math.ceil(this.surface.count / TEXTURE_WIDTH) || 1);
     const harmonics = arrays.sh ? arrays.sh.shape[1] / 3 : 0;
     this.program = program(gl, LIGHT_VERTEX_SHADER, lightFragmentShader(harmonics, arrays.strain_color ? 3 : 0));
@@ -95,6 +100,12 @@ export class LightPass {
         this.vertexValues[to + 8 + k] = arriving[from + k];
       }
     }
+    if (!sun) return;
+    const lashes = this.lashes.place(vertices); // after the vertices, with nothing but their positions
+    for (let from = 0, to = (vertices.length / 3) * 4 * VERTEX_TEXELS; from < lashes.length; from += 3) {
+      this.vertexValues.set(lashes.subarray(from, from + 3), to);
+      to += 4 * VERTEX_TEXELS;
+    }
   }
 
   drawShadows() {
@@ -110,7 +121,7 @@ export class LightPass {
     gl.uniform3f(uniforms.uMiddle, ...view.middle);
     gl.uniform1f(uniforms.uRadius, view.radius);
     gl.bindVertexArray(this.shadows.vertexArray);
-    gl.drawElements(gl.TRIANGLES, this.faces.length, gl.UNSIGNED_INT, 0);
+    gl.drawElements(gl.TRIANGLES, this.casters.length, gl.UNSIGNED_INT, 0);
     gl.disable(gl.DEPTH_TEST);
   }
 
@@ -208,7 +219,7 @@ function surfaceTexels({ count, color, irradiance, occlusion, roughness, corners
 
 /**
  * @param {WebGL2RenderingContext} gl
- * @param {Values} faces
+ * @param {Uint32Array} faces
  */
 function makeShadowMap(gl, faces) {
   const texture = gl.createTexture();
@@ -223,7 +234,7 @@ function makeShadowMap(gl, faces) {
   const [vertexArray, indexBuffer] = [gl.createVertexArray(), gl.createBuffer()];
   gl.bindVertexArray(vertexArray);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, indexBuffer);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint32Array.from(faces), gl.STATIC_DRAW);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
   gl.bindVertexArray(null);
   return { texture, framebuffer, vertexArray, indexBuffer };
 }

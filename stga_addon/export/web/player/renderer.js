@@ -7,6 +7,7 @@
  */
 
 import { RendererError, bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength, program } from './gl.js';
+import { wholeQuaternion } from './rotation.js';
 import {
   FACE_TEXELS,
   OVER_FRAGMENT_SHADER,
@@ -199,18 +200,6 @@ function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_sca
     }
   }
   return values;
-}
-
-/**
- * The unit quaternion whose parts but the largest, which is positive, are `smaller`.
- * @param {Values} smaller
- * @param {number} largest
- */
-function wholeQuaternion(smaller, largest) {
-  const rest = Math.sqrt(Math.max(0, 1 - smaller[0] ** 2 - smaller[1] ** 2 - smaller[2] ** 2));
-  const whole = Array.from(smaller);
-  whole.splice(largest, 0, rest);
-  return whole;
 }
 
 /**

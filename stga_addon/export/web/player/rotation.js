@@ -1,7 +1,7 @@
 // @ts-check
 // Rotations as axis-angle vectors, unit quaternions (w, x, y, z) and 3×3 matrices, row by row.
 
-/** @import { Vector } from './types.js' */
+/** @import { Values, Vector } from './types.js' */
 
 const SMALL_ANGLE = 1e-8;
 
@@ -86,4 +86,16 @@ export function multiplied([aw, ax, ay, az], [bw, bx, by, bz]) {
     aw * by - ax * bz + ay * bw + az * bx,
     aw * bz + ax * by - ay * bx + az * bw,
   ];
+}
+
+/**
+ * The unit quaternion whose parts but the largest, which is positive, are `smaller`.
+ * @param {Values} smaller
+ * @param {number} largest
+ */
+export function wholeQuaternion(smaller, largest) {
+  const rest = Math.sqrt(Math.max(0, 1 - smaller[0] ** 2 - smaller[1] ** 2 - smaller[2] ** 2));
+  const whole = Array.from(smaller);
+  whole.splice(largest, 0, rest);
+  return whole;
 }

@@ -8,7 +8,7 @@ import { FaceFrames } from './face_frames.js';
 import { HARMONICS } from './harmonics.js';
 import { crossed, difference, dotProduct } from './vector.js';
 
-export const HIGHLIGHT_SHARE = 0.038;
+export const HIGHLIGHT_SHARE = 0.034;
 export const WET_HIGHLIGHT_SHARE = 0.14;
 export const MIN_DIFFUSE_SHARE = 0.1;
 const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
@@ -99,14 +99,33 @@ export class Surface {
   /** Geometric mean over the splats, before damping. */
   typicalAlbedo() {
     const sum = [0, 0, 0];
-    for (let k = 0; k < this.color.length; k++) {
-      const share = this.roughness[Math.floor(k / 3)] > 0 ? WET_HIGHLIGHT_SHARE : HIGHLIGHT_SHARE;
-      const linear = linearOfSrgb(Math.max(this.color[k], 0));
-      const highlight = (share / Math.PI) * this.irradiance[k];
-      const albedo = (Math.PI * Math.max(linear - highlight, MIN_DIFFUSE_SHARE * linear)) / this.irradiance[k];
-      sum[k % 3] += Math.log(Math.max(albedo, LEAST_ALBEDO));
-    }
+    for (let k = 0; k < this.color.length; k++) sum[k % 3] += Math.log(Math.max(this.recordedAlbedo(k), LEAST_ALBEDO));
     return sum.map((total) => Math.exp(total / this.count));
+  }
+
+  /**
+   * Albedo before damping: the k-th of 3·N.
+   * @param {number} k
+   */
+  recordedAlbedo(k) {
+    const share = this.roughness[Math.floor(k / 3)] > 0 ? WET_HIGHLIGHT_SHARE : HIGHLIGHT_SHARE;
+    const linear = linearOfSrgb(Math.max(this.color[k], 0));
+    const highlight = (share / Math.PI) * this.irradiance[k];
+    return (Math.PI * Math.max(linear - highlight, MIN_DIFFUSE_SHARE * linear)) / this.irradiance[k];
+  }
+
+  /**
+   * Albedo of a splat, mean of its channels.
+   * @param {number} splat
+   */
+  meanAlbedo(splat) {
+    let sum = 0;
+    for (let c = 0; c < 3; c++) {
+      const albedo = this.recordedAlbedo(3 * splat + c);
+      const damped = Math.max(albedo, LEAST_ALBEDO) ** (1 - this.damping) * this.typical[c] ** this.damping;
+      sum += (this.damping ? damped : albedo) / 3;
+    }
+    return sum;
   }
 }
 
@@ -118,7 +137,7 @@ export class Surface {
  * @param {number} splat
  * @returns {Vector}
  */
-function placed(world, face, xyz, splat) {
+export function placed(world, face, xyz, splat) {
   const [x, y, z] = xyz.subarray(3 * splat, 3 * splat + 3);
   const part = (/** @type {number} */ k) => world[k] * x + world[k + 1] * y + world[k + 2] * z + world[k + 3];
   return [part(12 * face), part(12 * face + 4), part(12 * face + 8)];

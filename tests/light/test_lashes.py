@@ -1,0 +1,116 @@
+"""Shadows of lashes: splats that stand off the mesh beside an eyeball."""
+
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from light.scenes import blocked
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.light import AvatarLight
+from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.light.harmonics import uniform
+from stga_addon.light.relight import Relighter
+from stga_addon.light.surface import vertex_normals
+from stga_addon.light.transfer import transfer_of
+from stga_addon.light.values import Light, Lighting
+from stga_addon.scene.gpu.relit_packing import relit_scene
+from stga_addon.scene.layers import Relit, SceneLayer
+
+EYE_RADIUS, LID_HEIGHT = 0.012, 0.016
+EYE = np.array([0.0, 0.0, 1.0])
+SUN = Light("sun", np.full(3, 3.0), direction=(0, -1, 0))
+
+
+def eye_below_a_lid() -> tuple[np.ndarray, np.ndarray]:
+    """An eyeball around the origin, and behind it a small plate at LID_HEIGHT whose normal is y."""
+    ball = trimesh.creation.icosphere(4, EYE_RADIUS)
+    lid = trimesh.creation.box((0.02, 0.002, 0.01), trimesh.transformations.translation_matrix((0, 0.015, -0.004)))
+    both = trimesh.util.concatenate([ball, lid.subdivide().subdivide()])
+    return np.array(both.vertices), np.array(both.faces, np.int32)
+
+
+def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avatar:
+    """A gray splat in each triangle, and a card of 8 × 4 mm at `offset` from the lid's top."""
+    vertices, faces = eye_below_a_lid()
+    transfer, occlusion = transfer_of(vertices, faces, 64)
+    irradiance = np.full((len(vertices), 3), np.pi, np.float32)
+    wet = np.where(np.linalg.norm(vertices, axis=1) < 0.0121, 0.2, 0).astype(np.float32)
+    light = AvatarLight(uniform(np.ones(3)).astype(np.float32), transfer, occlusion, irradiance, wet, 0.0)
+    count = len(faces) + 1
+    top = np.flatnonzero(vertices[faces][:, :, 1].min(1) > LID_HEIGHT - 1e-6)
+    splats = Splats(
+        xyz=np.zeros((count, 3), np.float32),
+        rotation=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scale=np.full((count, 3), -9, np.float32),
+        opacity=np.full(count, 3, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+        face=np.append(np.arange(len(faces)), top[0]).astype(np.int32),
+        unbound=np.zeros(count, bool),
+    )
+    avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces, light=light)
+    frames = avatar.frames(vertices)
+    splats.xyz[-1] = frames.rotation[top[0]].T @ (np.array([0, LID_HEIGHT, 0]) + offset - frames.origin[top[0]])
+    splats.log_scale[-1] = np.log([0.0002, 0.0002, 0.0002])
+    # The axes of the card are x and z of the world: turned about the lid's normal from the triangle's.
+    axes = np.eye(4)
+    axes[:3, :3] = frames.rotation[top[0]].T @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    splats.rotation[-1] = trimesh.transformations.quaternion_from_matrix(axes)
+    splats.log_scale[-1] = np.log([0.004, 0.002, 0.0002])
+    splats.sh[-1, 0] = (color - 0.5) / SH_C0
+    return avatar
+
+
+def test_a_lash_shades_the_eye_as_cast_rays_say():
+    """Catches lashes that throw no shadow, one at another place or of another size, and one that does not follow."""
+    relighter = Relighter(avatar_with((0, 0.003, 0.006)))
+    assert len(relighter.lashes.face) == 1
+    corners = np.array([[0.008, 0, 0], [0, 0, -0.004], [-0.008, 0, 0], [0, 0, 0.004]])
+    ends = corners + np.array([0, LID_HEIGHT + 0.003, 0.006])
+    for shift in (np.zeros(3), np.array([0.1, 0.05, -0.2])):
+        mesh = relighter.avatar.neutral + shift
+        cards = relighter.lash_casters(mesh, Lighting(lights=(SUN,)))[0]
+        found = {tuple(np.round(corner, 6)) for corner in cards.vertices}
+        assert found == {tuple(np.round(corner, 6)) for corner in ends + shift}
+    avatar = relighter.avatar
+    vertices = avatar.neutral.astype(np.float64)
+    points = vertices[avatar.faces].mean(1)
+    normals = vertex_normals(vertices, avatar.faces)[avatar.faces].mean(1)
+    with_lid = np.concatenate([vertices, ends])
+    faces = np.concatenate([avatar.faces, len(vertices) + np.array([[0, 1, 2], [0, 2, 3]])])
+    up = normals[:, 1] > 0.5
+    eye = np.flatnonzero(up & (np.linalg.norm(points, axis=1) < EYE_RADIUS))
+    dark = blocked(points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0]), with_lid, faces)
+    alone = blocked(points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0]), vertices, avatar.faces)
+    assert 20 < (dark & ~alone).sum() < (~alone).sum() - 20
+    lit = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0))[eye, 1]
+    open_ = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0, shadows=False))[eye, 1]
+    assert ((lit < 0.5 * open_) == dark).mean() > 0.9  # but for the soft edge
+    assert (lit[dark & ~alone] < 0.5 * open_[dark & ~alone]).mean() > 0.9
+
+
+def test_the_viewport_draws_lashes_into_its_shadow_maps():
+    """Catches a viewport whose lashes throw no shadow while a rendered image's do."""
+    avatar = avatar_with((0, 0.003, 0.006))
+    mesh = avatar.neutral.astype(np.float64) + 0.1
+    relit = Relit(Relighter(avatar), mesh, Lighting(lights=(SUN,)))
+    layer = SceneLayer(avatar.splats, avatar.frames(mesh), np.eye(4), relit=relit)
+    head, cards = relit_scene([layer]).maps[0].meshes
+    assert head[0] is mesh
+    np.testing.assert_array_equal(cards[0], relit.relighter.lashes.caster(mesh).vertices)
+    still = replace(relit, lighting=Lighting(lights=(SUN,), shadows=False))
+    assert relit_scene([replace(layer, relit=still)]).maps == ()
+
+
+def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
+    """Catches shadows of bright skin, of splats on the mesh, and of hair far from the eyes."""
+    relighters = {
+        "bright": Relighter(avatar_with((0, 0.003, 0.006), color=0.7)),
+        "on the mesh": Relighter(avatar_with((0, 0.001, 0.0))),
+        "far": Relighter(avatar_with((0, 0.03, 0.0))),
+    }
+    avatar = avatar_with((0, 0.003, 0.006))
+    assert avatar.light is not None
+    dry = replace(avatar.light, roughness=np.zeros_like(avatar.light.roughness))
+    relighters["no eyes"] = Relighter(replace(avatar, light=dry))
+    assert {name: len(each.lashes.face) for name, each in relighters.items()} == dict.fromkeys(relighters, 0)
