@@ -56,6 +56,8 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
     if found is None:
         return None
     try:
+        if isinstance(found, dict):
+            found = {"shift_mm": 0.0, **found}  # of a capture that was tracked before there was one
         motion: TorsoMotion = from_json(TorsoMotion, found)
         if set(motion.misfit) != set(MOTIONS):
             raise StgaError(f"misfit: expected {', '.join(MOTIONS)}")
