@@ -8,6 +8,7 @@ pushed forward, the torso is shifted as well.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from .fit import HeadFit
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 from .posed_points import cross_matrices
-from .torso_motion import TorsoMotion
+from .torso_motion import TorsoMotion, TorsoPoints
 from .torso_points import Carrier, Motion, SeenPoints, at_depth, compared, seen_points
 from .torso_take import (
     NECK,
@@ -62,39 +63,61 @@ MIN_GAIN, MIN_OWN_GAIN = 0.1, 0.05
 to be shifted as well."""
 
 
-def follow_torso(
-    fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Footage, report: Report
-) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], TorsoMotion | None]:
-    """Parameters (E + 18,) of every timestep with the torso's motion, vertex offsets (V, 3) that shift the torso, none
-    where it is not shifted, and how that was decided.
+@dataclass(frozen=True)
+class FollowedTorso:
+    """A take's heads on their torso.
+
+    parameters  timestep -> (E + 18,)
+    offsets     timestep -> vertex offsets (V, 3) that shift the torso; empty where it is not shifted
+    motion      how it was decided; None where that cannot be told
+    points      where the torso's surface is seen; None where it rides on the head
+    """
+
+    parameters: Mapping[int, np.ndarray]
+    offsets: Mapping[int, np.ndarray] = field(default_factory=dict)
+    motion: TorsoMotion | None = None
+    points: TorsoPoints | None = None
+
+
+def follow_torso(fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Footage, report: Report) -> FollowedTorso:
+    """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
 
     The torso turns about the neck's joint; the head is not moved. Parameters are returned as they are where the torso
-    rides on the head. None where that cannot be told: without masks, in takes shorter than MIN_TIMESTEPS, of models
-    without a neck, and where little of a torso is seen.
+    rides on the head, and where its motion cannot be told: without masks, in takes shorter than MIN_TIMESTEPS, of
+    models without a neck, and where little of a torso is seen.
     """
     unchanged = dict(parameters)
     torso = torso_faces(fit.head.model)
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
-        return unchanged, {}, None
+        return FollowedTorso(unchanged)
     middle = _middle_timestep(parameters)
     take = TorsoTake(fit, unchanged, _cameras(footage, middle), torso)
     seen = seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
-        return unchanged, {}, None
+        return FollowedTorso(unchanged)
     some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
     motions = _motions(take, seen, some, report)
-    found = compared(take, at_depth(take, seen, motions), motions, some)
+    deep = at_depth(take, seen, motions)
+    found = compared(take, deep, motions, some)
     own = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
     misfit = {"head": found["head"], "still": found["still"], "own": found[own]}
     motion = _chosen(misfit)
     if motion == "head":
-        return unchanged, {}, TorsoMotion(motion, misfit, 0.0)
-    chosen = motions[own if motion == "own" else motion]
-    turn = max(float(np.degrees(np.linalg.norm(joint_rotation(posed.parameters, NECK)))) for posed in chosen.values())
-    offsets = {t: take.with_offset(posed) for t, posed in chosen.items() if posed.shift is not None}
-    heads = {t: offsets[t][0] if t in offsets else posed.parameters for t, posed in chosen.items()}
-    shift = max((float(np.linalg.norm(p.shift)) for p in chosen.values() if p.shift is not None), default=0.0)
-    return heads, {t: own for t, (_, own) in offsets.items()}, TorsoMotion(motion, misfit, turn, 1000 * shift)
+        return FollowedTorso(unchanged, motion=TorsoMotion(motion, misfit, 0.0))
+    name = own if motion == "own" else motion
+    return _followed(take, motions[name], motion, misfit, TorsoPoints(middle, deep[name].at))
+
+
+def _followed(
+    take: TorsoTake, posed: Motion, motion: str, misfit: Mapping[str, float], points: TorsoPoints
+) -> FollowedTorso:
+    """The take with the motion that was chosen."""
+    turn = max(float(np.degrees(np.linalg.norm(joint_rotation(own.parameters, NECK)))) for own in posed.values())
+    shift = max((float(np.linalg.norm(own.shift)) for own in posed.values() if own.shift is not None), default=0.0)
+    shifted = {t: take.with_offset(own) for t, own in posed.items() if own.shift is not None}
+    heads = {t: shifted[t][0] if t in shifted else own.parameters for t, own in posed.items()}
+    offsets = {t: offset for t, (_, offset) in shifted.items()}
+    return FollowedTorso(heads, offsets, TorsoMotion(motion, misfit, turn, 1000 * shift), points)
 
 
 def _motions(take: TorsoTake, seen: SeenPoints, some: Sequence[int], report: Report) -> dict[str, Motion]:

@@ -4,14 +4,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import StgaError
-from ..files import read_json
+from ..files import read_json, read_npz, write_npz
 from ..schema import from_json, setting
 from .folder import REPORT_FILE
 
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
 TORSO_KEY = "torso"
 """Of the report; null where the motion could not be told."""
+POINTS_FILE = "torso_points.npz"
 
 
 @dataclass(frozen=True)
@@ -53,9 +56,38 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
     if found is None:
         return None
     try:
+        if isinstance(found, dict):
+            found = {"shift_mm": 0.0, **found}  # of a capture that was tracked before there was one
         motion: TorsoMotion = from_json(TorsoMotion, found)
         if set(motion.misfit) != set(MOTIONS):
             raise StgaError(f"misfit: expected {', '.join(MOTIONS)}")
     except StgaError as error:
         raise StgaError(f"{path}: {TORSO_KEY}: {error}") from error
     return motion
+
+
+@dataclass(frozen=True)
+class TorsoPoints:
+    """Where the torso's surface is seen at a timestep: (N, 3) meters in the capture's world."""
+
+    timestep: int
+    at: np.ndarray
+
+
+def write_torso_points(capture: Path, points: TorsoPoints) -> None:
+    """Write the points into a capture's folder."""
+    write_npz(capture / POINTS_FILE, {"timestep": np.array(points.timestep), "points": points.at.astype(np.float32)})
+
+
+def read_torso_points(capture: Path) -> TorsoPoints | None:
+    """The points in a capture's folder; None where it has none. Raises StgaError where their file is damaged."""
+    path = capture / POINTS_FILE
+    if not path.is_file():
+        return None
+    arrays = read_npz(path)
+    timestep, at = arrays.get("timestep", np.zeros(0)), arrays.get("points", np.zeros(0))
+    if timestep.shape != () or timestep.dtype.kind not in "iu":
+        raise StgaError(f"{path}: timestep: expected a whole number")
+    if at.ndim != 2 or at.shape[1] != 3 or at.dtype.kind != "f" or not np.isfinite(at).all():
+        raise StgaError(f"{path}: points: expected (points, 3) finite numbers")
+    return TorsoPoints(int(timestep), at.astype(np.float64))

@@ -50,7 +50,7 @@ from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
 from .torso import follow_torso
-from .torso_motion import TORSO_KEY, TorsoMotion
+from .torso_motion import TORSO_KEY, TorsoMotion, write_torso_points
 from .write_capture import posed_mesh, write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
@@ -153,7 +153,7 @@ def track(
 
         source = _source(footage, head_file, task if landmarks is None else landmarks)
         footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
-    parameters, offsets, torso = follow_torso(fit, parameters, footage, report)
+    torso = follow_torso(fit, parameters, footage, report)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
@@ -162,7 +162,7 @@ def track(
         + scale_warnings(fit, places, reliable, footage, found)
         + matte_warnings,
         misfits,
-        torso,
+        torso.motion,
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
@@ -170,14 +170,16 @@ def track(
         out / SHEET_FILE,
         footage,
         cameras,
-        lambda timestep: posed_mesh(fit, parameters[timestep], offsets.get(timestep)),
+        lambda timestep: posed_mesh(fit, torso.parameters[timestep], torso.offsets.get(timestep)),
         fit.head.model.faces,
         result.reprojection_px,
         result.image_misfit,
     )
     if landmarks is not None:  # what a correction of the capture starts from
         write_landmarks(out / LANDMARKS_FOLDER, detected, places, reliable)
-    write_capture(out, footage, fit, parameters, offsets, meshes, report)
+    if torso.points is not None:
+        write_torso_points(out, torso.points)
+    write_capture(out, footage, fit, torso.parameters, torso.offsets, meshes, report)
     return result
 
 

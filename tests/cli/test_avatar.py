@@ -11,6 +11,7 @@ from stga_addon.cli import avatar
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.tracking import write_capture
+from stga_addon.tracking.torso import FollowedTorso
 
 
 def make(take, out, *more):
@@ -34,7 +35,7 @@ def made(take, tmp_path_factory):
         patch.setattr(write_capture, "write_json", interrupt)
         # What takes the longest, and is thrown away here
         patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_: fit)
-        patch.setattr("stga_addon.tracking.track.follow_torso", lambda fit, parameters, *_: (parameters, None))
+        patch.setattr("stga_addon.tracking.track.follow_torso", lambda fit, parameters, *_: FollowedTorso(parameters))
         assert make(take, out) == 130
     assert not (out / "run").exists()
     printed = StringIO()

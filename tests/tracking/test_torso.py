@@ -25,7 +25,7 @@ from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.posed_points import parameters_of
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.torso import follow_torso
-from stga_addon.tracking.torso_motion import read_torso_motion
+from stga_addon.tracking.torso_motion import read_torso_motion, read_torso_points
 from stga_addon.tracking.torso_take import NECK, ROOT, with_root
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import flame_frame, posed_mesh
@@ -39,6 +39,7 @@ SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)
 """Of what turns, at each timestep."""
 LIFT_M = 0.012 * np.sin(1.3 * np.arange(TIMESTEPS))[:, None] * [0.5, 1.0, 0.2]
 """By which shoulders are shifted at each timestep."""
+CHEST_SIZE_M, CHEST_CENTER_M = np.array([0.17, 0.08, 0.085]), np.array([0.0, -0.215, -0.04])
 BACKDROP = 115
 
 
@@ -50,7 +51,7 @@ def ellipsoid():
     """Shoulders (V, 3), faces (F, 3) and colors (V, 3) of patterned cloth, below the demo's head."""
     around, down = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.linspace(0, np.pi, 45), indexing="ij")
     unit = np.stack([np.sin(down) * np.cos(around), np.cos(down), np.sin(down) * np.sin(around)], -1).reshape(-1, 3)
-    vertices = unit * [0.17, 0.08, 0.085] + [0, -0.215, -0.04]
+    vertices = unit * CHEST_SIZE_M + CHEST_CENTER_M
     grid = np.arange(90 * 45).reshape(90, 45)
     a, b, c, d = (own.ravel() for own in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
@@ -133,7 +134,8 @@ def torso_angles(fit, parameters, offsets):
 def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, motions):
     """Catches shoulders that ride on the head, and a head that is moved to turn them."""
     fit, parameters, footage = take(head, heads * SWING_DEG, torsos * SWING_DEG)
-    found, offsets, torso = follow_torso(fit, parameters, footage, quiet)
+    followed = follow_torso(fit, parameters, footage, quiet)
+    found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso.motion in motions
     wrong = torso_angles(fit, found, offsets) - torsos * SWING_DEG
     assert np.abs(wrong - wrong.mean()).max() < 3.0
@@ -147,9 +149,10 @@ def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, mo
 @pytest.mark.slow
 def test_shoulders_that_are_lifted_are_followed(head):
     """Catches a torso that is only turned, of which patterned cloth is off by pixels, offsets that FLAME's joints undo,
-    and a head that is moved with them."""
+    a head that is moved with them, and points that are as deep as the neck instead of on the chest."""
     fit, parameters, footage = take(head, SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M)
-    found, offsets, torso = follow_torso(fit, parameters, footage, quiet)
+    followed = follow_torso(fit, parameters, footage, quiet)
+    found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso.motion == "own"
     assert torso.shift_mm > 5
     model = head.model
@@ -162,6 +165,9 @@ def test_shoulders_that_are_lifted_are_followed(head):
         assert np.abs(mesh - posed_mesh(fit, parameters[timestep]))[apart].max() < 2e-3
     wrong = np.array(places) - LIFT_M
     assert np.abs(wrong - wrong.mean(0)).max() < 3e-3
+    timestep = followed.points.timestep
+    beside = followed.points.at - [0.002 * timestep, 0, 0] - LIFT_M[timestep] - CHEST_CENTER_M
+    assert np.median(np.abs(np.linalg.norm(beside / CHEST_SIZE_M, axis=1) - 1)) < 0.15
 
 
 @pytest.mark.slow
@@ -169,7 +175,8 @@ def test_a_torso_that_rides_on_the_head_changes_nothing(head):
     """Catches a torso that noise turns: a bust on a turntable, or a studio capture, keeps its parameters bit for
     bit."""
     fit, parameters, footage = take(head, SWING_DEG, SWING_DEG)
-    found, offsets, torso = follow_torso(fit, parameters, footage, quiet)
+    followed = follow_torso(fit, parameters, footage, quiet)
+    found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso.motion == "head"
     assert not offsets
     assert torso.turn_deg < 1e-3
@@ -180,7 +187,8 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
     """Catches shoulders that follow the backdrop."""
     fit, parameters, footage = take(head, [0, 5, 10, 15], [0, 0, 0, 0], (40, 55))
     bare = tuple(replace(own, frames=replace(own.frames, masks=[None] * 4)) for own in footage.cameras)
-    found, offsets, torso = follow_torso(fit, parameters, replace(footage, cameras=bare), quiet)
+    followed = follow_torso(fit, parameters, replace(footage, cameras=bare), quiet)
+    found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso is None
     assert not offsets
     assert all(found[timestep] is parameters[timestep] for timestep in parameters)
@@ -226,6 +234,7 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head):
     found = read_torso_motion(out)
     assert found == result.torso
     assert found.shift_mm > 5
+    assert len(read_torso_points(out).at) > 100
     capture = open_capture(out, tmp_path / "head.npz")
     sequence, used = capture.flame, np.unique(capture.faces[torso_faces(capture.flame.model)])
     lifts = np.array([capture.mesh(timestep)[used].mean(0)[1] for timestep in range(TIMESTEPS)])

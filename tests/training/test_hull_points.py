@@ -16,11 +16,11 @@ from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.masks import torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
+from stga_addon.tracking.torso_motion import TorsoPoints, write_torso_points
 from stga_addon.training.optimize.hull_points import (
-    GAP_VOXELS,
     MIN_MESH_DISTANCE_M,
+    SEEN_COPIES,
     VOXEL_SIZE_M,
-    flat_layers,
     flat_points,
     hull_points,
 )
@@ -186,6 +186,31 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -
         np.testing.assert_allclose(world[0], world[1], atol=1e-6)
 
 
+def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path: Path) -> None:
+    """Catches a chest that bulges as the hull of few cameras does, one that loses its place when it turns, and a hull
+    of many cameras that is thrown away."""
+    model = synthetic_flame(0)
+    turned = replace(neutral_frame(model), rotation=np.array([0.0, 0.4, 0.0]), neck_pose=np.array([0.0, -0.4, 0.0]))
+    frames = {TIMESTEP: turned, TIMESTEP + 1: neutral_frame(model)}
+    head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
+    views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
+    capture = Capture(
+        tmp_path, "flame", model.faces, sequence_mesh(head, TIMESTEP + 1), {"train": views}, tuple(frames), {},
+        lambda timestep: sequence_mesh(head, timestep), lambda timestep, pose: sequence_mesh(head, timestep), head,
+    )  # fmt: skip
+    hull, many = (hull_points(capture, own, "stga", 0, torso=True) for own in (views[:3], views))
+    at = np.array([0.0, -0.16, 0.09]) + np.random.default_rng(0).uniform(-0.01, 0.01, (200, 3))
+    write_torso_points(tmp_path, TorsoPoints(TIMESTEP + 1, at))
+    few = hull_points(capture, views[:3], "stga", 0, torso=True)
+    seen = few.rows(slice(-SEEN_COPIES * len(at), None))
+    assert len(few) - len(seen) < 0.2 * len(hull)  # above the neck
+    assert torso_faces(model)[seen.face].all()
+    neutral = face_frames(capture.mesh(TIMESTEP + 1), capture.faces, capture.neutral)
+    assert np.linalg.norm(to_world(seen, neutral).xyz - at.mean(0), axis=1).max() < 0.03
+    assert np.linalg.norm(in_world(capture, seen).xyz - at.mean(0), axis=1).min() > 0.01
+    np.testing.assert_array_equal(hull_points(capture, views, "stga", 0, torso=True).xyz, many.xyz)
+
+
 def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None:
     """Catches a grid of 4 mm laid through a mesh of 100 m: 10^13 points."""
     huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
@@ -211,23 +236,6 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside: Capture, conve
     assert np.linalg.norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
     assert world.unbound.all()
     np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
-
-
-def test_what_a_single_camera_shows_later_is_added(beside: Capture, tmp_path: Path) -> None:
-    """Catches shoulders that end where the first image ended, and a layer doubled by every further timestep."""
-    later = replace(next(view for view in beside.views["train"] if _gap(view.camera) > 0.02), timestep=TIMESTEP + 1)
-    posed = beside.mesh(TIMESTEP)
-    capture = replace(beside, mesh=lambda timestep: posed)
-    mask = silhouette(later.camera, CENTRE, RADIUS)
-    middle = int(np.flatnonzero(mask.any(axis=0)).mean())
-    mask[:, middle:] = False
-    Image.fromarray(mask.astype(np.uint8) * 255).save(tmp_path / "half.png")
-    first = replace(later, timestep=TIMESTEP, mask=tmp_path / "half.png")
-    half, both, whole = (flat_layers(capture, views, "stga", 0) for views in ((first,), (first, later), (later, first)))
-    assert len(whole) == len(flat_points(capture, later, "stga", 0))
-    assert 1.2 * len(half) < len(both) <= len(whole)
-    added = later.camera.project(in_world(capture, both.rows(slice(len(half), None))).xyz.astype(np.float64))[0]
-    assert added[:, 0].min() > middle + (GAP_VOXELS - 1) * VOXEL_SIZE_M * FOCAL / FAR
 
 
 def _gap(camera: Camera) -> float:

@@ -6,15 +6,16 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 
-from ...avatar.embedding import face_frames, to_local, to_world
+from ...avatar.embedding import face_frames, to_local
 from ...avatar.lattice import lattice_weights
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask
 from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
-from ...capture.model import Capture, View, evenly_spread
+from ...capture.model import Capture, View
 from ...flame.masks import torso_faces
 from ...flame.sequence import below_neck
+from ...tracking.torso_motion import TorsoPoints, read_torso_points
 
 VOXEL_SIZE_M = 0.004
 """Distance between hull points, on a mesh of a head's size."""
@@ -31,9 +32,10 @@ MIN_EXPOSED_SHARE = 0.125
 contradicts would become floaters in other views."""
 SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
-LAYER_TIMESTEPS, GAP_VOXELS = 8, 3.0
-"""Further timesteps of a single camera at which it is looked for what the layer lacks, and the distance beside the
-layer, in voxels, from which something is missing: less is motion that the mesh does not follow."""
+FEW_CAMERAS = 4
+"""Up to which the visual hull of a torso bulges by centimeters, so that the points of `TorsoPoints` are better."""
+SEEN_COPIES, SEEN_SPREAD = 3, 0.5
+"""Splats for each of these points, and the standard deviation of their distance from it, in voxels."""
 
 
 def hull_points(
@@ -43,7 +45,8 @@ def hull_points(
 
     views: all of one timestep. The hull is carved on a grid of VOXEL_SIZE_M (coarser on a larger mesh) from the masks
     or, without masks, from pixels that differ from white. Each splat is embedded in the nearest triangle and follows
-    it; torso: below the base of FLAME's neck, in the nearest one of the torso.
+    it; torso: below the base of FLAME's neck, in the nearest one of the torso, and of few cameras where `stga track`
+    has seen it instead of on the hull.
     """
     mesh = capture.mesh(views[0].timestep)
     voxel = voxel_size(mesh)
@@ -54,7 +57,31 @@ def hull_points(
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
-    return to_local(world, frames, face[outside])
+    hull = to_local(world, frames, face[outside])
+    seen = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
+    if seen is None or capture.flame is None or seen.timestep not in capture.timesteps:
+        return hull
+    triangles = np.flatnonzero(torso_faces(capture.flame.model))
+    if not len(triangles):
+        return hull
+    rest = hull.rows(~below_neck(capture.flame, views[0].timestep, points[outside]))
+    return _joined(rest, _torso_surface(capture, seen, triangles, convention, sh_degree))
+
+
+def _torso_surface(
+    capture: Capture, seen: TorsoPoints, triangles: np.ndarray, convention: str, sh_degree: int
+) -> Splats:
+    """Splats around the points at which the torso is seen, in its triangles (their numbers)."""
+    mesh, voxel = capture.mesh(seen.timestep), voxel_size(capture.mesh(seen.timestep))
+    spread = np.random.default_rng(0).normal(0, SEEN_SPREAD * voxel, (SEEN_COPIES, *seen.at.shape))
+    points = (seen.at + spread).reshape(-1, 3)
+    _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+    return to_local(_new_splats(points, voxel, sh_degree), frames, triangles[among])
+
+
+def _joined(*parts: Splats) -> Splats:
+    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
 def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, torso: bool = False) -> Splats:
@@ -82,28 +109,6 @@ def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, t
         face = _carried(capture, view.timestep, points, face)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     return to_local(_new_splats(points, voxel, sh_degree), frames, face)
-
-
-def flat_layers(
-    capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
-) -> Splats:
-    """`flat_points` of a single camera's first view, and those of its further ones (`LAYER_TIMESTEPS`) that show what
-    lies farther from the layer so far than GAP_VOXELS: a shoulder that was out of the image at first."""
-    timesteps = {view.timestep: view for view in reversed(views)}
-    layer = flat_points(capture, views[0], convention, sh_degree, torso)
-    for view in evenly_spread([timesteps[t] for t in sorted(timesteps) if t != views[0].timestep], LAYER_TIMESTEPS):
-        mesh, added = capture.mesh(view.timestep), flat_points(capture, view, convention, sh_degree, torso)
-        if not len(added):
-            continue
-        if len(layer):
-            frames = face_frames(mesh, capture.faces, capture.neutral, convention)
-            points, known = (to_world(own, frames).xyz.astype(np.float64) for own in (added, layer))
-            pixels, depth = view.camera.project(points)
-            gap = GAP_VOXELS * voxel_size(mesh) * view.camera.fl_x / float(np.median(depth))
-            distance, _ = cKDTree(view.camera.project(known)[0]).query(pixels)
-            added = added.rows(distance > gap)
-        layer = Splats(*(np.concatenate([getattr(own, name) for own in (layer, added)]) for name in vars(layer)))
-    return layer
 
 
 def voxel_size(mesh: np.ndarray) -> float:

@@ -9,13 +9,13 @@ from ...avatar.lattice import lattice_splats
 from ...avatar.splats import ADDED, SH_C0, Splats
 from ...capture.model import Capture
 from ..settings import TrainingSettings
-from .hull_points import flat_layers, hull_points, in_image
+from .hull_points import flat_points, hull_points, in_image
 from .initial_colors import triangle_colors
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, hull points of the first training timestep
-    (`flat_layers` where a single camera shows it)."""
+    (`flat_points` where a single camera shows it)."""
     lattice = lattice_splats(
         capture.neutral, capture.faces, settings.lattice, settings.sh_degree, convention=settings.convention
     )
@@ -27,8 +27,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     parts = [lattice]
     if settings.hull_points:
         if len(views) == 1:
-            alone = [view for view in capture.views["train"] if view.camera_index == views[0].camera_index]
-            parts.append(flat_layers(capture, alone, settings.convention, settings.sh_degree, settings.torso))
+            parts.append(flat_points(capture, views[0], settings.convention, settings.sh_degree, settings.torso))
         else:
             parts.append(hull_points(capture, views, settings.convention, settings.sh_degree, settings.torso))
     splats = Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))

@@ -316,6 +316,8 @@ def test_torso(tmp_path):
     verdict = rules.torso(tracked(tmp_path, {"torso": {"motion": "own", "misfit": misfit, "turn_deg": 17.3}}))
     assert verdict.on
     assert all(figure in verdict.reason for figure in ("17°", "40%", "20%", "10%"))
+    shifted = {"motion": "own", "misfit": misfit, "turn_deg": 3.0, "shift_mm": 8.2}
+    assert "3° and 8 mm" in rules.torso(tracked(tmp_path, {"torso": shifted})).reason
     assert not rules.torso(tracked(tmp_path, {"torso": {"motion": "head", "misfit": misfit, "turn_deg": 0.0}})).on
     assert not rules.torso(tracked(tmp_path, {"torso": None})).on
     assert not rules.torso(tracked(tmp_path, {})).on
