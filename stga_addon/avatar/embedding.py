@@ -132,13 +132,19 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(area > np.maximum(MIN_AREA_RATIO * triangles.longest_squared, MIN_DIVISOR), area, 0.0)
 
 
+def points_to_world(points: np.ndarray, frames: FaceFrames, face: np.ndarray) -> np.ndarray:
+    """(N, 3) in meters of points (N, 3) in the frames of the triangles `face` (N,)."""
+    turned = np.einsum("nij,nj->ni", frames.rotation[face], points)
+    return np.asarray(frames.scale[face, None] * turned + frames.origin[face])
+
+
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
     """Bake local splats into world space. SH keep their coefficients: their directions are world directions.
 
     Color that depends on strain is added to the constant coefficient, or left out where `frames` have no strain.
     """
     face, scale = splats.face, frames.scale[splats.face]
-    xyz = scale[:, None] * np.einsum("nij,nj->ni", frames.rotation[face], splats.xyz) + frames.origin[face]
+    xyz = points_to_world(splats.xyz, frames, face)
     rotation = multiply(frames.quaternion[face], normalized(splats.rotation))
     log_scale = splats.log_scale + np.log(np.maximum(scale, MIN_DIVISOR))[:, None]
     return replace(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..avatar.embedding import FaceFrames, face_frames
+from ..avatar.embedding import face_frames, points_to_world
 from ..avatar.file import Avatar
 from ..flame.quaternions import to_matrices
 from .eyes import connected_parts
@@ -36,15 +36,10 @@ class Lashes:
         """The cards of a head posed as mesh (V, 3), as what throws shadows."""
         avatar, used = self.avatar, self.avatar.faces[self.face]
         frames = face_frames(mesh, used, avatar.neutral, avatar.convention)
-        vertices = placed(frames, np.arange(len(self.face)), self.corners)
+        corners = self.corners.reshape(-1, 3)
+        vertices = points_to_world(corners, frames, np.repeat(np.arange(len(self.face)), 4))
         faces = 4 * np.arange(len(self.face))[:, None, None] + TRIANGLES
-        return Caster(vertices.reshape(-1, 3), faces.reshape(-1, 3).astype(np.int32))
-
-
-def placed(frames: FaceFrames, face: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(M, K, 3) of points (M, K, 3) in the frames of triangles (M,)."""
-    turned = np.einsum("nij,nkj->nki", frames.rotation[face], points)
-    return np.asarray(frames.origin[face, None] + frames.scale[face, None, None] * turned)
+        return Caster(vertices, faces.reshape(-1, 3).astype(np.int32))
 
 
 def find_lashes(
@@ -59,7 +54,7 @@ def find_lashes(
     frames = face_frames(neutral, avatar.faces, neutral, avatar.convention)
     dark = (albedo.mean(1) < MAX_ALBEDO) & (roughness == 0) & (splats.opacities() > MIN_OPACITY)
     found = np.flatnonzero(dark)
-    points = placed(frames, splats.face[found], splats.xyz[found, None])[:, 0]
+    points = points_to_world(splats.xyz[found], frames, splats.face[found])
     found, points = (rows[_near_eyes(points, neutral, avatar)] for rows in (found, points))
     normal = at_splats(vertex_normals(neutral, avatar.faces), corners[found], weights[found])
     above = points - at_splats(neutral, corners[found], weights[found])

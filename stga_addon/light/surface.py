@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..avatar.embedding import face_frames
+from ..avatar.embedding import face_frames, points_to_world
 from ..avatar.file import Avatar
 
 MAX_STEPS = 6
@@ -25,9 +25,7 @@ def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
     """
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     face = avatar.splats.face.astype(np.int64)
-    points = frames.origin[face] + frames.scale[face, None] * np.einsum(
-        "nij,nj->ni", frames.rotation[face], avatar.splats.xyz
-    )
+    points = points_to_world(avatar.splats.xyz, frames, face)
     corners, beyond = avatar.neutral[avatar.faces].astype(np.float64), _beyond_edges(avatar.faces)
     inside, weights, distance = _nearest(points, corners[face])
     found, walking, at = face.copy(), np.arange(len(face)), face
