@@ -44,8 +44,8 @@ USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this factor, than it is at
 this share of the timesteps so far."""
 DAMPING = 1e-3
-CONVERGED_STEP = 1e-3
-"""Largest change of a parameter (standard deviations, radians, meters) after which a level is done."""
+CONVERGED_STEP_M = 5e-5
+"""Root mean square of the points' motion in a step, after which a level is done."""
 MAX_TURN = 0.3
 """Of a joint in one step, in radians."""
 SETTLED_GAIN = 0.01
@@ -188,7 +188,7 @@ class _Solver:
         old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, values))
         better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
         if better:
-            terms = self._terms(shot, texture, values, visible, 0)
+            terms = self._terms(shot, texture, values, visible, 0, *self.head.linearized(values, 0))
         else:
             values = shot.start
             stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
@@ -239,25 +239,32 @@ class _Solver:
         """Parameters after up to so many steps in each level of the plan."""
         for level, steps in plan:
             for _ in range(steps):
-                step = self._step(shot, texture, values, visible, level)
+                step, motion = self._step(shot, texture, values, visible, level)
                 values = values + step
-                if np.abs(step).max() < CONVERGED_STEP:
+                if motion < CONVERGED_STEP_M:
                     break
         return values
 
-    def _step(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int) -> np.ndarray:
-        """A damped Gauss–Newton step."""
-        matrix, right = self._terms(shot, texture, values, visible, level)
+    def _step(
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int
+    ) -> tuple[np.ndarray, float]:
+        """A damped Gauss–Newton step, and the root mean square in meters of what it moves the points by."""
+        at, jacobian = self.head.linearized(values, level)
+        matrix, right = self._terms(shot, texture, values, visible, level, at, jacobian)
         matrix = matrix + np.diag(self.head.precision)
         matrix[np.diag_indices(len(matrix))] *= 1 + DAMPING
         step = np.linalg.solve(matrix, right - self.head.precision * values)
-        return np.asarray(step / max(1.0, np.abs(step[-RIGID_SIZE:-3]).max() / MAX_TURN))
+        step = step / max(1.0, np.abs(step[-RIGID_SIZE:-3]).max() / MAX_TURN)
+        return step, float(np.sqrt(3 * np.mean((jacobian @ step) ** 2)))
 
     def _terms(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior."""
-        at, jacobian = self.head.linearized(values, level)
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int, at: np.ndarray,
+        jacobian: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior.
+
+        at (M, 3), jacobian (M, 3, K + 18): of the level's points.
+        """
         curvature, slope = photo_term(self.head, shot.views, self._by_images(shot, visible), texture, values, at, level)
         share = len(self.head.rows[0]) / len(at)  # a level weighs the same with fewer points
         flat = jacobian.reshape(-1, len(values))

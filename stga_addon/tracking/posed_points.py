@@ -51,6 +51,8 @@ class PosedPoints:
         self.posedirs, self.weights, self.parents = model.posedirs[rows], model.weights[rows], model.parents.tolist()
         self.joints = model.j_regressor @ model.v_template
         self.joint_dirs = np.einsum("jv,vak->jak", model.j_regressor, model.shapedirs)
+        self._below = _below(self.parents)
+        self._corner_weights = (self.weights * self.barycentric.reshape(-1, 1)).T.reshape(len(self.parents), -1, 3)
 
     def positions(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
         """(N, 3) meters; rigid (18,): pose, then translation."""
@@ -66,15 +68,14 @@ class PosedPoints:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
         posed, count = self._posed(coefficients, rigid), len(self.barycentric)
         turns = [_left_jacobian(angles) for angles in posed.angles]
-        moved = _moves(posed.rotations, self._placed(posed.rotations, self.joint_dirs), self.joint_dirs)
-        shapes = np.concatenate([self.dirs, self._corrective_dirs(posed, turns)], axis=2)
+        first, share = self.dirs.shape[2], self._corner_weights.sum(2)
+        found = np.empty((count, 3, first + RIGID_SIZE))
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
-        found = np.concatenate([skin @ shapes.reshape(count, 9, -1), np.zeros((count, 3, TRANSLATION_SIZE))], axis=2)
-        first = self.dirs.shape[2]
-        found[..., :first] += np.tensordot(self._weighted(self.weights).sum(1), moved, 1)
-        for joint, turn in enumerate(turns):
-            found[..., first + 3 * joint : first + 3 * joint + 3] += self._by_joint(posed, turn, joint)
+        moved = _moves(posed.rotations, self._placed(posed.rotations, self.joint_dirs), self.joint_dirs)
+        found[..., :first] = skin @ self.dirs.reshape(count, 9, first) + np.tensordot(share.T, moved, 1)
+        found[..., first:-TRANSLATION_SIZE] = skin @ self._corrective_dirs(posed, turns).reshape(count, 9, -1)
+        found[..., first:-TRANSLATION_SIZE] += self._by_joints(posed, turns)
         found[..., -TRANSLATION_SIZE:] = np.eye(3)
         return posed.positions, found
 
@@ -89,7 +90,7 @@ class PosedPoints:
         moved = _moves(rotations, places[..., None], joints[..., None])[..., 0]
         corrected = self.template + self.dirs @ coefficients + self.posedirs @ (local[1:] - np.eye(3)).ravel()
         skin = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
-        posed = (skin @ corrected[..., None])[..., 0] + self.weights @ moved
+        posed = np.einsum("nij,nj->ni", skin, corrected) + self.weights @ moved
         positions = self._weighted(posed).sum(1) + rigid[POSE_SIZE:]
         angles = rigid[:POSE_SIZE].reshape(-1, 3)
         return _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
@@ -102,25 +103,20 @@ class PosedPoints:
             bent[9 * (joint - 1) : 9 * joint, 3 * joint : 3 * joint + 3] = changes.reshape(3, 9).T
         return np.asarray((self.posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
 
-    def _by_joint(self, posed: "_Posed", turn: np.ndarray, joint: int) -> np.ndarray:
-        """Derivatives (N, 3, 3) by a joint's axis-angle, of which `turn` is the `_left_jacobian`, but for correctives.
+    def _by_joints(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
+        """Derivatives (N, 3, 15) by the joints' axis-angles, of which `turns` are `_left_jacobian`, but for correctives.
 
         Turning a joint turns about it what it and the joints below it carry, each with its share of the skin.
         """
-        parent = self.parents[joint]
-        carried = [k for k in range(len(self.parents)) if self._is_below(k, joint)]
-        share = self.weights[:, carried]
-        turned = (share @ posed.rotations[carried].reshape(-1, 9)).reshape(-1, 3, 3)
-        arms = (turned @ posed.corrected[..., None])[..., 0]
-        arms += share @ (posed.moved[carried] - posed.places[joint])
-        world = turn if parent < 0 else posed.rotations[parent] @ turn
-        return np.asarray(-cross_matrices(self._weighted(arms).sum(1)) @ world)
-
-    def _is_below(self, joint: int, above: int) -> bool:
-        """Whether `above` is the joint or one that carries it."""
-        while joint >= 0 and joint != above:
-            joint = self.parents[joint]
-        return joint == above
+        turned = posed.corrected @ posed.rotations.swapaxes(1, 2) + posed.moved[:, None]
+        corners = turned.reshape(*self._corner_weights.shape, 3)
+        carried = np.einsum("jnc,jncx->jnx", self._corner_weights, corners)
+        share = self._below @ self._corner_weights.sum(2)
+        arms = np.tensordot(self._below, carried, 1) - share[..., None] * posed.places[:, None]
+        parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
+        across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ np.stack(turns)).reshape(-1, 3, 9)
+        by_joint = (arms @ across).reshape(*arms.shape, 3)
+        return by_joint.transpose(1, 2, 0, 3).reshape(len(by_joint[0]), 3, POSE_SIZE)
 
     def _placed(self, rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
         """World positions (5, 3, K) of joints (5, 3, K), or their derivatives, in which the result is linear."""
@@ -163,6 +159,15 @@ def cross_matrices(vectors: np.ndarray) -> np.ndarray:
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([np.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2)
+
+
+def _below(parents: list[int]) -> np.ndarray:
+    """(J, J): 1 where a joint (column) is one (row) or is carried by it."""
+    found = np.eye(len(parents))
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            found[:, joint] += found[:, parent]
+    return found
 
 
 def _left_jacobian(angles: np.ndarray) -> np.ndarray:
