@@ -104,7 +104,7 @@ class PosedPoints:
         return np.asarray((self.posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
 
     def _by_joints(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (N, 3, 15) by the joints' axis-angles, of which `turns` are `_left_jacobian`, but for correctives.
+        """Derivatives (N, 3, 15) by the axis-angles of the joints, whose `_left_jacobian` is given; no correctives.
 
         Turning a joint turns about it what it and the joints below it carry, each with its share of the skin.
         """
