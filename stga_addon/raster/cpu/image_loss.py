@@ -125,12 +125,13 @@ def _gradient_row(image, target_row, keep, blurred, stride, left, first, past, s
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
 @jit
-def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scale, gradient, sums):
+def image_loss(first_job, past_job, image, target, rectangles, begins, ssim_weight, scale, gradient, sums):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
 
     image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
-    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, per
-    rectangle, sums (R, 2): Σ |difference| and Σ SSIM over its pixels.
+    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, for
+    every row of a rectangle r, which begin at begins[r], sums (3, rows, 2): Σ |difference| and Σ SSIM over its pixels
+    of each channel. By row, the sums do not depend on how an image is cut into bands.
     """
     height, width = image.shape[1], image.shape[2]
     for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
@@ -148,7 +149,6 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
         slopes = np.zeros(3 * stride, np.float32)
         second = np.zeros(3 * RING_ROWS * stride, np.float32)
         blurred, similarities = np.zeros(3 * stride, np.float32), np.empty(padded, np.float32)
-        difference, similarity = 0.0, 0.0
         for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
             # 1. horizontal blur of this row's four values
             inside = 0 <= row < height
@@ -182,7 +182,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
                     beyond = plane * stride + PADDING_PX
                     slopes[beyond + span : beyond + padded] = ZERO
                 if y0 <= middle < y1:
-                    similarity += _sum_row(similarities, x0 - left, x1 - left)
+                    sums[c, begins[r] + middle - y0, 1] = _sum_row(similarities, x0 - left, x1 - left)
             for plane in range(3):
                 into = (plane * RING_ROWS + middle % RING_ROWS) * stride
                 if inside:
@@ -200,9 +200,7 @@ def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scal
                 image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
                 gradient[c, out],
             )  # fmt: skip
-            difference += absolute
-        sums[job, 0] = difference
-        sums[job, 1] = similarity
+            sums[c, begins[r] + out - y0, 0] = absolute
 
 
 @parallel(lambda image, *_: len(image))
