@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from . import jit, part_jit
+from .elementary import exponential
 from .threads import next_piece, parallel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
@@ -147,16 +148,24 @@ def scale_limit(
 @jit
 def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
     """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see `scale_limit`."""
+    scales = np.empty(3 * ROWS_PER_SUM, np.float32)
     first_sum, past_sum = next_piece(work)
     while first_sum < past_sum:
         for k in range(first_sum, past_sum):
+            begin, count = k * ROWS_PER_SUM, min(len(rows) - k * ROWS_PER_SUM, ROWS_PER_SUM)
+            for n in range(np.uint64(count)):
+                i = np.uint64(rows[np.uint64(begin) + n])
+                for c in range(np.uint64(3)):
+                    scales[np.uint64(3) * n + c] = log_scale[i, c]
+            for n in range(np.uint64(3 * count)):
+                scales[n] = exponential(scales[n])
             total = 0.0
-            for n in range(k * ROWS_PER_SUM, min(len(rows), (k + 1) * ROWS_PER_SUM)):
-                i = rows[n]
+            for n in range(np.uint64(count)):
+                i = np.uint64(rows[np.uint64(begin) + n])
                 limit = limits[1 if unbound[i] else 0, face[i]]
-                for c in range(3):
-                    over = max(ZERO, math.exp(log_scale[i, c]) - limit)
-                    total += over * over
+                for c in range(np.uint64(3)):
+                    excess = max(ZERO, scales[np.uint64(3) * n + c] - limit)
+                    total += excess * excess
             sums[k] = total
         first_sum, past_sum = next_piece(work)
 

@@ -10,7 +10,7 @@ from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
 from .threads import next_piece, parallel
 
 RADIX_BITS = 11
-SPLATS_PER_SORT = 16_384
+SPLATS_PER_SORT = 8_192
 """Splats that a thread sorts at a time."""
 SORT_PARTS = 16
 """Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
@@ -23,7 +23,7 @@ def list_visible(rect):
     for i in range(np.uint64(len(rect))):
         found[count] = i
         count += rect[i, 2] > rect[i, 0]
-    return found[:count].copy()
+    return found[:count]
 
 
 def depth_order(depth: np.ndarray, candidates: np.ndarray) -> np.ndarray:
@@ -32,18 +32,30 @@ def depth_order(depth: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     Least-significant-digit radix sort on the bits of the float: positive floats order like their bits. Counted from the
     least, the depths of a head have 22 bits, and take two of the three passes.
     """
-    keys, values = depth.view(np.uint32)[candidates], candidates
-    if len(keys) == 0:
+    if len(candidates) == 0:
         return candidates
-    least = keys.min()
+    keys, values = np.empty(len(candidates), np.uint32), candidates
+    least, greatest = collect_keys(depth.view(np.uint32), candidates, keys)
+    least = np.uint32(least)
     counts = np.empty((-(-len(keys) // SPLATS_PER_SORT), 1 << RADIX_BITS), np.int32)
-    for shift in range(0, int(keys.max() - least).bit_length(), RADIX_BITS):
+    for shift in range(0, int(greatest - least).bit_length(), RADIX_BITS):
         digit, moved_keys, moved = np.uint32(shift), np.empty_like(keys), np.empty_like(values)
         count_digits(counts, keys, least, digit)
         sum_digits(counts)
         move_by_digit(counts, keys, values, least, digit, moved_keys, moved)
         keys, values = moved_keys, moved
     return values
+
+
+@jit
+def collect_keys(bits, candidates, keys):
+    """Write the bits (N,) uint32 of the candidates (M,) to keys (M,); returns the least and the greatest, uint32."""
+    least = greatest = bits[np.uint64(candidates[0])]
+    for n in range(np.uint64(len(candidates))):
+        key = bits[np.uint64(candidates[n])]
+        keys[n] = key
+        least, greatest = min(least, key), max(greatest, key)
+    return least, greatest
 
 
 @inline_jit

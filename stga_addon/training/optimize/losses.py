@@ -1,5 +1,6 @@
 """Image loss of the CPU backend, and the unit of the limits on size and position (STGA, training)."""
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -23,13 +24,13 @@ def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray
     bands: how many, over the whole width: what lies beyond the left and right edge of narrower ones would cost more
     than what lies above and below. By default, so many that the threads are done soonest.
     """
-    tops = _edges(height, bands or _bands(height))
+    tops = _edges(height, bands or _bands(height, threads()))
     return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
 
 
-def _bands(height: int) -> int:
-    """How many bands cost the busiest thread the fewest rows, of those that give a thread something to take over."""
-    count = threads()
+@cache
+def _bands(height: int, count: int) -> int:
+    """How many bands cost the busiest of `count` threads the fewest rows, if there are more pieces than threads."""
 
     def rows_of_a_thread(bands: int) -> int:
         return -(-3 * bands // count) * (-(-height // bands) + 2 * LOSS_REACH_PX)
@@ -65,12 +66,11 @@ def image_gradient(
     image, out (3, H, W) float32; target (H, W, 3) uint8. The loss is the mean over the whole image whatever the
     rectangles are. Returns L1 and SSIM, which are the image's only if the rectangles tile it.
     """
-    ends = np.cumsum(rectangles[:, 3] - rectangles[:, 1])
-    begins = ends - (rectangles[:, 3] - rectangles[:, 1])
-    sums = np.zeros((3, ends[-1] if len(ends) else 0, 2))
+    begins = np.append(0, np.cumsum(rectangles[:, 3] - rectangles[:, 1]))
+    sums = np.zeros((3, begins[-1], 2))
     share = 1.0 / image.size
     image_loss(image, target, rectangles, begins, np.float32(ssim_weight), np.float32(share), out, sums)
-    l1, ssim = sums.sum((0, 1)) * share
+    l1, ssim = sums.reshape(-1, 2).sum(0) * share
     return float(l1), float(ssim)
 
 
