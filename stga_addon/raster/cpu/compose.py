@@ -13,8 +13,8 @@ from .project import project_forward
 from .rasterize import (
     BLACK_BACKGROUND,
     BufferPool,
-    heaviest_first,
     frames_in_camera,
+    heaviest_first,
     new_image,
     new_projection,
     sort_into_tiles,

@@ -125,13 +125,13 @@ def _gradient_row(image, target_row, keep, blurred, stride, left, first, past, s
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
 @jit
-def image_loss(work, image, target, rectangles, begins, ssim_weight, scale, gradient, sums):
+def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, sums):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
 
     image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
-    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, for
-    every row of a rectangle r, which begin at begins[r], sums (3, rows, 2): Σ |difference| and Σ SSIM over its pixels
-    of each channel. By row, the sums do not depend on how an image is cut into bands.
+    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, for the
+    rows of all rectangles one after the other, sums (3, rows, 2): Σ |difference| and Σ SSIM over a row's pixels, by
+    channel. By row, the sums do not depend on how an image is cut into bands.
     """
     height, width = image.shape[1], image.shape[2]
     first_job, past_job = next_piece(work)
@@ -139,6 +139,9 @@ def image_loss(work, image, target, rectangles, begins, ssim_weight, scale, grad
         for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
             r, c = job // 3, job % 3
             x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
+            first_sum = -y0  # where the sums of the rectangle's rows begin, less its first row
+            for before in range(r):
+                first_sum += rectangles[before, 3] - rectangles[before, 1]
             # Columns [left, right) hold everything that matters; each row buffer is padded by PADDING_PX zeros.
             left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
             span = right - left
@@ -185,7 +188,7 @@ def image_loss(work, image, target, rectangles, begins, ssim_weight, scale, grad
                         beyond = plane * stride + PADDING_PX
                         slopes[beyond + span : beyond + padded] = ZERO
                     if y0 <= middle < y1:
-                        sums[c, begins[r] + middle - y0, 1] = _sum_row(similarities, x0 - left, x1 - left)
+                        sums[c, first_sum + middle, 1] = _sum_row(similarities, x0 - left, x1 - left)
                 for plane in range(3):
                     into = (plane * RING_ROWS + middle % RING_ROWS) * stride
                     if inside:
@@ -203,7 +206,7 @@ def image_loss(work, image, target, rectangles, begins, ssim_weight, scale, grad
                     image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
                     gradient[c, out],
                 )  # fmt: skip
-                sums[c, begins[r] + out - y0, 0] = absolute
+                sums[c, first_sum + out, 0] = absolute
         first_job, past_job = next_piece(work)
 
 

@@ -129,7 +129,7 @@ def render_forward(
     def project(rows: np.ndarray, rendered: np.ndarray) -> None:
         project_forward(rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection)
 
-    touched = rendered = np.ones((tiles_y, tiles_x), bool)
+    touched = rendered = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
     if focus is None:
         project(buffers.kept("everything", (len(splats.xyz),), np.arange), rendered)
         tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), whole_tiles)

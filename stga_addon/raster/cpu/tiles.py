@@ -63,7 +63,7 @@ def _digit(key, least, shift):
     return np.uint64((np.uint32(key - least) >> shift) & np.uint32((1 << RADIX_BITS) - 1))
 
 
-@parallel(lambda counts, *_: len(counts))
+@parallel(lambda counts, *_: len(counts), piece=16)
 @jit
 def count_digits(work, counts, keys, least, shift):
     """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit occurs.
