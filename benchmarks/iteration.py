@@ -45,7 +45,7 @@ from stga_addon.raster.cpu.rasterize import (
     tile_grid,
     with_strain_color,
 )
-from stga_addon.raster.cpu.threads import parallel, threads
+from stga_addon.raster.cpu.threads import next_piece, parallel, threads
 from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
 from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
@@ -132,19 +132,22 @@ MULTIPLY_ADDS = 16
 """Of one value in `multiply_add_rows`, one after the other."""
 
 
-@parallel(lambda rows: len(rows))
+@parallel(lambda rows: len(rows), piece=16)
 @jit
-def multiply_add_rows(first, past, rows):
+def multiply_add_rows(work, rows):
     """Sixteen multiply-adds of each value of rows (R, 256) float32, 100 times over."""
-    for n in range(first, past):
-        row = rows[n]
-        for _ in range(100):
-            for p in range(np.uint64(row.shape[0])):
-                x = row[p]
-                value = x
-                for _ in range(MULTIPLY_ADDS):
-                    value = value * x - x
-                row[p] = value
+    first, past = next_piece(work)
+    while first < past:
+        for n in range(first, past):
+            row = rows[n]
+            for _ in range(100):
+                for p in range(np.uint64(row.shape[0])):
+                    x = row[p]
+                    value = x
+                    for _ in range(MULTIPLY_ADDS):
+                        value = value * x - x
+                    row[p] = value
+        first, past = next_piece(work)
 
 
 def arithmetic_rate(clock: Callable[[], float]) -> float:

@@ -6,10 +6,11 @@ The demo's head of benchmarks/iteration.py, one thing changed at a time from 60,
 process. More splats are smaller ones, as on a real head: their size falls with the square root of their number. Run it
 on an idle machine. Prints every figure, with the (splat, tile) pairs of the view, and draws them.
 
---model: instead, what more threads than this machine has would bring. The pieces that an iteration is cut into for N
-threads are timed one after the other (time of the thread, median of repeats) and given to N threads as `threads.py`
-does: each takes the next piece when it is free, and one at a time holds Python's lock to call a kernel. Added are what
-lies between the kernels, and for each kernel the measured time to wake N − 1 threads and to hear of the last one's end.
+--model: instead, what more threads than this machine has would bring. The pieces that an iteration is cut into are
+timed one after the other (time of the thread, median of repeats; many short ones a few at a time) and given to N
+threads as `threads.py` does: one at a time holds Python's lock to call the kernel, and each takes the next piece when
+it is free. Added are what lies between the kernels, and for each kernel the measured time to wake N − 1 threads and to
+hear of the last one's end.
 Cores are taken to be alike and memory to keep up: the last column is the bandwidth that this needs.
 """
 
@@ -40,6 +41,8 @@ import matplotlib.pyplot as plt
 
 SPLATS, WIDTH, HEIGHT = 60_000, 802, 550
 MODELLED_THREADS = (1, 2, 4, 8, 16)
+TIMED_PIECES = 64
+"""Pieces of a kernel that are timed one by one, if it has no more: calling it takes time too."""
 BYTES_PER_SPLAT, BYTES_PER_PAIR, BYTES_PER_PIXEL = 3_100, 140, 71
 """What an iteration at least reads and writes, by the table of benchmarks/iteration.py."""
 
@@ -99,7 +102,7 @@ def series(repeats: int) -> dict[str, list[Point]]:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A call of a kernel, in milliseconds: its pieces, and for how long each holds Python's lock to be called."""
+    """A kernel, in milliseconds: its pieces, and for how long each thread holds Python's lock to call it."""
 
     name: str
     pieces: list[float]
@@ -113,19 +116,23 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
     found: list[Kernel] = []
     aside = 0.0
 
-    def one_by_one(kernel: Any, parts: list[tuple[int, int]], arguments: tuple[Any, ...]) -> None:
+    def one_by_one(kernel: Any, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
         nonlocal aside
         begin = thread_time()
+        together = piece * -(-units // (piece * TIMED_PIECES))
+        spans = [(first, min(first + together, units)) for first in range(0, units, together)]
         times = []
-        for first, past in parts:
+        for first, past in spans:
             before = thread_time()
-            kernel(first, past, *arguments)
+            kernel(np.array([first, past, piece]), *arguments)
             times.append(1e3 * (thread_time() - before))
         before = thread_time()
         for _ in range(3):
-            kernel(0, 0, *arguments)
+            kernel(np.array([0, 0, piece]), *arguments)
         call = 1e3 * (thread_time() - before) / 3
-        found.append(Kernel(kernel.__name__, [max(call, ms) for ms in times], call))
+        pieces = [-(-(past - first) // piece) for first, past in spans]
+        each = [max(0.0, ms - call) / count for ms, count in zip(times, pieces, strict=True) for _ in range(count)]
+        found.append(Kernel(kernel.__name__, each, call))
         aside += 1e3 * (thread_time() - begin)
 
     with patch.object(kernel_threads, "_run", one_by_one):
@@ -136,20 +143,20 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
 
 
 def span_ms(kernel: Kernel, count: int, two_threads: float, waking: float) -> float:
-    """How long a kernel takes `count` threads. Each takes the next piece as soon as it is free, and one at a time calls
-    the kernel; the calling thread first wakes the others, one after the other, and at the end hears of each.
+    """How long a kernel takes `count` threads. Each calls the kernel once, one at a time, and then takes the next piece
+    as soon as it is free; the calling thread first wakes the others, one after the other, and at the end hears of each.
 
     two_threads: what a kernel without work costs on two threads; waking: what it takes to wake one.
     """
     helpers = min(count, len(kernel.pieces)) - 1
-    if not helpers:
-        return sum(kernel.pieces)
-    latency = two_threads - waking
-    free, lock = [helpers * waking, *(latency + n * waking for n in range(1, helpers + 1))], 0.0
+    latency = two_threads - waking if helpers else 0.0
+    free, lock = [], 0.0
+    for ready in sorted([helpers * waking, *(latency + n * waking for n in range(1, helpers + 1))]):
+        lock = max(ready, lock) + kernel.call
+        free.append(lock)
     heapq.heapify(free)
     for ms in kernel.pieces:
-        lock = max(free[0], lock) + kernel.call
-        heapq.heapreplace(free, lock + ms - kernel.call)
+        heapq.heapreplace(free, free[0] + ms)
     return max(free)
 
 
@@ -172,7 +179,7 @@ def dispatch_ms(repeats: int) -> float:
     """What a kernel without work costs on two threads."""
 
     @parallel(lambda: 16)
-    def nothing(begin: int, end: int) -> None:
+    def nothing(work: np.ndarray) -> None:
         pass
 
     before = threads()

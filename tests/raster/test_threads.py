@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("numba")
 
 from stga_addon.raster.cpu import jit
-from stga_addon.raster.cpu.threads import parallel, set_threads, threads
+from stga_addon.raster.cpu.threads import next_piece, parallel, set_threads, threads
 
 from .test_kernels import SCENES, kernel_gradients, random_cotangents
 
@@ -24,14 +24,16 @@ def as_many_as_before() -> Iterator[None]:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 20])
 @pytest.mark.parametrize("units", [0, 1, 2, 5, 8, 100])
-@pytest.mark.parametrize("least", [1, 6])
-def test_every_unit_is_done_once(count: int, units: int, least: int) -> None:
+@pytest.mark.parametrize("piece", [1, 6])
+def test_every_unit_is_done_once(count: int, units: int, piece: int) -> None:
     """Catches pieces that overlap, are left out at the end, or are taken by two threads."""
 
-    @parallel(len, least=least)
-    def count_up(begin: int, end: int, done: np.ndarray) -> None:
-        for n in range(begin, end):
-            done[n] += 1
+    @parallel(len, piece=piece)
+    def count_up(work: np.ndarray, done: np.ndarray) -> None:
+        begin, end = next_piece(work)
+        while begin < end:
+            done[begin:end] += 1
+            begin, end = next_piece(work)
 
     set_threads(count)
     done = np.zeros(units, int)
@@ -40,14 +42,36 @@ def test_every_unit_is_done_once(count: int, units: int, least: int) -> None:
     assert (done == 20).all()
 
 
+@parallel(len)
+@jit
+def count_pieces(work, done):
+    begin, end = next_piece(work)
+    while begin < end:
+        for n in range(begin, end):
+            done[n] += 1
+        begin, end = next_piece(work)
+
+
+def test_threads_that_run_at_once_take_different_pieces() -> None:
+    """Catches a counter that two threads read before either has advanced it: pieces this short collide at once."""
+    set_threads(4)
+    done = np.zeros(2_000_000, np.int64)
+    for _ in range(5):
+        count_pieces(done)
+    assert (done == 5).all()
+
+
 @pytest.mark.parametrize("at", [0, 9])
 def test_an_error_reaches_the_caller(at: int) -> None:
     """Catches an error that dies with its thread, a caller that then waits for ever, and threads lost to it."""
 
     @parallel(len)
-    def fail(begin: int, end: int, numbers: np.ndarray) -> None:
-        if begin <= at < end:
-            raise ValueError("this piece")
+    def fail(work: np.ndarray, numbers: np.ndarray) -> None:
+        begin, end = next_piece(work)
+        while begin < end:
+            if begin <= at < end:
+                raise ValueError("this piece")
+            begin, end = next_piece(work)
 
     set_threads(3)
     for _ in range(5):

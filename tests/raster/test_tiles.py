@@ -5,9 +5,9 @@ import pytest
 
 pytest.importorskip("numba")
 
+from stga_addon.raster.cpu.blend import RUN_TILES
 from stga_addon.raster.cpu.layout import TileLists
-from stga_addon.raster.cpu.rasterize import balance_tiles
-from stga_addon.raster.cpu.threads import cut, set_threads, threads
+from stga_addon.raster.cpu.rasterize import heaviest_first
 from stga_addon.raster.cpu.tiles import SPLATS_PER_SORT, depth_order, list_visible
 
 
@@ -32,19 +32,17 @@ def test_splats_with_tiles_are_listed():
     assert len(depth_order(np.ones(0, np.float32), np.zeros(0, np.int32))) == 0
 
 
-@pytest.mark.parametrize("count", [1, 2, 16])
-def test_pieces_of_tiles_have_equally_many_pairs(count):
-    """Catches tiles that are lost or doubled, and a thread that gets the full tiles of the middle."""
-    before = threads()
-    set_threads(count)
-    try:
-        rng = np.random.default_rng(1)
-        far = np.abs(np.arange(1785) % 51 - 25) + np.abs(np.arange(1785) // 51 - 17)
-        pairs = np.where(far < 20, rng.integers(200, 400, 1785), 0)
-        lists = TileLists(*[np.zeros(0, np.int32)] * 4, np.append(0, np.cumsum(pairs)), np.zeros(0, np.int32))
-        tiles = balance_tiles(np.arange(1785, dtype=np.int32), lists)
-        np.testing.assert_array_equal(np.sort(tiles), np.arange(1785))
-        pieces = [pairs[tiles[a:b]].sum() for a, b in cut(1785)]
-        assert max(pieces) < 1.5 * sum(pieces) / len(pieces)
-    finally:
-        set_threads(before)
+@pytest.mark.parametrize("count", [1, 7, 8, 1785])
+def test_runs_of_tiles_begin_with_the_fullest(count):
+    """Catches tiles that are lost or doubled, neighbors that are torn apart, and a long run that is left to the end,
+    where all threads but one wait for it."""
+    rng = np.random.default_rng(1)
+    pairs = rng.integers(0, 400, 1785)
+    lists = TileLists(*[np.zeros(0, np.int32)] * 4, np.append(0, np.cumsum(pairs)), np.zeros(0, np.int32))
+    given = np.sort(rng.choice(1785, count, replace=False)).astype(np.int32)
+    tiles = heaviest_first(given, lists)
+    np.testing.assert_array_equal(np.sort(tiles), given)
+    whole = count // RUN_TILES * RUN_TILES
+    runs = tiles[:whole].reshape(-1, RUN_TILES)
+    assert {tuple(run) for run in runs.tolist()} == {tuple(r) for r in given[:whole].reshape(-1, RUN_TILES).tolist()}
+    assert (np.diff(pairs[runs].sum(1)) <= 0).all()

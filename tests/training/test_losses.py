@@ -108,16 +108,26 @@ def test_too_short_a_reach_would_be_noticed() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
-@pytest.mark.parametrize("parts", [(1, 1), (2, 4), (3, 5), (1, 64)])
-def test_rectangles_tile_the_image(height: int, width: int, parts: tuple[int, int]) -> None:
-    """Catches a pixel that two rectangles or none covers, and an empty one where the image has fewer pixels than
-    parts."""
+@pytest.mark.parametrize("bands", [1, 2, 3, 64])
+def test_rectangles_tile_the_image(height: int, width: int, bands: int) -> None:
+    """Catches a pixel that two rectangles or none covers, and an empty one where the image has fewer rows than
+    bands."""
     covered = np.zeros((height, width), int)
-    for x0, y0, x1, y1 in whole_image(height, width, parts):
+    for x0, y0, x1, y1 in whole_image(height, width, bands):
         assert x0 < x1
         assert y0 < y1
         covered[y0:y1, x0:x1] += 1
     np.testing.assert_array_equal(covered, 1)
+
+
+def test_bands_do_not_change_a_bit() -> None:
+    """Catches a run that goes another way on another number of threads, which decides how many bands there are."""
+    image, target = random_pair(75, 110, seed=2)
+    whole, cut = np.empty_like(image), np.empty_like(image)
+    losses = image_gradient(image, target, whole_image(75, 110, 1), 0.2, whole)
+    for bands in (2, 5, 16):
+        assert image_gradient(image, target, whole_image(75, 110, bands), 0.2, cut) == losses
+        np.testing.assert_array_equal(cut, whole)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.6, 1.0])

@@ -18,7 +18,7 @@ from . import inline_jit, jit, part_jit
 from .elementary import prefetch
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PIXELS, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, TILE
 from .outline import outline, rows_within
-from .threads import parallel
+from .threads import next_piece, parallel
 
 MAX_ALPHA = np.float32(0.999)
 MIN_ALPHA = np.float32(1 / 255)
@@ -55,6 +55,9 @@ BATCH_PAIRS = 32
 (AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN, AT_BLUE, AT_EXTENT_Y,
  AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip
 BATCH_SIZE = 13 * BATCH_PAIRS
+
+RUN_TILES = 4
+"""Tiles that the same thread renders one after the other: neighbors share splats."""
 
 
 @inline_jit
@@ -251,9 +254,9 @@ def _store_tile(s, left, top, background, blended):
                 last[y, x] = np.int32(s[LAST + p])
 
 
-@parallel(lambda tiles, *_: len(tiles))
+@parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
 @jit
-def blend_forward(first_tile, past_tile, tiles, tiles_x, tile_rows, lists, projection, background, blended):
+def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background, blended):
     """Render the listed tiles to `blended`; the tuples are those of `layout.py`.
 
     tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; tile_rows (tiles, 4): their rows that are needed, see
@@ -264,38 +267,41 @@ def blend_forward(first_tile, past_tile, tiles, tiles_x, tile_rows, lists, proje
     s, batch = np.empty(FORWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
-    for k in range(first_tile, past_tile):
-        tile = tiles[k]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        begin, end = start[tile], start[tile + 1]
-        if begin == end:
-            _store_empty_tile(left, top, background, blended)
-            continue
-        _begin_tile(s, tile_rows, np.uint64(tile))
-        for batch_begin in range(begin, end, BATCH_PAIRS):
-            alive = _blocks_alive(s)
-            if alive == 0:
-                break
-            count = min(BATCH_PAIRS, end - batch_begin)
-            next_end = min(end, batch_begin + count + BATCH_PAIRS)
-            _prefetch_batch(pair_splat, batch_begin + count, next_end, projected)
-            for j in range(np.uint64(batch_begin + count), np.uint64(next_end)):
-                prefetch(extent_y, np.uint64(pair_splat[j]))
-            _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
-            for q in range(np.uint64(count)):
-                batch[AT_EXTENT_Y + q] = extent_y[np.uint64(pair_splat[np.uint64(batch_begin) + q])]
-            _find_blocks(count, batch)
-            for group in range(0, count, PAIRS_PER_GROUP):
-                if group > 0:
-                    alive = _blocks_alive(s)
-                blocks = np.uint64(0)
-                for q in range(np.uint64(group), np.uint64(min(count, group + PAIRS_PER_GROUP))):
-                    reached = np.uint16(np.uint16(batch[AT_BLOCKS + q]) & alive)
-                    pair_blocks[np.uint64(batch_begin) + q] = reached
-                    blocks = _list_blocks(listed, blocks, q, reached)
-                _falloff(blocks, listed, batch, False, s)
-                _blend(blocks, listed, batch_begin - begin, batch, s)
-        _store_tile(s, left, top, background, blended)
+    first_tile, past_tile = next_piece(work)
+    while first_tile < past_tile:
+        for k in range(first_tile, past_tile):
+            tile = tiles[k]
+            left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+            begin, end = start[tile], start[tile + 1]
+            if begin == end:
+                _store_empty_tile(left, top, background, blended)
+                continue
+            _begin_tile(s, tile_rows, np.uint64(tile))
+            for batch_begin in range(begin, end, BATCH_PAIRS):
+                alive = _blocks_alive(s)
+                if alive == 0:
+                    break
+                count = min(BATCH_PAIRS, end - batch_begin)
+                next_end = min(end, batch_begin + count + BATCH_PAIRS)
+                _prefetch_batch(pair_splat, batch_begin + count, next_end, projected)
+                for j in range(np.uint64(batch_begin + count), np.uint64(next_end)):
+                    prefetch(extent_y, np.uint64(pair_splat[j]))
+                _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
+                for q in range(np.uint64(count)):
+                    batch[AT_EXTENT_Y + q] = extent_y[np.uint64(pair_splat[np.uint64(batch_begin) + q])]
+                _find_blocks(count, batch)
+                for group in range(0, count, PAIRS_PER_GROUP):
+                    if group > 0:
+                        alive = _blocks_alive(s)
+                    blocks = np.uint64(0)
+                    for q in range(np.uint64(group), np.uint64(min(count, group + PAIRS_PER_GROUP))):
+                        reached = np.uint16(np.uint16(batch[AT_BLOCKS + q]) & alive)
+                        pair_blocks[np.uint64(batch_begin) + q] = reached
+                        blocks = _list_blocks(listed, blocks, q, reached)
+                    _falloff(blocks, listed, batch, False, s)
+                    _blend(blocks, listed, batch_begin - begin, batch, s)
+            _store_tile(s, left, top, background, blended)
+        first_tile, past_tile = next_piece(work)
 
 
 @part_jit
@@ -397,10 +403,10 @@ def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
     return np.int64(deepest)
 
 
-@parallel(lambda tiles, *_: len(tiles))
+@parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
 @jit
 def blend_backward(
-    first_tile, past_tile, tiles, tiles_x, lists, blended, wanted, projected, background, v_image, v_transmittance,
+    work, tiles, tiles_x, lists, blended, wanted, projected, background, v_image, v_transmittance,
     pair_gradients,
 ):  # fmt: skip
     """Write the gradient of every wanted (tile, splat) pair of the listed tiles to pair_gradients (P, PROJECTED).
@@ -414,39 +420,42 @@ def blend_backward(
     sums, places = np.empty(PROJECTED, np.float32), np.empty(PAIRS_PER_GROUP + 1, np.uint64)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
-    for k in range(first_tile, past_tile):
-        tile = tiles[k]
-        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        begin = start[tile]
-        if begin == start[tile + 1]:
-            continue
-        deepest = begin + _load_tile(s, left, top, background, v_image, v_transmittance, blended)
-        pair_gradients[deepest : start[tile + 1], :] = np.float32(0.0)
-        nearest = begin  # nothing in front of the first wanted pair needs to be walked
-        while nearest < deepest and not wanted[pair_splat[nearest]]:
-            nearest += 1
-        stepped = _blocks_of_wanted(nearest, deepest, pair_splat, pair_blocks, wanted)
-        for batch_end in range(deepest, nearest, -BATCH_PAIRS):
-            batch_begin = max(nearest, batch_end - BATCH_PAIRS)
-            count = batch_end - batch_begin
-            _prefetch_batch(pair_splat, max(nearest, batch_begin - BATCH_PAIRS), batch_begin, projected)
-            _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
-            for group_end in range(count, 0, -PAIRS_PER_GROUP):
-                group = min(group_end, PAIRS_PER_GROUP)
-                blocks = np.uint64(0)
-                for n in range(group):
-                    q = np.uint64(group_end - 1 - n)
-                    j = np.uint64(batch_begin) + q
-                    # A frozen one is only stepped through, where a wanted one reaches.
-                    reached = np.uint16(pair_blocks[j] & stepped)
-                    places[n] = blocks * np.uint64(BLOCK_PIXELS)
-                    blocks = _list_blocks(listed, blocks, q, reached)
-                places[group] = blocks * np.uint64(BLOCK_PIXELS)
-                _falloff(blocks, listed, batch, True, s)
-                _unblend(blocks, listed, batch_begin - begin, batch, s)
-                for n in range(group):
-                    q = np.uint64(group_end - 1 - n)
-                    j = np.uint64(batch_begin) + q
-                    if wanted[pair_splat[j]]:
-                        _sum_gradient(places[n], places[n + 1], s, sums)
-                        _store_pair(pair_gradients, j, q, batch, sums)
+    first_tile, past_tile = next_piece(work)
+    while first_tile < past_tile:
+        for k in range(first_tile, past_tile):
+            tile = tiles[k]
+            left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+            begin = start[tile]
+            if begin == start[tile + 1]:
+                continue
+            deepest = begin + _load_tile(s, left, top, background, v_image, v_transmittance, blended)
+            pair_gradients[deepest : start[tile + 1], :] = np.float32(0.0)
+            nearest = begin  # nothing in front of the first wanted pair needs to be walked
+            while nearest < deepest and not wanted[pair_splat[nearest]]:
+                nearest += 1
+            stepped = _blocks_of_wanted(nearest, deepest, pair_splat, pair_blocks, wanted)
+            for batch_end in range(deepest, nearest, -BATCH_PAIRS):
+                batch_begin = max(nearest, batch_end - BATCH_PAIRS)
+                count = batch_end - batch_begin
+                _prefetch_batch(pair_splat, max(nearest, batch_begin - BATCH_PAIRS), batch_begin, projected)
+                _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
+                for group_end in range(count, 0, -PAIRS_PER_GROUP):
+                    group = min(group_end, PAIRS_PER_GROUP)
+                    blocks = np.uint64(0)
+                    for n in range(group):
+                        q = np.uint64(group_end - 1 - n)
+                        j = np.uint64(batch_begin) + q
+                        # A frozen one is only stepped through, where a wanted one reaches.
+                        reached = np.uint16(pair_blocks[j] & stepped)
+                        places[n] = blocks * np.uint64(BLOCK_PIXELS)
+                        blocks = _list_blocks(listed, blocks, q, reached)
+                    places[group] = blocks * np.uint64(BLOCK_PIXELS)
+                    _falloff(blocks, listed, batch, True, s)
+                    _unblend(blocks, listed, batch_begin - begin, batch, s)
+                    for n in range(group):
+                        q = np.uint64(group_end - 1 - n)
+                        j = np.uint64(batch_begin) + q
+                        if wanted[pair_splat[j]]:
+                            _sum_gradient(places[n], places[n + 1], s, sums)
+                            _store_pair(pair_gradients, j, q, batch, sums)
+        first_tile, past_tile = next_piece(work)

@@ -1,7 +1,7 @@
 """Kernels that an edition of the extension brings compiled, so that the first training does not wait for a compiler.
 
-They run on every processor of the last ten years with AVX2. One with AVX-512 compiles its own in the background, which
-are faster, and uses these until then.
+They need x86-64-v3: AVX2, FMA and what else NEEDED_FEATURES lists. A processor with AVX-512 compiles its own in the
+background, which are faster, and uses these until then.
 """
 
 import os

@@ -13,8 +13,8 @@ from .project import project_forward
 from .rasterize import (
     BLACK_BACKGROUND,
     BufferPool,
-    balance_tiles,
     frames_in_camera,
+    heaviest_first,
     new_image,
     new_projection,
     sort_into_tiles,
@@ -39,7 +39,7 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
         )  # fmt: skip
         begin = rows.stop
     lists, whole = sort_into_tiles(projection, tiles_x, tiles_y, buffers), whole_tiles(tiles_x * tiles_y)
-    tiles = balance_tiles(np.arange(tiles_x * tiles_y, dtype=np.int32), lists)
+    tiles = heaviest_first(np.arange(tiles_x * tiles_y, dtype=np.int32), lists)
     blended = new_image(camera.width, camera.height, lists, buffers)
     blend_forward(tiles, tiles_x, whole, lists, projection, BLACK_BACKGROUND, blended)
     rgb, alpha = blended.image, 1 - blended.transmittance

@@ -1,5 +1,5 @@
 """Exponential and logarithm for loops that LLVM vectorizes: the C library's are calls, one value at a time. And
-prefetching."""
+instructions that Python has no name for: prefetching, and adding to a number that several threads count with."""
 
 from typing import Any
 
@@ -63,3 +63,14 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, index), generate
+
+
+@intrinsic
+def fetch_add(typing: Any, counter: Any, step: Any) -> Any:
+    """Add `step` to the first element of an int64 array, undivided by other threads; returns what it was before."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return builder.atomic_rmw("add", data, arguments[1], "monotonic")
+
+    return types.int64(counter, types.int64), generate

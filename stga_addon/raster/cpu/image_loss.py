@@ -8,7 +8,7 @@ maps never reach main memory.
 import numpy as np
 
 from . import inline_jit, jit, part_jit
-from .threads import parallel
+from .threads import next_piece, parallel
 
 WINDOW_RADIUS_PX = 5
 LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
@@ -125,97 +125,105 @@ def _gradient_row(image, target_row, keep, blurred, stride, left, first, past, s
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
 @jit
-def image_loss(first_job, past_job, image, target, rectangles, ssim_weight, scale, gradient, sums):
+def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, sums):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
 
     image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
-    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, per
-    rectangle, sums (R, 2): Σ |difference| and Σ SSIM over its pixels.
+    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, for the
+    rows of all rectangles one after the other, sums (3, rows, 2): Σ |difference| and Σ SSIM over a row's pixels, by
+    channel. By row, the sums do not depend on how an image is cut into bands.
     """
     height, width = image.shape[1], image.shape[2]
-    for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
-        r, c = job // 3, job % 3
-        x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
-        # Columns [left, right) hold everything that matters; each row buffer is padded by PADDING_PX zeros.
-        left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
-        span = right - left
-        padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX  # blurs go beyond the span, where nothing reads
-        stride = padded + 2 * PADDING_PX
-        target_row = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
-        source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
-        first = np.zeros(4 * RING_ROWS * stride, np.float32)
-        moments = np.zeros(4 * stride, np.float32)
-        slopes = np.zeros(3 * stride, np.float32)
-        second = np.zeros(3 * RING_ROWS * stride, np.float32)
-        blurred, similarities = np.zeros(3 * stride, np.float32), np.empty(padded, np.float32)
-        difference, similarity = 0.0, 0.0
-        for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
-            # 1. horizontal blur of this row's four values
-            inside = 0 <= row < height
-            if inside:
-                keep = (row % RING_ROWS) * stride
-                for n in range(np.uint64(span)):
-                    value = target[np.uint64(row), np.uint64(left) + n, np.uint64(c)]
-                    target_row[np.uint64(keep) + n] = np.float32(value) * np.float32(1 / 255)
-                for n in range(np.uint64(span)):
-                    x, y = image[c, row, np.uint64(left) + n], target_row[np.uint64(keep) + n]
-                    source[np.uint64(PADDING_PX) + n] = x
-                    source[np.uint64(stride + PADDING_PX) + n] = y
-                    source[np.uint64(2 * stride + PADDING_PX) + n] = x * x + y * y
-                    source[np.uint64(3 * stride + PADDING_PX) + n] = x * y
-            for plane in range(4):
-                into = (plane * RING_ROWS + row % RING_ROWS) * stride
+    first_job, past_job = next_piece(work)
+    while first_job < past_job:
+        for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
+            r, c = job // 3, job % 3
+            x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
+            first_sum = -y0  # where the sums of the rectangle's rows begin, less its first row
+            for before in range(r):
+                first_sum += rectangles[before, 3] - rectangles[before, 1]
+            # Columns [left, right) hold everything that matters; each row buffer is padded by PADDING_PX zeros.
+            left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
+            span = right - left
+            # Blurs go beyond the span, where nothing reads.
+            padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX
+            stride = padded + 2 * PADDING_PX
+            target_row = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
+            source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
+            first = np.zeros(4 * RING_ROWS * stride, np.float32)
+            moments = np.zeros(4 * stride, np.float32)
+            slopes = np.zeros(3 * stride, np.float32)
+            second = np.zeros(3 * RING_ROWS * stride, np.float32)
+            blurred, similarities = np.zeros(3 * stride, np.float32), np.empty(padded, np.float32)
+            for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
+                # 1. horizontal blur of this row's four values
+                inside = 0 <= row < height
                 if inside:
-                    _blur_row(source, plane * stride, first, into, padded)
-                else:
-                    first[into : into + span] = ZERO
-            # 2. SSIM of the row five above, and its slopes blurred horizontally
-            middle = row - WINDOW_RADIUS_PX
-            if middle < y0 - WINDOW_RADIUS_PX:
-                continue
-            inside = 0 <= middle < height
-            if inside:
+                    keep = (row % RING_ROWS) * stride
+                    for n in range(np.uint64(span)):
+                        value = target[np.uint64(row), np.uint64(left) + n, np.uint64(c)]
+                        target_row[np.uint64(keep) + n] = np.float32(value) * np.float32(1 / 255)
+                    for n in range(np.uint64(span)):
+                        x, y = image[c, row, np.uint64(left) + n], target_row[np.uint64(keep) + n]
+                        source[np.uint64(PADDING_PX) + n] = x
+                        source[np.uint64(stride + PADDING_PX) + n] = y
+                        source[np.uint64(2 * stride + PADDING_PX) + n] = x * x + y * y
+                        source[np.uint64(3 * stride + PADDING_PX) + n] = x * y
                 for plane in range(4):
-                    _blur_column(first, plane, stride, middle, moments, plane * stride, padded)
-                _similarity_row(moments, stride, padded, similarities, slopes)
-                for plane in range(3):  # what lies beyond the image has no slope
-                    beyond = plane * stride + PADDING_PX
-                    slopes[beyond + span : beyond + padded] = ZERO
-                if y0 <= middle < y1:
-                    similarity += _sum_row(similarities, x0 - left, x1 - left)
-            for plane in range(3):
-                into = (plane * RING_ROWS + middle % RING_ROWS) * stride
+                    into = (plane * RING_ROWS + row % RING_ROWS) * stride
+                    if inside:
+                        _blur_row(source, plane * stride, first, into, padded)
+                    else:
+                        first[into : into + span] = ZERO
+                # 2. SSIM of the row five above, and its slopes blurred horizontally
+                middle = row - WINDOW_RADIUS_PX
+                if middle < y0 - WINDOW_RADIUS_PX:
+                    continue
+                inside = 0 <= middle < height
                 if inside:
-                    _blur_row(slopes, plane * stride, second, into, padded)
-                else:
-                    second[into : into + span] = ZERO
-            # 3. gradient of the row five above that
-            out = middle - WINDOW_RADIUS_PX
-            if out < y0 or out >= y1 or out < 0 or out >= height:
-                continue
-            for plane in range(3):
-                _blur_column(second, plane, stride, out, blurred, plane * stride, padded)
-            keep = (out % RING_ROWS) * stride
-            absolute = _gradient_row(
-                image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
-                gradient[c, out],
-            )  # fmt: skip
-            difference += absolute
-        sums[job, 0] = difference
-        sums[job, 1] = similarity
+                    for plane in range(4):
+                        _blur_column(first, plane, stride, middle, moments, plane * stride, padded)
+                    _similarity_row(moments, stride, padded, similarities, slopes)
+                    for plane in range(3):  # what lies beyond the image has no slope
+                        beyond = plane * stride + PADDING_PX
+                        slopes[beyond + span : beyond + padded] = ZERO
+                    if y0 <= middle < y1:
+                        sums[c, first_sum + middle, 1] = _sum_row(similarities, x0 - left, x1 - left)
+                for plane in range(3):
+                    into = (plane * RING_ROWS + middle % RING_ROWS) * stride
+                    if inside:
+                        _blur_row(slopes, plane * stride, second, into, padded)
+                    else:
+                        second[into : into + span] = ZERO
+                # 3. gradient of the row five above that
+                out = middle - WINDOW_RADIUS_PX
+                if out < y0 or out >= y1 or out < 0 or out >= height:
+                    continue
+                for plane in range(3):
+                    _blur_column(second, plane, stride, out, blurred, plane * stride, padded)
+                keep = (out % RING_ROWS) * stride
+                absolute = _gradient_row(
+                    image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
+                    gradient[c, out],
+                )  # fmt: skip
+                sums[c, first_sum + out, 0] = absolute
+        first_job, past_job = next_piece(work)
 
 
-@parallel(lambda image, *_: len(image))
+@parallel(lambda image, *_: len(image), piece=16)
 @jit
-def change_background(first_row, past_row, image, mask, before, after, out):
+def change_background(work, image, mask, before, after, out):
     """Write image (H, W, 3) uint8, composited over the color `before`, as it looks over `after`.
 
     mask (H, W) uint8: the foreground's coverage; before, after (3,) float32 in 0…255; out as image.
     image = coverage · foreground + (1 − coverage) · before, so only the second term has to be exchanged.
     """
-    for y in range(first_row, past_row):
-        for x in range(image.shape[1]):
-            clear = np.float32(255 - mask[y, x]) * np.float32(1 / 255)
-            for c in range(3):
-                value = np.float32(image[y, x, c]) + clear * (after[c] - before[c])
-                out[y, x, c] = np.uint8(min(np.float32(255.0), max(ZERO, value)) + np.float32(0.5))
+    first_row, past_row = next_piece(work)
+    while first_row < past_row:
+        for y in range(first_row, past_row):
+            for x in range(image.shape[1]):
+                clear = np.float32(255 - mask[y, x]) * np.float32(1 / 255)
+                for c in range(3):
+                    value = np.float32(image[y, x, c]) + clear * (after[c] - before[c])
+                    out[y, x, c] = np.uint8(min(np.float32(255.0), max(ZERO, value)) + np.float32(0.5))
+        first_row, past_row = next_piece(work)

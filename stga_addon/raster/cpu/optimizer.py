@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from . import jit, part_jit
-from .threads import EVEN_PIECES, parallel
+from .elementary import exponential
+from .threads import next_piece, parallel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 ROWS_PER_BLOCK = 256
+"""Rows that a thread steps at a time."""
 ROWS_PER_SUM = 1024
 """Rows that are summed by one thread, so that a sum does not depend on how many threads there are."""
 MAX_GRADIENT = np.float32(1e18)
@@ -40,9 +42,9 @@ class AdamOptions(NamedTuple):
     ema_share: np.float32
 
 
-@parallel(lambda rows, *_: len(rows), EVEN_PIECES)
+@parallel(lambda rows, *_: len(rows), piece=ROWS_PER_BLOCK)
 @jit
-def adam_rows(first_row, past_row, rows, steps, parameters, options):
+def adam_rows(work, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
     parameters: tuple of AdamTables; steps (N,) int32; options: AdamOptions. The stepped value enters its exponential
@@ -52,14 +54,11 @@ def adam_rows(first_row, past_row, rows, steps, parameters, options):
     All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(options.beta1), math.log(options.beta2)
-    correct1, correct2, ema_shares = (
-        np.empty(ROWS_PER_BLOCK, np.float32),
-        np.empty(ROWS_PER_BLOCK, np.float32),
-        np.empty(ROWS_PER_BLOCK, np.float32),
-    )
+    correct1, correct2 = np.empty(ROWS_PER_BLOCK, np.float32), np.empty(ROWS_PER_BLOCK, np.float32)
+    ema_shares = np.empty(ROWS_PER_BLOCK, np.float32)
     latest, first, second, share = np.int32(-1), ZERO, ZERO, ZERO
-    for begin in range(first_row, past_row, ROWS_PER_BLOCK):
-        end = min(past_row, begin + ROWS_PER_BLOCK)
+    begin, end = next_piece(work)
+    while begin < end:
         for n in range(begin, end):
             steps[rows[n]] += 1
             if steps[rows[n]] != latest:  # neighbors are mostly trained equally often
@@ -71,6 +70,7 @@ def adam_rows(first_row, past_row, rows, steps, parameters, options):
             correct1[n - begin], correct2[n - begin], ema_shares[n - begin] = first, second, share
         for p in range(len(parameters)):
             _adam_block(rows[begin:end], parameters[p], correct1, correct2, ema_shares, options)
+        begin, end = next_piece(work)
 
 
 @part_jit
@@ -98,14 +98,17 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
             average[i, c] += share * (value - average[i, c])
 
 
-@parallel(lambda rows, *_: len(rows), EVEN_PIECES, least=16_384)
+@parallel(lambda rows, *_: len(rows), piece=16_384)
 @jit
-def add_screen_gradients(first_row, past_row, rows, screen_gradient, total, count):
+def add_screen_gradients(work, rows, screen_gradient, total, count):
     """Add screen_gradient (N,) of the listed rows (M,) to total (N,), and 1 to their count (N,)."""
-    for n in range(first_row, past_row):
-        i = np.uint64(rows[n])
-        total[i] += screen_gradient[i]
-        count[i] += ONE
+    first_row, past_row = next_piece(work)
+    while first_row < past_row:
+        for n in range(first_row, past_row):
+            i = np.uint64(rows[n])
+            total[i] += screen_gradient[i]
+            count[i] += ONE
+        first_row, past_row = next_piece(work)
 
 
 @jit
@@ -141,45 +144,62 @@ def scale_limit(
     return norm
 
 
-@parallel(lambda sums, *_: len(sums), EVEN_PIECES, least=8)
+@parallel(lambda sums, *_: len(sums), piece=4)
 @jit
-def sum_excess_scale(first_sum, past_sum, sums, rows, log_scale, face, unbound, limits):
+def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
     """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see `scale_limit`."""
-    for k in range(first_sum, past_sum):
-        total = 0.0
-        for n in range(k * ROWS_PER_SUM, min(len(rows), (k + 1) * ROWS_PER_SUM)):
+    scales = np.empty(3 * ROWS_PER_SUM, np.float32)
+    first_sum, past_sum = next_piece(work)
+    while first_sum < past_sum:
+        for k in range(first_sum, past_sum):
+            begin, count = k * ROWS_PER_SUM, min(len(rows) - k * ROWS_PER_SUM, ROWS_PER_SUM)
+            for n in range(np.uint64(count)):
+                i = np.uint64(rows[np.uint64(begin) + n])
+                for c in range(np.uint64(3)):
+                    scales[np.uint64(3) * n + c] = log_scale[i, c]
+            for n in range(np.uint64(3 * count)):
+                scales[n] = exponential(scales[n])
+            total = 0.0
+            for n in range(np.uint64(count)):
+                i = np.uint64(rows[np.uint64(begin) + n])
+                limit = limits[1 if unbound[i] else 0, face[i]]
+                for c in range(np.uint64(3)):
+                    excess = max(ZERO, scales[np.uint64(3) * n + c] - limit)
+                    total += excess * excess
+            sums[k] = total
+        first_sum, past_sum = next_piece(work)
+
+
+@parallel(lambda rows, *_: len(rows), piece=1024)
+@jit
+def add_excess_scale(work, rows, log_scale, face, unbound, limits, factor, gradient):
+    """Add factor · ReLU(scale − limit) · scale to gradient (N, 3); see `scale_limit`."""
+    first_row, past_row = next_piece(work)
+    while first_row < past_row:
+        for n in range(first_row, past_row):
             i = rows[n]
             limit = limits[1 if unbound[i] else 0, face[i]]
             for c in range(3):
-                over = max(ZERO, math.exp(log_scale[i, c]) - limit)
-                total += over * over
-        sums[k] = total
+                scale = math.exp(log_scale[i, c])
+                gradient[i, c] += factor * max(ZERO, scale - limit) * scale
+        first_row, past_row = next_piece(work)
 
 
-@parallel(lambda rows, *_: len(rows), EVEN_PIECES)
+@parallel(lambda rows, *_: len(rows), piece=16_384)
 @jit
-def add_excess_scale(first_row, past_row, rows, log_scale, face, unbound, limits, factor, gradient):
-    """Add factor · ReLU(scale − limit) · scale to gradient (N, 3); see `scale_limit`."""
-    for n in range(first_row, past_row):
-        i = rows[n]
-        limit = limits[1 if unbound[i] else 0, face[i]]
-        for c in range(3):
-            scale = math.exp(log_scale[i, c])
-            gradient[i, c] += factor * max(ZERO, scale - limit) * scale
-
-
-@parallel(lambda rows, *_: len(rows), EVEN_PIECES, least=16_384)
-@jit
-def opacity_weight(first_row, past_row, rows, opacity, share, weight, gradient):
+def opacity_weight(work, rows, opacity, share, weight, gradient):
     """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient (N,).
 
     share (N,) float32.
     """
-    for n in range(first_row, past_row):
-        i = rows[n]
-        if share[i] != ZERO:  # bound splats have none
-            value = ONE / (ONE + math.exp(-opacity[i]))
-            gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)
+    first_row, past_row = next_piece(work)
+    while first_row < past_row:
+        for n in range(first_row, past_row):
+            i = rows[n]
+            if share[i] != ZERO:  # bound splats have none
+                value = ONE / (ONE + math.exp(-opacity[i]))
+                gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)
+        first_row, past_row = next_piece(work)
 
 
 @jit

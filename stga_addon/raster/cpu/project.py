@@ -11,27 +11,32 @@ from . import jit, part_jit
 from . import splat_block as block
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
 from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
-from .threads import EVEN_PIECES, parallel
+from .threads import next_piece, parallel
 
 COLUMN = np.uint64(BLOCK_SPLATS)
+SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
+"""That a thread takes over at a time."""
 
 
-@parallel(lambda origin, *_: len(origin), EVEN_PIECES, least=4096)
+@parallel(lambda origin, *_: len(origin), piece=4096)
 @jit
-def compose_frames(begin, end, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
+def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
     """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin = turn @ origin +
     shift.
 
     origin (F, 3), rotation (F, 3, 3), scale (F,), turn (3, 3) and shift (3,) float64, so that distance from the origin
     costs no precision. Writes camera_origin (F, 3) and camera_matrix (F, 3, 3) float32.
     """
-    for f in range(begin, end):
-        for r in range(3):
-            t0, t1, t2 = turn[r, 0], turn[r, 1], turn[r, 2]
-            camera_origin[f, r] = t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
-            for c in range(3):
-                along = t0 * rotation[f, 0, c] + t1 * rotation[f, 1, c] + t2 * rotation[f, 2, c]
-                camera_matrix[f, r, c] = scale[f] * along
+    begin, end = next_piece(work)
+    while begin < end:
+        for f in range(begin, end):
+            for r in range(3):
+                t0, t1, t2 = turn[r, 0], turn[r, 1], turn[r, 2]
+                camera_origin[f, r] = t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
+                for c in range(3):
+                    along = t0 * rotation[f, 0, c] + t1 * rotation[f, 1, c] + t2 * rotation[f, 2, c]
+                    camera_matrix[f, r, c] = scale[f] * along
+        begin, end = next_piece(work)
 
 
 @part_jit
@@ -106,10 +111,10 @@ def _mark_seen(rows, rendered, rect, b):
     return count
 
 
-@parallel(lambda rows, *_: len(rows), EVEN_PIECES)
+@parallel(lambda rows, *_: len(rows), piece=SPLATS_PER_PIECE)
 @jit
 def project_forward(
-    begin, end, rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection
+    work, rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection
 ):  # fmt: skip
     """Write the listed rows of `projection`; the tuples are those of `layout.py`.
 
@@ -125,41 +130,44 @@ def project_forward(
     tiles_x, tiles_y = (frames.size[0] + TILE - 1) // TILE, (frames.size[1] + TILE - 1) // TILE
     limits, coefficients = _tan_limits(frames.intrinsics, frames.size), np.uint64((degree + 1) * (degree + 1))
     b = np.zeros(block.FORWARD_SIZE, np.float32)
-    for first in range(begin, end, BLOCK_SPLATS):
-        some = rows[first : min(end, first + BLOCK_SPLATS)]
-        _load(some, splats, face, frames, b)
-        block.project_geometry(b, frames.intrinsics, limits)
-        if antialiased:
-            block.compensate_low_pass(b)
-        block.project_bounds(b, np.float32(tiles_x), np.float32(tiles_y))
-        if _mark_seen(some, rendered, rect, b) == 0:
-            continue
-        block.compute_harmonics(b, frames.to_world)
-        for q in range(np.uint64(len(some))):
-            if not b[block.SEEN + q] > ZERO:
+    begin, end = next_piece(work)
+    while begin < end:
+        for first in range(begin, end, BLOCK_SPLATS):
+            some = rows[first : min(end, first + BLOCK_SPLATS)]
+            _load(some, splats, face, frames, b)
+            block.project_geometry(b, frames.intrinsics, limits)
+            if antialiased:
+                block.compensate_low_pass(b)
+            block.project_bounds(b, np.float32(tiles_x), np.float32(tiles_y))
+            if _mark_seen(some, rendered, rect, b) == 0:
                 continue
-            i = np.uint64(some[q])
-            red, green, blue = _color(b, q, i, coefficients, sh)
-            f = np.uint64(face[i])
-            for k in range(strains):
-                red += strain[f, k] * strain_color[i, k, 0]
-                green += strain[f, k] * strain_color[i, k, 1]
-                blue += strain[f, k] * strain_color[i, k, 2]
-            # Before the cut at zero, which would turn NaN and −∞ into black.
-            if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
-                rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
-                continue
-            red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
-            z = b[block.CAMERA_Z + q]
-            if depth_as_color:
-                red, green, blue = z, ZERO, ZERO
-            rect[i, 0], rect[i, 1] = np.int32(b[block.X0 + q]), np.int32(b[block.Y0 + q])
-            rect[i, 2], rect[i, 3] = np.int32(b[block.X1 + q]), np.int32(b[block.Y1 + q])
-            depth[i], extent_y[i] = z, b[block.EXTENT_Y + q]
-            projected[i, MEAN_X], projected[i, MEAN_Y] = b[block.MEAN_X + q], b[block.MEAN_Y + q]
-            projected[i, PRECISION_X], projected[i, SHEAR] = b[block.PRECISION_X + q], b[block.SHEAR + q]
-            projected[i, PRECISION_Y], projected[i, OPACITY] = b[block.PRECISION_Y + q], b[block.OPACITY + q]
-            projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
+            block.compute_harmonics(b, frames.to_world)
+            for q in range(np.uint64(len(some))):
+                if not b[block.SEEN + q] > ZERO:
+                    continue
+                i = np.uint64(some[q])
+                red, green, blue = _color(b, q, i, coefficients, sh)
+                f = np.uint64(face[i])
+                for k in range(strains):
+                    red += strain[f, k] * strain_color[i, k, 0]
+                    green += strain[f, k] * strain_color[i, k, 1]
+                    blue += strain[f, k] * strain_color[i, k, 2]
+                # Before the cut at zero, which would turn NaN and −∞ into black.
+                if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
+                    rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
+                    continue
+                red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
+                z = b[block.CAMERA_Z + q]
+                if depth_as_color:
+                    red, green, blue = z, ZERO, ZERO
+                rect[i, 0], rect[i, 1] = np.int32(b[block.X0 + q]), np.int32(b[block.Y0 + q])
+                rect[i, 2], rect[i, 3] = np.int32(b[block.X1 + q]), np.int32(b[block.Y1 + q])
+                depth[i], extent_y[i] = z, b[block.EXTENT_Y + q]
+                projected[i, MEAN_X], projected[i, MEAN_Y] = b[block.MEAN_X + q], b[block.MEAN_Y + q]
+                projected[i, PRECISION_X], projected[i, SHEAR] = b[block.PRECISION_X + q], b[block.SHEAR + q]
+                projected[i, PRECISION_Y], projected[i, OPACITY] = b[block.PRECISION_Y + q], b[block.OPACITY + q]
+                projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
+        begin, end = next_piece(work)
 
 
 @part_jit
@@ -220,10 +228,10 @@ def _store_gradient(rows, b, gradients, screen_gradient):
         log_scale[i, 2], screen_gradient[i] = b[block.V_LOG_2 + q], b[block.V_SCREEN + q]
 
 
-@parallel(lambda visible, *_: len(visible), EVEN_PIECES)
+@parallel(lambda visible, *_: len(visible), piece=SPLATS_PER_PIECE)
 @jit
 def project_backward(
-    begin, end, visible, splats, face, frames, degree, depth_as_color, antialiased,
+    work, visible, splats, face, frames, degree, depth_as_color, antialiased,
     projected, lists, pair_gradients, gradients, screen_gradient,
 ):  # fmt: skip
     """Write the gradient of each listed splat to its row of `gradients`; the counterpart of `project_forward`.
@@ -238,24 +246,27 @@ def project_backward(
     limits, coefficients = _tan_limits(frames.intrinsics, frames.size), np.uint64((degree + 1) * (degree + 1))
     compensated = ONE if antialiased else ZERO
     b = np.zeros(block.BACKWARD_SIZE, np.float32)
-    for first in range(begin, end, BLOCK_SPLATS):
-        some = visible[first : min(end, first + BLOCK_SPLATS)]
-        _load(some, splats, face, frames, b)
-        _sum_pairs(some, lists, pair_gradients, b)
-        _load_projected(some, projected, b)
-        block.differentiate_geometry(b, frames.intrinsics, limits, half_size, compensated)
-        block.compute_harmonics(b, frames.to_world)
-        for q in range(np.uint64(len(some))):
-            i = np.uint64(some[q])
-            f = np.uint64(face[i])
-            if depth_as_color:
-                b[block.V_CAMERA_Z + q] += b[block.G_RED + q]
-                b[block.G_RED + q] = b[block.G_GREEN + q] = b[block.G_BLUE + q] = ZERO
-            _color_gradient(b, q, i, coefficients, sh, v_sh)
-            for k in range(np.uint64(v_strain_color.shape[1])):
-                weight = strain[f, k] if k < strains else ZERO
-                v_strain_color[i, k, 0] = weight * b[block.G_RED + q]
-                v_strain_color[i, k, 1] = weight * b[block.G_GREEN + q]
-                v_strain_color[i, k, 2] = weight * b[block.G_BLUE + q]
-        block.differentiate_position(b, frames.to_world)
-        _store_gradient(some, b, gradients, screen_gradient)
+    begin, end = next_piece(work)
+    while begin < end:
+        for first in range(begin, end, BLOCK_SPLATS):
+            some = visible[first : min(end, first + BLOCK_SPLATS)]
+            _load(some, splats, face, frames, b)
+            _sum_pairs(some, lists, pair_gradients, b)
+            _load_projected(some, projected, b)
+            block.differentiate_geometry(b, frames.intrinsics, limits, half_size, compensated)
+            block.compute_harmonics(b, frames.to_world)
+            for q in range(np.uint64(len(some))):
+                i = np.uint64(some[q])
+                f = np.uint64(face[i])
+                if depth_as_color:
+                    b[block.V_CAMERA_Z + q] += b[block.G_RED + q]
+                    b[block.G_RED + q] = b[block.G_GREEN + q] = b[block.G_BLUE + q] = ZERO
+                _color_gradient(b, q, i, coefficients, sh, v_sh)
+                for k in range(np.uint64(v_strain_color.shape[1])):
+                    weight = strain[f, k] if k < strains else ZERO
+                    v_strain_color[i, k, 0] = weight * b[block.G_RED + q]
+                    v_strain_color[i, k, 1] = weight * b[block.G_GREEN + q]
+                    v_strain_color[i, k, 2] = weight * b[block.G_BLUE + q]
+            block.differentiate_position(b, frames.to_world)
+            _store_gradient(some, b, gradients, screen_gradient)
+        begin, end = next_piece(work)

@@ -10,10 +10,9 @@ import numpy as np
 from ...avatar.embedding import FaceFrames
 from ...avatar.splats import no_strain_color
 from ...capture.camera import Camera
-from .blend import blend_backward, blend_forward
+from .blend import RUN_TILES, blend_backward, blend_forward
 from .layout import PROJECTED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .project import compose_frames, project_backward, project_forward
-from .threads import pieces_of
 from .tiles import (
     SORT_PARTS,
     compute_offsets,
@@ -26,8 +25,6 @@ from .tiles import (
 )
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
-RUN_TILES = 4
-"""Tiles in a row that the same thread renders one after the other."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,7 @@ def render_forward(
     def project(rows: np.ndarray, rendered: np.ndarray) -> None:
         project_forward(rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection)
 
-    touched = rendered = np.ones((tiles_y, tiles_x), bool)
+    touched = rendered = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
     if focus is None:
         project(buffers.kept("everything", (len(splats.xyz),), np.arange), rendered)
         tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), whole_tiles)
@@ -144,7 +141,7 @@ def render_forward(
         rendered = ((left < past_left) | (right < past_right)).reshape(touched.shape)
         project(np.flatnonzero(~focus), rendered)
     lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
-    tiles = balance_tiles(np.flatnonzero(rendered).astype(np.int32), lists)
+    tiles = heaviest_first(np.flatnonzero(rendered).astype(np.int32), lists)
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, tile_rows, lists, projection, background, blended)
@@ -239,9 +236,9 @@ def tile_grid(width: int, height: int) -> tuple[int, int]:
     return -(-width // TILE), -(-height // TILE)
 
 
-def balance_tiles(tiles: np.ndarray, lists: TileLists) -> np.ndarray:
-    """Reorder tiles so that all pieces of work have about as many pairs, in runs of neighbors, which share splats."""
-    runs, pieces = np.arange(len(tiles)) // RUN_TILES, pieces_of()
-    pairs = np.bincount(runs, lists.start[tiles + 1] - lists.start[tiles])
-    turn = np.argsort(np.argsort(-pairs, kind="stable")) % (2 * pieces)  # to the pieces and back, heavy runs first
-    return np.asarray(tiles[np.argsort(np.minimum(turn, 2 * pieces - 1 - turn)[runs], kind="stable")])
+def heaviest_first(tiles: np.ndarray, lists: TileLists) -> np.ndarray:
+    """Reorder tiles in runs of neighbors, those of the most pairs first: what is left at the end is short."""
+    whole = len(tiles) // RUN_TILES * RUN_TILES
+    pairs = (lists.start[1:] - lists.start[:-1])[tiles[:whole]].reshape(-1, RUN_TILES).sum(1)
+    runs = tiles[:whole].reshape(-1, RUN_TILES)[np.argsort(-pairs, kind="stable")]
+    return np.concatenate([runs.ravel(), tiles[whole:]])

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from . import jit, part_jit
-from .threads import parallel
+from .threads import next_piece, parallel
 
 ZERO, EIGHTH, HALF, ONE, TWO, PI = (np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi))
 SUN, POINT, SPOT, AREA = 0, 1, 2, 3
@@ -34,50 +34,54 @@ def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
     return distribution * fresnel * HALF / shadowing
 
 
-@parallel(lambda points, *_: len(points))
+@parallel(lambda points, *_: len(points), piece=256)
 @jit
-def add_lights(begin, end, points, normals, eye, roughness, reflectance, lights, lit, irradiance, highlight):
+def add_lights(work, points, normals, eye, roughness, reflectance, lights, lit, irradiance, highlight):
     """Add what lights (L, COLUMNS) give to irradiance and highlight (N, 3) float32 of points with normals (N, 3).
 
     eye (3,). roughness, reflectance (N,): of the highlight; a roughness of 0 has none. lit (maps, N): see MAP.
     """
-    for n in range(begin, end):
-        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
-        nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
-        vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
-        scale = ONE / math.sqrt(max(vx * vx + vy * vy + vz * vz, np.float32(1e-20)))
-        vx, vy, vz = vx * scale, vy * scale, vz * scale
-        toward_eye = max(nx * vx + ny * vy + nz * vz, MIN_FACING)
-        alpha = roughness[n] * roughness[n]
-        for s in range(len(lights)):
-            light = lights[s]
-            kind, row = int(light[KIND]), int(light[MAP])
-            dx, dy, dz, strength, width = -light[4], -light[5], -light[6], ONE, light[WIDTH]
-            if kind != SUN:
-                dx, dy, dz = light[1] - px, light[2] - py, light[3] - pz
-                square = max(dx * dx + dy * dy + dz * dz, np.float32(1e-8))
-                away = ONE / math.sqrt(square)
-                dx, dy, dz, strength, width = dx * away, dy * away, dz * away, ONE / square, width * away
-                along = -(dx * light[4] + dy * light[5] + dz * light[6])
-                if kind == AREA:
-                    strength *= max(along, ZERO)
-                elif kind == SPOT:
-                    inside = min(max((along - light[CONE]) / light[FADE], ZERO), ONE)
-                    strength *= inside * inside * (np.float32(3.0) - TWO * inside)
-            facing = nx * dx + ny * dy + nz * dz
-            if row >= 0:
-                strength *= lit[row, n]
-            if not (facing > ZERO and strength > ZERO):
-                continue
-            gloss = ZERO
-            if alpha > ZERO and light[SPECULAR] > ZERO:
-                hx, hy, hz = dx + vx, dy + vy, dz + vz
-                scale = ONE / math.sqrt(max(hx * hx + hy * hy + hz * hz, np.float32(1e-12)))
-                half = min(max((nx * hx + ny * hy + nz * hz) * scale, ZERO), ONE)
-                fresnel_cosine = min(max((vx * hx + vy * hy + vz * hz) * scale, ZERO), ONE)
-                wide = min(alpha * alpha + EIGHTH * width * width, ONE)  # slopes by roughness and by the light's size
-                gloss = ggx(facing, toward_eye, half, fresnel_cosine, wide, reflectance[n])
-            for k in range(3):
-                arriving = light[COLOR + k] * strength * facing
-                irradiance[n, k] += arriving * light[DIFFUSE]
-                highlight[n, k] += arriving * light[SPECULAR] * gloss
+    begin, end = next_piece(work)
+    while begin < end:
+        for n in range(begin, end):
+            px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+            nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
+            vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
+            scale = ONE / math.sqrt(max(vx * vx + vy * vy + vz * vz, np.float32(1e-20)))
+            vx, vy, vz = vx * scale, vy * scale, vz * scale
+            toward_eye = max(nx * vx + ny * vy + nz * vz, MIN_FACING)
+            alpha = roughness[n] * roughness[n]
+            for s in range(len(lights)):
+                light = lights[s]
+                kind, row = int(light[KIND]), int(light[MAP])
+                dx, dy, dz, strength, width = -light[4], -light[5], -light[6], ONE, light[WIDTH]
+                if kind != SUN:
+                    dx, dy, dz = light[1] - px, light[2] - py, light[3] - pz
+                    square = max(dx * dx + dy * dy + dz * dz, np.float32(1e-8))
+                    away = ONE / math.sqrt(square)
+                    dx, dy, dz, strength, width = dx * away, dy * away, dz * away, ONE / square, width * away
+                    along = -(dx * light[4] + dy * light[5] + dz * light[6])
+                    if kind == AREA:
+                        strength *= max(along, ZERO)
+                    elif kind == SPOT:
+                        inside = min(max((along - light[CONE]) / light[FADE], ZERO), ONE)
+                        strength *= inside * inside * (np.float32(3.0) - TWO * inside)
+                facing = nx * dx + ny * dy + nz * dz
+                if row >= 0:
+                    strength *= lit[row, n]
+                if not (facing > ZERO and strength > ZERO):
+                    continue
+                gloss = ZERO
+                if alpha > ZERO and light[SPECULAR] > ZERO:
+                    hx, hy, hz = dx + vx, dy + vy, dz + vz
+                    scale = ONE / math.sqrt(max(hx * hx + hy * hy + hz * hz, np.float32(1e-12)))
+                    half = min(max((nx * hx + ny * hy + nz * hz) * scale, ZERO), ONE)
+                    fresnel_cosine = min(max((vx * hx + vy * hy + vz * hz) * scale, ZERO), ONE)
+                    # Slopes by roughness and by the light's size.
+                    wide = min(alpha * alpha + EIGHTH * width * width, ONE)
+                    gloss = ggx(facing, toward_eye, half, fresnel_cosine, wide, reflectance[n])
+                for k in range(3):
+                    arriving = light[COLOR + k] * strength * facing
+                    irradiance[n, k] += arriving * light[DIFFUSE]
+                    highlight[n, k] += arriving * light[SPECULAR] * gloss
+        begin, end = next_piece(work)

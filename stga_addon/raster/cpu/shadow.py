@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from . import jit
-from .threads import parallel
+from .threads import next_piece, parallel
 
 ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
@@ -43,27 +43,30 @@ def add_depths(points, faces, depth):
                         depth[y, x] = z
 
 
-@parallel(lambda depth, points, *_: len(points))
+@parallel(lambda depth, points, *_: len(points), piece=256)
 @jit
-def lit_shares(begin, end, depth, points, bias, step, lit):
+def lit_shares(work, depth, points, bias, step, lit):
     """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not block it.
 
     points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block. step: texels between
     the 3 × 3 places that are looked up bilinearly around a point; 0: one place.
     """
     size, reach = len(depth), 1 if step > 0 else 0
-    for n in range(begin, end):
-        found, z = ZERO, points[n, 2] - bias[n]
-        for across in range(-reach, reach + 1):
-            for down in range(-reach, reach + 1):
-                x = points[n, 0] - HALF + np.float32(across) * step
-                y = points[n, 1] - HALF + np.float32(down) * step
-                left, top = math.floor(x), math.floor(y)
-                right_share, lower_share = x - np.float32(left), y - np.float32(top)
-                for k in range(4):
-                    column, row = int(left) + (k & 1), int(top) + (k >> 1)
-                    outside = column < 0 or row < 0 or column >= size or row >= size
-                    if outside or z <= depth[row, column]:
-                        weight = right_share if k & 1 else ONE - right_share
-                        found += weight * (lower_share if k >> 1 else ONE - lower_share)
-        lit[n] = found / np.float32((2 * reach + 1) ** 2)
+    begin, end = next_piece(work)
+    while begin < end:
+        for n in range(begin, end):
+            found, z = ZERO, points[n, 2] - bias[n]
+            for across in range(-reach, reach + 1):
+                for down in range(-reach, reach + 1):
+                    x = points[n, 0] - HALF + np.float32(across) * step
+                    y = points[n, 1] - HALF + np.float32(down) * step
+                    left, top = math.floor(x), math.floor(y)
+                    right_share, lower_share = x - np.float32(left), y - np.float32(top)
+                    for k in range(4):
+                        column, row = int(left) + (k & 1), int(top) + (k >> 1)
+                        outside = column < 0 or row < 0 or column >= size or row >= size
+                        if outside or z <= depth[row, column]:
+                            weight = right_share if k & 1 else ONE - right_share
+                            found += weight * (lower_share if k >> 1 else ONE - lower_share)
+            lit[n] = found / np.float32((2 * reach + 1) ** 2)
+        begin, end = next_piece(work)

@@ -12,13 +12,13 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
-PIECES_PER_THREAD = 8
-"""More pieces than threads, so that a thread which finishes early takes over work."""
-EVEN_PIECES = 4
-"""The same for kernels whose units all cost alike."""
-MANY_THREADS = 8
-"""From here on, threads get fewer pieces each: every call of a kernel holds Python's lock while its arguments are
-unpacked, up to 20 µs, for which all other threads wait."""
+import numpy as np
+
+from . import part_jit
+from .elementary import fetch_add
+
+UNITS, PIECE = 1, 2
+"""Where a kernel's `work` (3,) int64 holds the number of units and those of a piece; first is the next unit."""
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -37,63 +37,56 @@ def set_threads(count: int) -> None:
     _threads = max(1, count)
 
 
-def parallel(
-    units: Callable[..., int], pieces: int = PIECES_PER_THREAD, least: int = 1
-) -> Callable[[Any], Callable[..., None]]:
-    """Make kernel(begin, end, *arguments) a function of the arguments alone that runs on all threads.
+def parallel(units: Callable[..., int], piece: int = 1) -> Callable[[Any], Callable[..., None]]:
+    """Make kernel(work, *arguments) a function of the arguments alone that runs on all threads.
 
-    units: how many units of work the arguments hold; a kernel must do [begin, end) of them whatever the others do, and
-    write what no other unit writes, so that results do not depend on the threads. pieces: a thread, of equal length.
-    least: units of a piece, so many that they take longer than to wake a thread.
+    units: how many units of work the arguments hold. Each thread calls the kernel once, because Python's lock is held
+    while the arguments are unpacked, up to 20 µs; in there it takes one piece after the other, by `next_piece`. A
+    kernel must do a unit whatever the others do, and write what no other unit writes, so that results do not depend on
+    the threads. piece: units that are taken at a time; there are at most as many threads as pieces, so one should take
+    longer than to wake a thread.
     """
 
     def decorate(kernel: Any) -> Callable[..., None]:
         @wraps(kernel)
         def call(*arguments: Any) -> None:
-            _run(kernel, cut(units(*arguments), pieces, least), arguments)
+            _run(kernel, units(*arguments), piece, arguments)
 
         return call
 
     return decorate
 
 
-def pieces_of(pieces: int = PIECES_PER_THREAD) -> int:
-    """How many pieces of work there are, where few threads get `pieces` each."""
-    return _threads * max(2, min(pieces, pieces * MANY_THREADS // _threads)) if _threads > 1 else 1
+@part_jit
+def next_piece(work):
+    """First and past-the-last unit of a piece that no thread has taken before; the same number if none is left."""
+    begin = fetch_add(work, work[PIECE])
+    return min(begin, work[UNITS]), min(begin + work[PIECE], work[UNITS])
 
 
-def cut(units: int, pieces: int = PIECES_PER_THREAD, least: int = 1) -> list[tuple[int, int]]:
-    """First and past-the-last unit of each piece of work; see `parallel`."""
-    size = max(least, -(-units // pieces_of(pieces)))
-    return [(begin, min(begin + size, units)) for begin in range(0, units, size)]
-
-
-def _run(kernel: Any, parts: list[tuple[int, int]], arguments: tuple[Any, ...]) -> None:
-    """Call the kernel for each part; the parts are those of `cut`."""
-    if len(parts) == 1:
-        kernel(*parts[0], *arguments)
+def _run(kernel: Any, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
+    """Do all units of a kernel, on this thread and others."""
+    shared = np.array([0, units, piece], np.int64)
+    helpers = min(_threads, -(-units // piece)) - 1
+    if helpers <= 0:
+        if units:
+            kernel(shared, *arguments)
         return
-    remaining = iter(parts)  # shared: under Python's lock, each piece is taken once
     finished: SimpleQueue[BaseException | None] = SimpleQueue()
-
-    def work() -> None:
-        for begin, end in remaining:
-            kernel(begin, end, *arguments)
 
     def assist() -> None:
         try:
-            work()
+            kernel(shared, *arguments)
         except BaseException as error:  # is raised in the calling thread, which waits for this one
             finished.put(error)
         else:
             finished.put(None)
 
-    helpers = min(_threads, len(parts)) - 1
     _start(helpers)
     for _ in range(helpers):
         _tasks.put(assist)
     try:
-        work()
+        kernel(shared, *arguments)
     finally:
         errors = [finished.get() for _ in range(helpers)]
     for error in errors:

@@ -7,10 +7,10 @@ import numpy as np
 from . import inline_jit, jit, part_jit
 from .elementary import prefetch
 from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
-from .threads import EVEN_PIECES, parallel
+from .threads import next_piece, parallel
 
 RADIX_BITS = 11
-SPLATS_PER_SORT = 16_384
+SPLATS_PER_SORT = 8_192
 """Splats that a thread sorts at a time."""
 SORT_PARTS = 16
 """Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
@@ -23,7 +23,7 @@ def list_visible(rect):
     for i in range(np.uint64(len(rect))):
         found[count] = i
         count += rect[i, 2] > rect[i, 0]
-    return found[:count].copy()
+    return found[:count]
 
 
 def depth_order(depth: np.ndarray, candidates: np.ndarray) -> np.ndarray:
@@ -32,12 +32,13 @@ def depth_order(depth: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     Least-significant-digit radix sort on the bits of the float: positive floats order like their bits. Counted from the
     least, the depths of a head have 22 bits, and take two of the three passes.
     """
-    keys, values = depth.view(np.uint32)[candidates], candidates
-    if len(keys) == 0:
+    if len(candidates) == 0:
         return candidates
-    least = keys.min()
+    keys, values = np.empty(len(candidates), np.uint32), candidates
+    least, greatest = collect_keys(depth.view(np.uint32), candidates, keys)
+    least = np.uint32(least)
     counts = np.empty((-(-len(keys) // SPLATS_PER_SORT), 1 << RADIX_BITS), np.int32)
-    for shift in range(0, int(keys.max() - least).bit_length(), RADIX_BITS):
+    for shift in range(0, int(greatest - least).bit_length(), RADIX_BITS):
         digit, moved_keys, moved = np.uint32(shift), np.empty_like(keys), np.empty_like(values)
         count_digits(counts, keys, least, digit)
         sum_digits(counts)
@@ -46,23 +47,37 @@ def depth_order(depth: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     return values
 
 
+@jit
+def collect_keys(bits, candidates, keys):
+    """Write the bits (N,) uint32 of the candidates (M,) to keys (M,); returns the least and the greatest, uint32."""
+    least = greatest = bits[np.uint64(candidates[0])]
+    for n in range(np.uint64(len(candidates))):
+        key = bits[np.uint64(candidates[n])]
+        keys[n] = key
+        least, greatest = min(least, key), max(greatest, key)
+    return least, greatest
+
+
 @inline_jit
 def _digit(key, least, shift):
     return np.uint64((np.uint32(key - least) >> shift) & np.uint32((1 << RADIX_BITS) - 1))
 
 
-@parallel(lambda counts, *_: len(counts), EVEN_PIECES)
+@parallel(lambda counts, *_: len(counts), piece=16)
 @jit
-def count_digits(part, past_part, counts, keys, least, shift):
+def count_digits(work, counts, keys, least, shift):
     """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit occurs.
 
     The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts, digits) int32.
     """
-    for k in range(part, past_part):
-        row = counts[k]
-        row[:] = 0
-        for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
-            row[_digit(keys[n], least, shift)] += 1
+    part, past_part = next_piece(work)
+    while part < past_part:
+        for k in range(part, past_part):
+            row = counts[k]
+            row[:] = 0
+            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
+                row[_digit(keys[n], least, shift)] += 1
+        part, past_part = next_piece(work)
 
 
 @jit
@@ -76,17 +91,20 @@ def sum_digits(counts):
             found += count
 
 
-@parallel(lambda counts, *_: len(counts), EVEN_PIECES)
+@parallel(lambda counts, *_: len(counts))
 @jit
-def move_by_digit(part, past_part, place, keys, values, least, shift, moved_keys, moved):
+def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
     """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_digits` and is advanced."""
-    for k in range(part, past_part):
-        row = place[k]
-        for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
-            digit = _digit(keys[n], least, shift)
-            at = np.uint64(row[digit])
-            moved_keys[at], moved[at] = keys[n], values[n]
-            row[digit] += 1
+    part, past_part = next_piece(work)
+    while part < past_part:
+        for k in range(part, past_part):
+            row = place[k]
+            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
+                digit = _digit(keys[n], least, shift)
+                at = np.uint64(row[digit])
+                moved_keys[at], moved[at] = keys[n], values[n]
+                row[digit] += 1
+        part, past_part = next_piece(work)
 
 
 SPLATS_AHEAD = 16
@@ -117,25 +135,28 @@ def _next_tile(tile, column, width, tiles_x):
 
 @parallel(lambda *_: SORT_PARTS)
 @jit
-def count_pairs(part, past_part, rect, order, tiles_x, counts, pairs):
+def count_pairs(work, rect, order, tiles_x, counts, pairs):
     """Count the (splat, tile) pairs of each part of order (M,) int32: the splats, near to far.
 
     rect (N, 4) int32 tile bounds. Writes counts (SORT_PARTS, tiles) int32 and pairs (N,) int32, of the splats in
     `order`.
     """
-    for k in range(part, past_part):
-        row = counts[k]
-        row[:] = 0
-        past = np.uint64((k + 1) * len(order) // SORT_PARTS)
-        for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
-            _prefetch_rect(rect, order, n, past)
-            i = np.uint64(order[n])
-            tile, width, total = _tiles_of(rect, i, tiles_x)
-            pairs[i] = total
-            column = np.uint64(1)
-            for _ in range(total):
-                row[tile] += 1
-                tile, column = _next_tile(tile, column, width, tiles_x)
+    part, past_part = next_piece(work)
+    while part < past_part:
+        for k in range(part, past_part):
+            row = counts[k]
+            row[:] = 0
+            past = np.uint64((k + 1) * len(order) // SORT_PARTS)
+            for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
+                _prefetch_rect(rect, order, n, past)
+                i = np.uint64(order[n])
+                tile, width, total = _tiles_of(rect, i, tiles_x)
+                pairs[i] = total
+                column = np.uint64(1)
+                for _ in range(total):
+                    row[tile] += 1
+                    tile, column = _next_tile(tile, column, width, tiles_x)
+        part, past_part = next_piece(work)
 
 
 @jit
@@ -162,26 +183,29 @@ def compute_offsets(visible, pairs, counts, first_pair):
 
 @parallel(lambda *_: SORT_PARTS)
 @jit
-def fill_pairs(part, past_part, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
+def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
     """Write every tile's pairs front to back; `place` holds the offsets of `compute_offsets` and is advanced.
 
     pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat stand, its first at
     first_pair[i].
     """
-    for k in range(part, past_part):
-        row = place[k]
-        past = np.uint64((k + 1) * len(order) // SORT_PARTS)
-        for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
-            _prefetch_rect(rect, order, n, past)
-            i = np.uint64(order[n])
-            tile, width, total = _tiles_of(rect, i, tiles_x)
-            first, column = np.uint64(first_pair[i]), np.uint64(1)
-            for found in range(first, first + total):
-                at = row[tile]
-                row[tile] = at + 1
-                pair_splat[np.uint64(at)] = i
-                splat_pairs[found] = at
-                tile, column = _next_tile(tile, column, width, tiles_x)
+    part, past_part = next_piece(work)
+    while part < past_part:
+        for k in range(part, past_part):
+            row = place[k]
+            past = np.uint64((k + 1) * len(order) // SORT_PARTS)
+            for n in range(np.uint64(k * len(order) // SORT_PARTS), past):
+                _prefetch_rect(rect, order, n, past)
+                i = np.uint64(order[n])
+                tile, width, total = _tiles_of(rect, i, tiles_x)
+                first, column = np.uint64(first_pair[i]), np.uint64(1)
+                for found in range(first, first + total):
+                    at = row[tile]
+                    row[tile] = at + 1
+                    pair_splat[np.uint64(at)] = i
+                    splat_pairs[found] = at
+                    tile, column = _next_tile(tile, column, width, tiles_x)
+        part, past_part = next_piece(work)
 
 
 def whole_tiles(count: int) -> np.ndarray:

@@ -38,4 +38,4 @@ def step(
             by_column[3:] = rates["sh_rest"]
         parameters.append(AdamTables._make((*arrays, by_column)))
     options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
-    adam_rows(rows, state.steps.numpy(), tuple(parameters), options)
+    adam_rows(rows, state.numpy.steps, tuple(parameters), options)

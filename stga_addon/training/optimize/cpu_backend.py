@@ -36,7 +36,7 @@ class CpuBackend:
     def step(self, batch: Batch) -> float | None:
         """Forward, backward and optimizer step; returns the image loss of a global iteration, None for a local one."""
         state = self.state
-        focus = None if batch.selected is None else batch.selected[state.face.numpy()]
+        focus = None if batch.selected is None else batch.selected[state.numpy.face]
         target = self._target(batch)
         rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
         epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
@@ -46,14 +46,13 @@ class CpuBackend:
         self._add_limit_gradients(rows)
         adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
         if batch.accumulate:
-            add_screen_gradients(rows, screen, state.screen_gradient.numpy(), state.gradient_count.numpy())
+            add_screen_gradients(rows, screen, state.numpy.screen_gradient, state.numpy.gradient_count)
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
         """The view with the splats' exponential moving average: a new (3, H, W) float32 image."""
-        average = Parameters(*(tensor.numpy() for tensor in self.state.average))
         frames = self._moved_frames(view.timestep, averaged=True)
-        return self._forward(average, frames, view, background, sh_degree).image.copy()
+        return self._forward(self.state.numpy.average, frames, view, background, sh_degree).image.copy()
 
     def _target(self, batch: Batch) -> np.ndarray:
         """The target over the batch's background."""
@@ -71,14 +70,14 @@ class CpuBackend:
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the gradients of the trained rows; returns those rows, the screen gradients (N,) and the loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
-        frames = self._moved_frames(view.timestep)
-        rendering = self._forward(self.state.arrays(), frames, view, background, sh_degree, focus)
+        state, frames = self.state.numpy, self._moved_frames(view.timestep)
+        rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
         rectangles = whole_image(height, width) if focus is None else tile_rectangles(rendering.touched, height, width)
         v_image = self._buffers.get("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
         rows, screen = render_backward(
-            rendering, self.state.arrays(), self.state.face.numpy(), self._frames_in_camera, v_image,
-            Parameters(*(g.numpy() for g in self.state.gradients)), buffers=self._buffers,
+            rendering, state.parameters, state.face, self._frames_in_camera, v_image, state.gradients,
+            buffers=self._buffers,
         )  # fmt: skip
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
@@ -95,7 +94,7 @@ class CpuBackend:
     ) -> RenderOutput:  # fmt: skip
         self._frames_in_camera = frames_in_camera(frames, view.camera)
         return render_forward(
-            splats, self.state.face.numpy(), self._frames_in_camera, sh_degree, background, focus, LOSS_REACH_PX,
+            splats, self.state.numpy.face, self._frames_in_camera, sh_degree, background, focus, LOSS_REACH_PX,
             antialiased=self._settings.antialiased, buffers=self._buffers,
         )  # fmt: skip
 
@@ -103,8 +102,8 @@ class CpuBackend:
         """Step the timestep's FLAME parameters along the gradient of the loss, computed from the splats' gradients."""
         store, state, timestep = self._frames, self.state, batch.view.timestep
         assert store.tracking is not None
-        frames, gradients = store.of(timestep), Parameters(*(g.numpy() for g in state.gradients))
-        splats, face = state.arrays(), state.face.numpy()
+        frames, gradients = store.of(timestep), state.numpy.gradients
+        splats, face = state.numpy.parameters, state.numpy.face
         for name, offset in state.driven_offsets.items():
             shift = offset_of(offset.value, store.signals(timestep)(name))
             splats = splats._replace(xyz=splats.xyz + shift[face])
@@ -120,22 +119,21 @@ class CpuBackend:
         """
         state = self.state
         driven_offsets.step(
-            state.driven_offsets, rows, state.face.numpy(), state.gradients.xyz.numpy(),
+            state.driven_offsets, rows, state.numpy.face, state.numpy.gradients.xyz,
             self._frames.signals(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
         )  # fmt: skip
 
     def _add_limit_gradients(self, rows: np.ndarray) -> None:
         """Add the gradients that keep splats near what they cover, and unbound ones out of the air."""
-        settings, state = self._settings, self.state
-        face, unbound = state.face.numpy(), state.unbound.numpy()
+        settings, state = self._settings, self.state.numpy
+        face, unbound = state.face, state.unbound
         if settings.scale_weight:
-            gradient, log_scale = state.gradients.log_scale.numpy(), state.parameters.log_scale.numpy()
+            gradient, log_scale = state.gradients.log_scale, state.parameters.log_scale
             scale_limit(rows, log_scale, face, unbound, self._scale_limits, settings.scale_weight, gradient)
         if settings.unseen_opacity_weight:
-            opacity, gradient = state.parameters.opacity.numpy(), state.gradients.opacity.numpy()
             weight = settings.unseen_opacity_weight / len(state)
-            opacity_weight(rows, opacity, state.unseen_share.numpy(), weight, gradient)
+            opacity_weight(rows, state.parameters.opacity, state.unseen_share, weight, state.gradients.opacity)
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._units
-            gradient = state.gradients.xyz.numpy()
-            distance_limit(rows, state.parameters.xyz.numpy(), face, unbound, limit, settings.distance_weight, gradient)
+            weight, gradient = settings.distance_weight, state.gradients.xyz
+            distance_limit(rows, state.parameters.xyz, face, unbound, limit, weight, gradient)

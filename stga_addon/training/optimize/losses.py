@@ -1,5 +1,6 @@
 """Image loss of the CPU backend, and the unit of the limits on size and position (STGA, training)."""
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -7,8 +8,9 @@ from scipy.ndimage import find_objects, label
 
 from ...avatar.embedding import MIN_DIVISOR, face_areas, face_frames
 from ...capture.model import Capture
-from ...raster.cpu.image_loss import image_loss
+from ...raster.cpu.image_loss import LOSS_REACH_PX, image_loss
 from ...raster.cpu.layout import TILE
+from ...raster.cpu.threads import threads
 from ..settings import TrainingSettings
 from .hull_points import voxel_size
 
@@ -16,15 +18,24 @@ BAND_TILES = 12
 """Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
 
 
-def whole_image(height: int, width: int, parts: tuple[int, int] = (4, 2)) -> np.ndarray:
+def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray:
     """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one thread's work.
 
-    parts: rows and columns of rectangles. Wide ones are cheapest: each of their rows begins anew, and pixels beyond the
-    left and right edge cost more than those above and below.
+    bands: how many, over the whole width: what lies beyond the left and right edge of narrower ones would cost more
+    than what lies above and below. By default, so many that the threads are done soonest.
     """
-    rows, columns = parts
-    tops, lefts = (_edges(side, count) for side, count in ((height, rows), (width, columns)))
-    return np.array([[x0, y0, x1, y1] for y0, y1 in pairwise(tops) for x0, x1 in pairwise(lefts)], np.int64)
+    tops = _edges(height, bands or _bands(height, threads()))
+    return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
+
+
+@cache
+def _bands(height: int, count: int) -> int:
+    """How many bands cost the busiest of `count` threads the fewest rows, if there are more pieces than threads."""
+
+    def rows_of_a_thread(bands: int) -> int:
+        return -(-3 * bands // count) * (-(-height // bands) + 2 * LOSS_REACH_PX)
+
+    return min(range(-(-count // 2), 2 * count + 1), key=rows_of_a_thread)
 
 
 def _edges(side: int, count: int) -> list[int]:
@@ -55,10 +66,10 @@ def image_gradient(
     image, out (3, H, W) float32; target (H, W, 3) uint8. The loss is the mean over the whole image whatever the
     rectangles are. Returns L1 and SSIM, which are the image's only if the rectangles tile it.
     """
-    sums = np.zeros((3 * len(rectangles), 2))
+    sums = np.zeros((3, int((rectangles[:, 3] - rectangles[:, 1]).sum()), 2))
     share = 1.0 / image.size
     image_loss(image, target, rectangles, np.float32(ssim_weight), np.float32(share), out, sums)
-    l1, ssim = sums.sum(0) * share
+    l1, ssim = sums.reshape(-1, 2).sum(0) * share
     return float(l1), float(ssim)
 
 

@@ -1,6 +1,6 @@
 """State of the splats in training: parameters, optimizer moments and statistics for density control."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -68,11 +68,16 @@ class TrainState:
         return len(self.steps)
 
     @cached_property
-    def tables(self) -> dict[str, tuple[np.ndarray, ...]]:
-        """Parameter -> its values, gradient, moments and average as NumPy arrays (N, D) that share their memory.
+    def numpy(self) -> Any:
+        """A `TrainState` of NumPy arrays that share the tensors' memory, without driven offsets.
 
-        Kept, because asking torch for the arrays in every iteration takes longer than Adam on a small selection.
+        Kept, because asking torch for every array in every iteration takes as long as a small kernel.
         """
+        return state_of({name: tensor.numpy() for name, tensor in tensors_of(self).items()})
+
+    @cached_property
+    def tables(self) -> dict[str, tuple[np.ndarray, ...]]:
+        """Parameter -> its values, gradient, moments and average as NumPy arrays (N, D) that share their memory."""
         kept = self.parameters, self.gradients, self.first, self.second, self.average
         return {
             name: tuple(t.numpy().reshape(len(t), t[0].numel()) for t in tensors)
@@ -81,7 +86,8 @@ class TrainState:
 
     def arrays(self) -> Parameters:
         """The parameters as NumPy arrays that share their memory."""
-        return Parameters(*(t.numpy() for t in self.parameters))
+        parameters: Parameters = self.numpy.parameters
+        return parameters
 
     def splats(self) -> Splats:
         """A copy of the current splats."""
@@ -165,7 +171,7 @@ def tensors_of(state: TrainState) -> dict[str, torch.Tensor]:
     return flat
 
 
-def state_of(tensors: dict[str, torch.Tensor]) -> TrainState:
+def state_of(tensors: Mapping[str, Any]) -> TrainState:
     """Rebuild a state from `tensors_of`. Raises KeyError with the name of a missing tensor."""
     values: dict[str, Any] = {}
     for f in _splat_fields():
