@@ -36,7 +36,7 @@ void main() {}`;
 const SURFACE_FUNCTIONS = `
 const float PI = 3.14159265358979;
 const float REFLECTANCE = 0.04, SKIN_ROUGHNESS = 0.45;
-const float BIAS = 0.001, MAX_BIAS = 0.006, TAP_STEP = 2.0;
+const float BIAS = 0.001, MAX_BIAS = 0.006, TAP_STEP = 1.0;
 
 vec3 linear(vec3 srgb) {
   vec3 curve = pow((max(srgb, 0.04045) + 0.055) / 1.055, vec3(2.4));
