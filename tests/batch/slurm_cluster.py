@@ -33,8 +33,8 @@ SwitchType=switch/none
 MpiDefault=none
 SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU_Memory
-SchedulerParameters=sched_interval=1,bf_interval=1,sched_min_interval=0
-SlurmdTimeout=5
+SchedulerParameters=sched_interval=2,bf_interval=2,sched_min_interval=0
+SlurmdTimeout=10
 ReturnToService=2
 NodeName=one NodeHostname={host} NodeAddr=127.0.0.1 Port={first} CPUs=1 RealMemory=4000
 NodeName=two NodeHostname={host} NodeAddr=127.0.0.1 Port={second} CPUs=1 RealMemory=4000

@@ -295,11 +295,11 @@ def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
     """
     if not Path("/proc/self/status").exists():
         pytest.skip("peak memory of a process is read from Linux's /proc")
-    tests, few = Path(__file__).resolve().parents[1], JOBS // 5
+    tests, few = Path(__file__).resolve().parents[1], JOBS // 8
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]), "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-c", COST, str(few), str(JOBS)]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     (small_s, small_kb), (large_s, large_kb) = (map(float, line.split()) for line in run.stdout.splitlines())
-    print(f"{JOBS} jobs: {JOBS * large_s:.1f} s, {large_kb / 1024:.0f} MB")
-    assert large_s < 1.5 * small_s
+    print(f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; {large_s / small_s:.2f}")
+    assert large_s < 2 * small_s
     assert large_kb - small_kb < 30 * (JOBS - few)
