@@ -20,7 +20,9 @@ from ..selection import SelectionOptions
 from ..training.settings import MAX_GROWTH, TrainingSettings
 
 SHAPES_SUFFIX = ".csv"
-MATTES = ("auto", "none")
+WORLDS = "auto", "head", "keep"
+SYNC = "none", "auto", "sound", "motion"
+MATTES = "auto", "none"
 """What `Track.mattes` may be but a folder."""
 BLEND_SUFFIX = ".blend"
 SPLATS_ENGINE = "STGA_SPLATS"
@@ -34,10 +36,6 @@ FRAME_DIGITS = 6
 def device_field() -> Any:
     """A field for a device as `choose_device` takes it; "auto" continues a run on the device that trained it."""
     return setting("auto", accepts=is_device, expected=EXPECTED_DEVICE)
-
-
-WORLDS = "auto", "head", "keep"
-SYNC = "none", "auto", "sound", "motion"
 
 
 @dataclass(frozen=True)

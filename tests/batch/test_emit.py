@@ -44,11 +44,11 @@ def test_openjd_runs_the_batch(tmp_path: Path) -> None:
     if OPENJD is None:
         pytest.skip("openjd-cli is not installed: pip install openjd-cli")
     pytest.importorskip("torch")
-    plan = tiny_plan(tmp_path, iterations=3)
+    plan = tiny_plan(tmp_path, seeds=1, iterations=3)
     path = emit("openjd", Batch(plan))
     openjd("check", str(path))
     summary = json.loads(openjd("summary", str(path), "--output", "json"))
-    assert summary["total_tasks"] == 4
+    assert summary["total_tasks"] == 2
     (train, evaluate) = (step["name"] for step in json.loads(path.read_text())["steps"])
     openjd("run", str(path), "--step", evaluate, "--run-dependencies")
     assert train.endswith("train")
@@ -64,6 +64,9 @@ def test_openjd_steps(tmp_path: Path) -> None:
     folders = [s["parameterSpace"]["taskParameterDefinitions"][0]["range"] for s in (first, second, last)]
     assert [len(found) for found in folders] == [1024, 476, 1]
     assert {folder for found in folders for folder in found} == {str(job.request_folder) for job in plan.jobs}
+    for step in template["steps"]:
+        arguments = step["script"]["actions"]["onRun"]["args"]
+        assert arguments[arguments.index("perform") + 1] == "{{Task.Param.Folder}}"
     assert [each["dependsOn"] for each in last["dependencies"]] == [first["name"], second["name"]]
     assert "dependencies" not in second
     memory = {"name": "amount.worker.memory", "min": 7000}

@@ -1,6 +1,7 @@
 """An empty Blender file for every test, the checkout as an extension, and what is built from it."""
 
 import importlib.util
+import pkgutil
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from capture.factory import write_flame_capture
 from stga_addon.capture.flame_capture import OWN_MODELS
 from stga_addon.development.package import build_zip, fetch_wheels
 from stga_addon.errors import StgaError
+from stga_addon.worker.environment import missing_packages
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -22,11 +24,18 @@ def empty_scene():
 
 @pytest.fixture(scope="session")
 def extension():
-    """The checkout as a package of its own, as Blender imports an extension: only relative imports find their way."""
-    spec = importlib.util.spec_from_file_location(
-        "stga_checkout", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
-    )
-    module = sys.modules["stga_checkout"] = importlib.util.module_from_spec(spec)
+    """The checkout as a package of its own, as Blender imports an extension: only relative imports find their way.
+
+    Its kernels are those of `stga_addon`: under another name they would be compiled again, which takes a minute.
+    """
+    name = "stga_checkout"
+    if not missing_packages():
+        kernels = importlib.import_module("stga_addon.raster.cpu")
+        sys.modules[f"{name}.{kernels.__name__}"] = kernels
+        for _, part, _ in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
+            sys.modules[f"{name}.{part}"] = importlib.import_module(part)
+    spec = importlib.util.spec_from_file_location(name, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.register()
     yield module

@@ -34,6 +34,7 @@ def made(take, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write_capture, "write_json", interrupt)
         # What takes the longest, and is thrown away here
+        patch.setattr("stga_addon.tracking.track.fit_dense", lambda *_, **__: None)
         patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_: fit)
         patch.setattr("stga_addon.tracking.track.follow_torso", lambda fit, parameters, *_: FollowedTorso(parameters))
         assert make(take, out) == 130

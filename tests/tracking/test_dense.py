@@ -7,28 +7,21 @@ import pytest
 
 from stga_addon.capture.camera import look_at
 from stga_addon.development.demo.blend_shapes import EXPRESSIONS
-from stga_addon.development.demo.head import synthetic_head, write_flame
+from stga_addon.development.demo.head import synthetic_head
 from stga_addon.development.demo.paint import paint
-from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking.appearance import Sample, average_texture, light_basis
 from stga_addon.tracking.dense import fit_dense
-from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.dense_terms import projection_derivative
 from stga_addon.tracking.fit import fit_head
-from stga_addon.tracking.folder import PLACES_FILE, REPORT_FILE
-from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.posed_points import PosedPoints
 from stga_addon.tracking.seen_surface import RecordedTake
 from stga_addon.tracking.solve import Observation, normal_equations, person, smooth_take, solve_take
-from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import posed_mesh
 
 from .test_fit import places_on, seen
-from .test_track import write_footage
 
 JAW = 2
 OPENINGS = 0.0, 0.0, 0.1, 0.25, 0.4, 0.45, 0.3, 0.05
@@ -193,24 +186,3 @@ def test_raised_brows_are_not_lowered_by_images_that_prove_little():
     found = fit_dense(first, replace(take.take, images=images))
     assert brow_errors(take, first).max() < 1
     assert brow_errors(take, found.fit).max() < 3
-
-
-@pytest.mark.slow
-def test_track_reports_what_the_images_do_not_explain(tmp_path):
-    """Catches dense tracking that `track` does not run, and a report without it."""
-    take = scene(np.radians([-40, 0, 40]), openings=OPENINGS[:6], size=(100, 130)).take
-    cameras = take.landmarks[0].cameras
-    pictures = {(camera.position.tobytes(), t): image for t in range(6) for camera, image in take.images(t)}
-    write_footage(tmp_path / "footage", cameras, 6, lambda camera, t: pictures[camera.position.tobytes(), t])
-    write_flame(synthetic_head(0, 1).model, tmp_path / "head.npz")
-    write_places(tmp_path / "points" / PLACES_FILE, take.places, take.reliable)
-    for number in range(3):
-        points = np.stack([take.landmarks[t].points[number] for t in range(6)])
-        write_npz(tmp_path / f"points/cam{number}.npz", {"timesteps": np.arange(6), "points": points})
-    result = track(
-        open_footage(tmp_path / "footage"), tmp_path / "head.npz", tmp_path / "out", tmp_path / "points", mattes=False
-    )
-    report = read_json(tmp_path / "out" / REPORT_FILE)
-    assert list(report["image_misfit"]) == list(REGIONS)
-    assert all(list(own) == list("012345") for own in report["image_misfit"].values())
-    assert all(0 < value < 0.5 for own in result.image_misfit.values() for value in own.values())

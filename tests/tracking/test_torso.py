@@ -12,11 +12,12 @@ from stga_addon.capture.open import open_capture
 from stga_addon.capture.rigid import Similarity, weighted_procrustes
 from stga_addon.development.demo.head import synthetic_head, write_flame
 from stga_addon.development.demo.paint import paint
-from stga_addon.files import write_npz
+from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, joint_positions
 from stga_addon.flame.masks import torso_faces
+from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit
-from stga_addon.tracking.folder import PLACES_FILE
+from stga_addon.tracking.folder import PLACES_FILE, REPORT_FILE
 from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
@@ -211,8 +212,11 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
 
 
 @pytest.mark.slow
-def test_track_writes_the_torso_as_flames_neck(tmp_path, head):
-    """Catches a torso that is followed and then not written, or not reported to those who train on the capture."""
+def test_track_writes_the_torso_as_flames_neck(tmp_path, head, monkeypatch):
+    """Catches a torso that is followed and then not written, or not reported to those who train on the capture; dense
+    tracking that `track` does not run, and a report without it."""
+    # What takes the longest, and changes neither
+    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_: fit)
     fit, parameters, footage = take(head, SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M)
     cameras = [own.camera for own in footage.cameras]
     numbers = {camera.position.tobytes(): number for number, camera in enumerate(cameras)}
@@ -235,6 +239,10 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head):
     assert found == result.torso
     assert found.shift_mm > 5
     assert len(read_torso_points(out).at) > 100
+    misfit = read_json(out / REPORT_FILE)["image_misfit"]
+    assert list(misfit) == list(REGIONS)
+    assert all(list(own) == list("0123456") for own in misfit.values())
+    assert all(0 < value < 0.5 for own in result.image_misfit.values() for value in own.values())
     capture = open_capture(out, tmp_path / "head.npz")
     sequence, used = capture.flame, np.unique(capture.faces[torso_faces(capture.flame.model)])
     lifts = np.array([capture.mesh(timestep)[used].mean(0)[1] for timestep in range(TIMESTEPS)])

@@ -66,8 +66,9 @@ def test_training_compiles_nothing_new(tmp_path: Path, transparent: bool) -> Non
 COLD = """
 import json
 from stga_addon.raster.cpu import blend, project, tiles
-from stga_addon.training.optimize.precompile import precompile_kernels
-precompile_kernels()
+from stga_addon.training.optimize import precompile
+precompile._optimize = precompile._limit = lambda: None  # which the first process compiles meanwhile
+precompile.precompile_kernels()
 kernels = [getattr(kernel, "__wrapped__", kernel) for kernel in
     (tiles.fill_pairs, blend.blend_forward, blend.blend_backward, project.project_backward)]
 print(json.dumps([[sum(kernel.stats.cache_hits.values()), len(kernel.signatures)] for kernel in kernels]))
