@@ -26,9 +26,10 @@ from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.posed_points import parameters_of
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.torso import follow_torso
+from stga_addon.tracking.torso_cloth import found_bending
 from stga_addon.tracking.torso_drape import draped, torso_sheet
-from stga_addon.tracking.torso_motion import read_torso_motion, read_torso_points
-from stga_addon.tracking.torso_take import NECK, ROOT, with_root
+from stga_addon.tracking.torso_motion import TorsoPoints, read_torso_motion, read_torso_points
+from stga_addon.tracking.torso_take import NECK, ROOT, TorsoPose, TorsoTake, with_root
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import flame_frame, posed_mesh
 
@@ -41,8 +42,8 @@ SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)
 """Of what turns, at each timestep."""
 LIFT_M = 0.012 * np.sin(1.3 * np.arange(TIMESTEPS))[:, None] * [0.5, 1.0, 0.2]
 """By which shoulders are shifted at each timestep."""
-SLIDE_M = 0.012 * np.sin(1.7 * np.arange(TIMESTEPS))[:, None] * [1.0, 0.3, 0.0]
-CLOTH_CENTER_M, CLOTH_SIGMA_M = np.array([0.05, -0.19, 0.03]), 0.05
+SLIDE_M = 0.01 * np.sin(0.9 * np.arange(TIMESTEPS))[:, None] * [1.0, 0.3, 0.0]
+CLOTH_CENTER_M, CLOTH_SIGMA_M = np.array([0.04, -0.23, 0.03]), 0.05
 """By which cloth slides over the shoulders at each timestep; where, and how far around."""
 CHEST_SIZE_M, CHEST_CENTER_M = np.array([0.17, 0.08, 0.085]), np.array([0.0, -0.215, -0.04])
 BACKDROP = 115
@@ -200,29 +201,30 @@ def test_the_necks_end_is_drawn_over_the_chest(fine_head):
     np.testing.assert_allclose(after[behind], at[behind], atol=1e-12)
 
 
-@pytest.mark.slow
 def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
-    """Catches a torso that only moves as one, a mesh that is bent where it ends instead of where the cloth is, and a
-    head that moves with the joint that FLAME finds from the bent vertices."""
-    head, (cloth, _, _) = fine_head, ellipsoid()
+    """Catches a torso that only moves as one, flow that is applied in another camera's or the head's axes, and a head
+    that moves with the joint that FLAME finds from the bent vertices."""
+    cloth, _, _ = ellipsoid()
     near = np.exp(-(((cloth - CLOTH_CENTER_M) / CLOTH_SIGMA_M) ** 2).sum(1) / 2)[:, None]
     slides = np.array([slide * near for slide in SLIDE_M])
-    fit, parameters, footage = take(head, 0.5 * SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M[:, None] + slides)
-    followed = follow_torso(fit, parameters, footage, quiet)
-    assert followed.motion.bend_mm > 4
-    apart = head.model.weights[:, ROOT] == 0
-    meshes = [posed_mesh(followed.fit, values, followed.offsets[t]) for t, values in followed.parameters.items()]
-    for timestep, mesh in enumerate(meshes):
-        assert np.abs(mesh - posed_mesh(fit, parameters[timestep]))[apart].max() < 2e-3
-    first, moved = followed.points.timestep, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
-    used = np.unique(head.model.faces[torso_faces(head.model)])
-    distance, nearest = cKDTree(cloth + slides[first] + moved[first]).query(meshes[first][used])
+    fit, parameters, footage = take(fine_head, 0.5 * SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M[:, None] + slides)
+    posed = TorsoTake(fit, parameters, footage.cameras, torso_faces(fine_head.model))
+    motion = posed.motion({t: TorsoPose(np.eye(3), LIFT_M[t]) for t in parameters}, rigid=True)
+    first, moved = 3, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
+    shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
+    bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), quiet)
+    meshes = {}
+    for timestep, torso in motion.items():
+        values, offset = posed.with_offset(torso, bending.at(timestep))
+        meshes[timestep] = posed_mesh(fit, values, offset)
+        apart = fine_head.model.weights[:, ROOT] == 0
+        assert np.abs(meshes[timestep] - posed_mesh(fit, parameters[timestep]))[apart].max() < 2e-3
+    distance, nearest = cKDTree(cloth + slides[first] + moved[first]).query(meshes[first][bending.vertices])
     on_cloth = (distance < 0.01) & (near[nearest, 0] > 0.5)
     assert on_cloth.sum() > 5
-    rigid = [slides[t] - slides[first] for t in range(TIMESTEPS)]
-    found = [meshes[t][used] - meshes[first][used] - moved[t] + moved[first] for t in range(TIMESTEPS)]
-    wrong = np.array([own[on_cloth] - true[nearest[on_cloth]] for own, true in zip(found, rigid, strict=True)])
-    true = np.array(rigid)[:, nearest[on_cloth]]
+    true = (slides - slides[first])[:, nearest[on_cloth]]
+    found = [meshes[t][bending.vertices] - meshes[first][bending.vertices] - moved[t] + moved[first] for t in meshes]
+    wrong = np.array(found)[:, on_cloth] - true
     assert np.linalg.norm(wrong, axis=2).mean() < 0.5 * np.linalg.norm(true, axis=2).mean()
 
 
