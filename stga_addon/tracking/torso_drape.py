@@ -20,7 +20,7 @@ SLOPE = 0.8
 """Of the angle around the neck: shoulders slope down."""
 REACH_RAD, DIRECTION_SIGMA = np.radians(10), 1.0
 """Of a direction to both sides; smoothing of what is found in them, in steps."""
-MIN_POINTS, FARTHEST_SHARE, BEYOND_M = 5, 0.98, 0.03
+MIN_POINTS, FARTHEST_SHARE, BEYOND_M = 5, 0.98, 0.015
 """In a direction: points below which it is not seen, the share of them that the mesh reaches, and how far beyond."""
 FULL_HEIGHT = 0.5
 """Height (see `TorsoSheet`) from which vertices lie on the surface, not between it and the model's."""
