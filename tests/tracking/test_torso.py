@@ -201,6 +201,7 @@ def test_the_necks_end_is_drawn_over_the_chest(fine_head):
     np.testing.assert_allclose(after[behind], at[behind], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     """Catches a torso that only moves as one, flow that is applied in another camera's or the head's axes, and a head
     that moves with the joint that FLAME finds from the bent vertices."""
