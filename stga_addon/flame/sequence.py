@@ -88,9 +88,12 @@ def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
 
 
 def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: world points (N, 3) that lie lower than the root joint, at the base of the neck, seen by the torso."""
+    """(N,) bool: world points (N, 3) that lie lower than the root joint, at the base of the neck, seen by the torso.
+
+    The joint is that of the model without offsets, which may draw the torso over clothes, and the joint with it.
+    """
     model, frame = sequence.model, sequence.frame(timestep)
-    shaped = shaped_vertices(model, sequence.shape, frame.expr, sequence.static_offset)
+    shaped = shaped_vertices(model, sequence.shape, frame.expr)
     root = joint_positions(model, shaped)[JOINTS.index("root")] + frame.translation
     up = axis_angle_matrices(frame.rotation[None])[0][:, 1]
     return np.asarray((points - root) @ up < 0)

@@ -29,6 +29,8 @@ MIN_SHADING, MAX_SHADING = 0.2, 4.0
 OWN_VIEW_PRIOR = 6.0
 """Observations of all cameras that count beside a camera's own in its texture: skin shines differently to each side."""
 MAX_DEVIATION_LEVELS = 60.0
+MAX_SAMPLES = 1 << 14
+"""Of an image at a time: OpenCV takes less than 2^15."""
 MIN_OBSERVATIONS = 1.0
 """Sum of the weights of the views of a point, below which its texture is not known."""
 
@@ -85,12 +87,18 @@ def pyramid(camera: Camera, image: np.ndarray, center: np.ndarray) -> list[Level
 
 
 def sampled(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Values (N, K) of an image (H, W, K) float32, K ≤ 4, at pixels (N, 2); those of the border outside."""
+    """Values (N, K) of an image (H, W, K) float32, K ≤ 4, at pixels (N, 2), or (N,) of one (H, W); those of the border
+    outside."""
     import cv2
 
+    if not len(pixels):
+        return np.zeros((0, *image.shape[2:]), np.float32)
     at = np.clip(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, image.shape[1::-1]).astype(np.float32)
-    found: Any = cv2.remap(image, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found[0])
+    parts: list[Any] = [
+        cv2.remap(image, part[None, :, 0], part[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+        for part in np.array_split(at, max(1, -(-len(at) // MAX_SAMPLES)))
+    ]
+    return np.concatenate(parts)
 
 
 def light_basis(normals: np.ndarray) -> np.ndarray:

@@ -4,11 +4,11 @@ Landmarks of a face cannot tell the neck's rotation from the head's, so that a t
 that its neck ends in turn as one. Here the root joint, which carries that ring, gets the orientation that explains the
 images below the head best; the neck turns back by as much, and the head stays where it was tracked. Skin between both
 is blended by the model's own weights. Where that leaves much unexplained, because shoulders were lifted or a chin was
-pushed forward, the torso is shifted as well.
+pushed forward, the torso is shifted as well; and its cloth bends, where that explains more.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from .fit import HeadFit
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 from .posed_points import cross_matrices
+from .surface import with_offset
+from .torso_cloth import Bending, found_bending
 from .torso_motion import TorsoMotion, TorsoPoints
 from .torso_points import Carrier, Motion, SeenPoints, at_depth, compared, seen_points
 from .torso_take import (
@@ -67,12 +69,14 @@ to be shifted as well."""
 class FollowedTorso:
     """A take's heads on their torso.
 
+    fit         the head; a torso that bends is drawn over the surface that cameras see
     parameters  timestep -> (E + 18,)
-    offsets     timestep -> vertex offsets (V, 3) that shift the torso; empty where it is not shifted
+    offsets     timestep -> vertex offsets (V, 3) that shift and bend the torso; empty where it is not shifted
     motion      how it was decided; None where that cannot be told
     points      where the torso's surface is seen; None where it rides on the head
     """
 
+    fit: HeadFit
     parameters: Mapping[int, np.ndarray]
     offsets: Mapping[int, np.ndarray] = field(default_factory=dict)
     motion: TorsoMotion | None = None
@@ -89,12 +93,12 @@ def follow_torso(fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Fo
     unchanged = dict(parameters)
     torso = torso_faces(fit.head.model)
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
-        return FollowedTorso(unchanged)
+        return FollowedTorso(fit, unchanged)
     middle = _middle_timestep(parameters)
     take = TorsoTake(fit, unchanged, _cameras(footage, middle), torso)
     seen = seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
-        return FollowedTorso(unchanged)
+        return FollowedTorso(fit, unchanged)
     some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
     motions = _motions(take, seen, some, report)
     deep = at_depth(take, seen, motions)
@@ -103,21 +107,36 @@ def follow_torso(fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Fo
     misfit = {"head": found["head"], "still": found["still"], "own": found[own]}
     motion = _chosen(misfit)
     if motion == "head":
-        return FollowedTorso(unchanged, motion=TorsoMotion(motion, misfit, 0.0))
+        return FollowedTorso(fit, unchanged, motion=TorsoMotion(motion, misfit, 0.0))
     name = own if motion == "own" else motion
-    return _followed(take, motions[name], motion, misfit, TorsoPoints(middle, deep[name].at))
+    points = TorsoPoints(middle, deep[name].at)
+    bending = found_bending(take, motions[name], points, some, report) if name == "shifted" else None
+    return _followed(fit, take, motions[name], bending, TorsoMotion(motion, misfit, 0.0), points)
 
 
 def _followed(
-    take: TorsoTake, posed: Motion, motion: str, misfit: Mapping[str, float], points: TorsoPoints
+    fit: HeadFit, take: TorsoTake, posed: Motion, bending: Bending | None, motion: TorsoMotion, points: TorsoPoints
 ) -> FollowedTorso:
     """The take with the motion that was chosen."""
     turn = max(float(np.degrees(np.linalg.norm(joint_rotation(own.parameters, NECK)))) for own in posed.values())
     shift = max((float(np.linalg.norm(own.shift)) for own in posed.values() if own.shift is not None), default=0.0)
-    shifted = {t: take.with_offset(own) for t, own in posed.items() if own.shift is not None}
+    bend = 0.0 if bending is None else bending.largest
+    motion = replace(motion, turn_deg=turn, shift_mm=1000 * shift, bend_mm=1000 * bend)
+    shifted = {
+        t: take.with_offset(own, 0.0 if bending is None else bending.at(t))
+        for t, own in posed.items()
+        if own.shift is not None
+    }
     heads = {t: shifted[t][0] if t in shifted else own.parameters for t, own in posed.items()}
     offsets = {t: offset for t, (_, offset) in shifted.items()}
-    return FollowedTorso(heads, offsets, TorsoMotion(motion, misfit, turn, 1000 * shift), points)
+    if bending is not None:
+        fit = replace(
+            fit,
+            head=with_offset(fit.head, bending.drape),
+            static_offset=bending.drape + (0 if fit.static_offset is None else fit.static_offset),
+        )
+        offsets = {t: offset - bending.drape for t, offset in offsets.items()}
+    return FollowedTorso(fit, heads, offsets, motion, points)
 
 
 def _motions(take: TorsoTake, seen: SeenPoints, some: Sequence[int], report: Report) -> dict[str, Motion]:

@@ -24,18 +24,21 @@ class TorsoMotion:
     misfit    motion -> share of the points below the head, held out from fitting, that images do not explain
     turn_deg  largest angle between torso and head
     shift_mm  largest distance of the torso from where the neck's joint holds it; 0 where a rotation explains enough
+    bend_mm   largest distance of its cloth from where a rigid torso has it; 0 where that explains enough
     """
 
     motion: str = setting(choices=MOTIONS)
     misfit: Mapping[str, float] = setting(minimum=0, maximum=1)
     turn_deg: float = setting(minimum=0)
     shift_mm: float = setting(0.0, minimum=0)
+    bend_mm: float = setting(0.0, minimum=0)
 
     @property
     def description(self) -> str:
         """A clause with the figures that decided."""
         shift = f" and {self.shift_mm:.0f} mm" if self.shift_mm else ""
-        apart = "" if self.motion == "head" else f", up to {self.turn_deg:.0f}°{shift} apart from the head"
+        bend = f", its cloth bends by up to {self.bend_mm:.0f} mm" if self.bend_mm else ""
+        apart = "" if self.motion == "head" else f", up to {self.turn_deg:.0f}°{shift} apart from the head{bend}"
         shares = {name: f"{self.misfit[name]:.0%}" for name in MOTIONS}
         return (
             f"the torso {MOTIONS[self.motion]}{apart}; images below the head are not explained by {shares['head']} if "
@@ -57,7 +60,7 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
         return None
     try:
         if isinstance(found, dict):
-            found = {"shift_mm": 0.0, **found}  # of a capture that was tracked before there was one
+            found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}  # of a capture that was tracked before there were any
         motion: TorsoMotion = from_json(TorsoMotion, found)
         if set(motion.misfit) != set(MOTIONS):
             raise StgaError(f"misfit: expected {', '.join(MOTIONS)}")

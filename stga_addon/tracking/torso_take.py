@@ -98,10 +98,11 @@ class TorsoTake:
         rest = self.model.v_template[vertices] + self.model.shapedirs[vertices] @ expr
         return np.asarray((rest - root) @ axis_angle_matrices(rigid[None, :3])[0].T + root + rigid[-3:])
 
-    def with_offset(self, torso: PosedTorso) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters (E + 18,) and vertex offsets (V, 3) by which a torso is rigid and shifted.
+    def with_offset(self, torso: PosedTorso, bend: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters (E + 18,) and vertex offsets (V, 3) by which a torso is rigid and shifted, and bent.
 
-        Offsets move the joints as well, which FLAME finds from vertices; the translation undoes that for the head.
+        bend (V, 3): offsets in meters, in the torso's axes, which the root joint turns. Offsets move the joints as
+        well, which FLAME finds from vertices; the translation undoes that for the head.
         """
         assert torso.shift is not None
         model, parameters, offset = self.model, torso.parameters.copy(), np.zeros_like(self.model.v_template)
@@ -109,6 +110,8 @@ class TorsoTake:
         moved = np.flatnonzero(share)
         before = posed_mesh(self._fit, parameters)[moved]
         wanted = before + share[moved, None] * (self.rigid(parameters, moved) + torso.shift - before)
+        root = axis_angle_matrices(joint_rotation(parameters, ROOT)[None])[0]
+        wanted += np.broadcast_to(bend, offset.shape)[moved] @ root.T
         turns = axis_angle_matrices(parameters[-RIGID_SIZE:-3].reshape(-1, 3))
         for joint, parent in enumerate(model.parents.tolist()):
             turns[joint] = turns[parent] @ turns[joint] if parent >= 0 else turns[joint]
@@ -120,6 +123,10 @@ class TorsoTake:
             by_offset = root + turns[ROOT] @ (neck - root) - turns[NECK] @ neck
             parameters[-3:] = torso.parameters[-3:] - by_offset
         return parameters, offset
+
+    def base(self, parameters: np.ndarray) -> np.ndarray:
+        """(3,) the root joint, inside the base of the neck."""
+        return np.asarray(self._joints[0] + self._joint_dirs[0] @ parameters[:-RIGID_SIZE] + parameters[-3:])
 
     def pivot(self, timestep: int) -> np.ndarray:
         """(3,) what the torso turns about: the joint of the neck."""

@@ -170,7 +170,7 @@ def track(
         out / SHEET_FILE,
         footage,
         cameras,
-        lambda timestep: posed_mesh(fit, torso.parameters[timestep], torso.offsets.get(timestep)),
+        lambda timestep: posed_mesh(torso.fit, torso.parameters[timestep], torso.offsets.get(timestep)),
         fit.head.model.faces,
         result.reprojection_px,
         result.image_misfit,
@@ -179,7 +179,7 @@ def track(
         write_landmarks(out / LANDMARKS_FOLDER, detected, places, reliable)
     if torso.points is not None:
         write_torso_points(out, torso.points)
-    write_capture(out, footage, fit, torso.parameters, torso.offsets, meshes, report)
+    write_capture(out, footage, torso.fit, torso.parameters, torso.offsets, meshes, report)
     return result
 
 

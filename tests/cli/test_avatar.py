@@ -36,7 +36,7 @@ def made(take, tmp_path_factory):
         # What takes the longest, and is thrown away here
         patch.setattr("stga_addon.tracking.track.fit_dense", lambda *_, **__: None)
         patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_: fit)
-        patch.setattr("stga_addon.tracking.track.follow_torso", lambda fit, parameters, *_: FollowedTorso(parameters))
+        patch.setattr("stga_addon.tracking.track.follow_torso", lambda fit, own, *_: FollowedTorso(fit, own))
         assert make(take, out) == 130
     assert not (out / "run").exists()
     printed = StringIO()

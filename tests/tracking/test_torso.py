@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_raster import rasterize
@@ -26,8 +27,10 @@ from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.posed_points import parameters_of
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.torso import follow_torso
-from stga_addon.tracking.torso_motion import read_torso_motion, read_torso_points
-from stga_addon.tracking.torso_take import NECK, ROOT, with_root
+from stga_addon.tracking.torso_cloth import found_bending
+from stga_addon.tracking.torso_drape import draped, torso_sheet
+from stga_addon.tracking.torso_motion import TorsoPoints, read_torso_motion, read_torso_points
+from stga_addon.tracking.torso_take import NECK, ROOT, TorsoPose, TorsoTake, with_root
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import flame_frame, posed_mesh
 
@@ -40,6 +43,9 @@ SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)
 """Of what turns, at each timestep."""
 LIFT_M = 0.012 * np.sin(1.3 * np.arange(TIMESTEPS))[:, None] * [0.5, 1.0, 0.2]
 """By which shoulders are shifted at each timestep."""
+SLIDE_M = 0.01 * np.sin(0.9 * np.arange(TIMESTEPS))[:, None] * [1.0, 0.3, 0.0]
+CLOTH_CENTER_M, CLOTH_SIGMA_M = np.array([0.04, -0.23, 0.03]), 0.05
+"""By which cloth slides over the shoulders at each timestep; where, and how far around."""
 CHEST_SIZE_M, CHEST_CENTER_M = np.array([0.17, 0.08, 0.085]), np.array([0.0, -0.215, -0.04])
 BACKDROP = 115
 
@@ -83,9 +89,15 @@ def head():
     return HeadModel(synthetic_head(0, 1).model, "flame")
 
 
+@pytest.fixture(scope="module")
+def fine_head():
+    """With several rows of vertices below the neck, as FLAME has."""
+    return HeadModel(synthetic_head(0, 2).model, "flame")
+
+
 def take(head, heads, torsos, size=SIZE, shifts=None):
     """Fit, parameters of a head tracked as one, and footage; heads, torsos (T,): degrees about the vertical axis;
-    shifts (T, 3): of the shoulders, in meters."""
+    shifts (T, 3) or (T, V, 3): of the shoulders, or of each of their vertices, in meters."""
     pictured = synthetic_head(0, 2)
     colors = np.clip(paint(pictured, 0)[0] ** (1 / 1.8), 0, 1)
     cloth, cloth_faces, cloth_colors = ellipsoid()
@@ -161,7 +173,7 @@ def test_shoulders_that_are_lifted_are_followed(head):
     apart = model.weights[:, ROOT] == 0
     places = []
     for timestep, values in found.items():
-        mesh = posed_mesh(fit, values, offsets[timestep])
+        mesh = posed_mesh(followed.fit, values, offsets[timestep])
         places.append(mesh[used].mean(0) - [0.002 * timestep, 0, 0])
         assert np.abs(mesh - posed_mesh(fit, parameters[timestep]))[apart].max() < 2e-3
     wrong = np.array(places) - LIFT_M
@@ -169,6 +181,53 @@ def test_shoulders_that_are_lifted_are_followed(head):
     timestep = followed.points.timestep
     beside = followed.points.at - [0.002 * timestep, 0, 0] - LIFT_M[timestep] - CHEST_CENTER_M
     assert np.median(np.abs(np.linalg.norm(beside / CHEST_SIZE_M, axis=1) - 1)) < 0.15
+
+
+def test_the_necks_end_is_drawn_over_the_chest(fine_head):
+    """Catches a mesh that is drawn to the points' mean depth, one that ends at the neck, a throat that is moved, and a
+    back that is made up."""
+    cloth, _, _ = ellipsoid()
+    sheet = torso_sheet(fine_head.model)
+    at, base = fine_head.model.v_template[sheet.vertices], np.array([0.0, -0.14, -0.04])
+    shown = cloth[(cloth[:, 2] > CHEST_CENTER_M[2] + 0.02) & (cloth[:, 1] < base[1] - 0.01)]
+    after = draped(sheet, at - base, shown - base) + base
+    moved = np.linalg.norm(after - at, axis=1) > 0.02
+    beside = np.abs(np.linalg.norm((after - CHEST_CENTER_M) / CHEST_SIZE_M, axis=1) - 1)
+    assert moved.sum() > 20
+    assert np.median(beside[moved & (sheet.height < 0.7)]) < 0.1
+    assert after[:, 1].min() < shown[:, 1].min() + 0.03
+    np.testing.assert_allclose(after[sheet.height == 0], at[sheet.height == 0], atol=1e-12)
+    behind = at[:, 2] < base[2] - 0.02
+    assert behind.any()
+    np.testing.assert_allclose(after[behind], at[behind], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
+    """Catches a torso that only moves as one, flow that is applied in another camera's or the head's axes, and a head
+    that moves with the joint that FLAME finds from the bent vertices."""
+    cloth, _, _ = ellipsoid()
+    near = np.exp(-(((cloth - CLOTH_CENTER_M) / CLOTH_SIGMA_M) ** 2).sum(1) / 2)[:, None]
+    slides = np.array([slide * near for slide in SLIDE_M])
+    fit, parameters, footage = take(fine_head, 0.5 * SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M[:, None] + slides)
+    posed = TorsoTake(fit, parameters, footage.cameras, torso_faces(fine_head.model))
+    motion = posed.motion({t: TorsoPose(np.eye(3), LIFT_M[t]) for t in parameters}, rigid=True)
+    first, moved = 3, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
+    shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
+    bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), quiet)
+    meshes = {}
+    for timestep, torso in motion.items():
+        values, offset = posed.with_offset(torso, bending.at(timestep))
+        meshes[timestep] = posed_mesh(fit, values, offset)
+        apart = fine_head.model.weights[:, ROOT] == 0
+        assert np.abs(meshes[timestep] - posed_mesh(fit, parameters[timestep]))[apart].max() < 2e-3
+    distance, nearest = cKDTree(cloth + slides[first] + moved[first]).query(meshes[first][bending.vertices])
+    on_cloth = (distance < 0.01) & (near[nearest, 0] > 0.5)
+    assert on_cloth.sum() > 5
+    true = (slides - slides[first])[:, nearest[on_cloth]]
+    found = [meshes[t][bending.vertices] - meshes[first][bending.vertices] - moved[t] + moved[first] for t in meshes]
+    wrong = np.array(found)[:, on_cloth] - true
+    assert np.linalg.norm(wrong, axis=2).mean() < 0.5 * np.linalg.norm(true, axis=2).mean()
 
 
 @pytest.mark.slow

@@ -318,6 +318,7 @@ def test_torso(tmp_path):
     assert all(figure in verdict.reason for figure in ("17°", "40%", "20%", "10%"))
     shifted = {"motion": "own", "misfit": misfit, "turn_deg": 3.0, "shift_mm": 8.2}
     assert "3° and 8 mm" in rules.torso(tracked(tmp_path, {"torso": shifted})).reason
+    assert "bends by up to 10 mm" in rules.torso(tracked(tmp_path, {"torso": {**shifted, "bend_mm": 10.4}})).reason
     assert not rules.torso(tracked(tmp_path, {"torso": {"motion": "head", "misfit": misfit, "turn_deg": 0.0}})).on
     assert not rules.torso(tracked(tmp_path, {"torso": None})).on
     assert not rules.torso(tracked(tmp_path, {})).on

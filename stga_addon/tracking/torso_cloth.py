@@ -1,0 +1,270 @@
+"""The torso's surface as it bends: cloth wrinkles and slides, which a rigid torso cannot follow.
+
+Each image is brought back to where one timestep shows the torso. Optical flow between the two shows what its motion so
+far misses, and the vertices of its sheet move by that, of all cameras together and smoothly.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..capture.mesh_raster import rasterize
+from ..flame.forward import axis_angle_matrices
+from .appearance import NOISE_LEVELS, sampled
+from .dense_terms import MIN_FLOW_SIDE_PX, inside, projection_derivative
+from .landmarks import Report
+from .torso_drape import TorsoSheet, draped, torso_sheet
+from .torso_motion import TorsoPoints
+from .torso_points import HELD_OUT
+from .torso_take import ROOT, PosedTorso, TorsoShot, TorsoTake, joint_rotation
+
+BLOCK_PX = 12
+"""Side of the blocks of pixels of which one in HELD_OUT is not fitted, and tells whether bending is right."""
+ROUGHNESS_M, BEND_SIGMA_M = 0.0005, 0.02
+"""Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
+FLOW_SIGMA_PX, FLOW_SHARE = 0.5, 0.15
+"""Of optical flow, and the share of the pixels that count as independent of each other."""
+FLOW_OUTLIER_PX, CHANGE_OUTLIER_LEVELS = 4.0, 5 * NOISE_LEVELS
+"""Distance, and difference of what flow matches, beyond which flow is wrong."""
+PIXEL_STEP = 3
+"""One of so many pixels is fitted."""
+MIN_GAIN = 0.05
+"""Share by which the misfit has to fall for the torso to bend."""
+STEPS = 4
+"""Gauss–Newton steps for each timestep."""
+HELD = 1e10
+"""Precision that holds a vertex."""
+
+
+@dataclass(frozen=True)
+class Bending:
+    """A torso that bends, by offsets of its vertices in its own axes, in meters.
+
+    vertices  (N,) ids of those that may move
+    drape     (V, 3) that draw the mesh over the torso
+    bends     timestep -> (N, 3) beside these
+    """
+
+    vertices: np.ndarray
+    drape: np.ndarray
+    bends: Mapping[int, np.ndarray]
+
+    def at(self, timestep: int) -> np.ndarray:
+        """All offsets (V, 3) of a timestep."""
+        whole = self.drape.copy()
+        whole[self.vertices] += self.bends[timestep]
+        return whole
+
+    @property
+    def largest(self) -> float:
+        """Meters by which a vertex leaves the rigid torso."""
+        return max(float(np.linalg.norm(bend, axis=1).max()) for bend in self.bends.values())
+
+
+def found_bending(
+    take: TorsoTake, motion: Mapping[int, PosedTorso], points: TorsoPoints, some: Sequence[int], report: Report
+) -> Bending | None:
+    """How a torso with a rigid motion bends; None where the images of some timesteps are not explained better by it."""
+    sheet = torso_sheet(take.model)
+    if sheet is None:
+        return None
+    first = motion[points.timestep]
+    turn, at = _axes(first), _rigid(take, first, sheet.vertices)
+    base = take.base(first.parameters) + (0.0 if first.shift is None else first.shift)
+    before = (at - base) @ turn
+    drape = draped(sheet, before, (points.at - base) @ turn) - before
+    cloth = _Cloth(take, sheet, motion, points.timestep, drape)
+    bends = cloth.follow(report)
+    rigid, bent = cloth.misfit(bends, [timestep for timestep in some if timestep != points.timestep])
+    if not bent < (1 - MIN_GAIN) * rigid:
+        return None
+    whole = np.zeros_like(take.model.v_template)
+    whole[sheet.vertices] = drape
+    return Bending(sheet.vertices, whole, bends)
+
+
+def _axes(torso: PosedTorso) -> np.ndarray:
+    """(3, 3) from the torso's axes to the world's."""
+    return np.asarray(axis_angle_matrices(joint_rotation(torso.parameters, ROOT)[None])[0])
+
+
+def _rigid(take: TorsoTake, torso: PosedTorso, vertices: np.ndarray) -> np.ndarray:
+    """(N, 3) of vertices (N,) of a rigid torso."""
+    assert torso.shift is not None
+    return np.asarray(take.rigid(torso.parameters, vertices) + torso.shift)
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """What a camera shows of the sheet at the first timestep, in P pixels.
+
+    shown    (H, W) bool
+    luma     (H, W) uint8
+    corners  (P, 3) rows of the sheet's vertices, and barycentric (P, 3) coordinates
+    fitted   (P,) bool
+    """
+
+    shown: np.ndarray
+    luma: np.ndarray
+    corners: np.ndarray
+    barycentric: np.ndarray
+    fitted: np.ndarray
+
+    @cached_property
+    def pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns (P,)."""
+        rows, columns = np.nonzero(self.shown)
+        return rows, columns
+
+
+@dataclass(frozen=True)
+class _Returned:
+    """An image of another timestep brought back to the reference: its luma (H, W), and of the P pixels the positions
+    (P, 3), the pixels (P, 2) that show them there, and whether they do (P,)."""
+
+    luma: np.ndarray
+    at: np.ndarray
+    source: np.ndarray
+    visible: np.ndarray
+
+
+class _Cloth:
+    """How the sheet bends over a take, as (N, 3) offsets of its vertices in the torso's axes, in meters."""
+
+    def __init__(
+        self, take: TorsoTake, sheet: TorsoSheet, motion: Mapping[int, PosedTorso], first: int, drape: np.ndarray
+    ) -> None:
+        """motion: of the rigid torso; drape (N, 3): that draws the sheet over the surface, in the torso's axes; first:
+        the timestep that the others are compared with."""
+        from scipy.sparse import diags_array, eye_array, kron
+
+        self._take, self._sheet, self._motion, self._first, self._drape = take, sheet, motion, first, drape
+        mean = diags_array(1 / sheet.laplacian.diagonal()) @ sheet.laplacian
+        held = HELD * ~drape.any(1)
+        own = mean.T @ mean / ROUGHNESS_M**2 + diags_array(BEND_SIGMA_M**-2 + held)
+        self._precision = kron(own, eye_array(3)).tocsr()
+        shot = take.shot(first)
+        self._references = {number: self._reference(shot, number) for number in shot.views}
+
+    def follow(self, report: Report) -> dict[int, np.ndarray]:
+        """Offsets by timestep, from the first one's, where they are 0, to both ends of the take."""
+        bends = {self._first: np.zeros_like(self._drape)}
+        later = [timestep for timestep in sorted(self._motion) if timestep > self._first]
+        earlier = [timestep for timestep in sorted(self._motion, reverse=True) if timestep < self._first]
+        for way in (later, earlier):
+            bend = bends[self._first]
+            for timestep in way:
+                report("Torso", len(bends), len(self._motion))
+                shot = self._take.shot(timestep)
+                for _ in range(STEPS):
+                    bend = self._stepped(timestep, shot, bend)
+                bends[timestep] = bend
+        return bends
+
+    def misfit(self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]) -> tuple[float, float]:
+        """Share, from 0 to 1, of the pixels that were not fitted that images do not explain: rigid, and bent."""
+        total, count, rigid = np.zeros(2), 0, np.zeros_like(self._drape)
+        for timestep in timesteps:
+            shot = self._take.shot(timestep)
+            for number in self._numbers(shot):
+                reference = self._references[number]
+                both = [self._returned(timestep, shot, number, bend) for bend in (rigid, bends[timestep])]
+                use = both[0].visible & both[1].visible & ~reference.fitted
+                changed = np.array([(own.luma.astype(float) - reference.luma)[reference.pixels][use] for own in both])
+                total += (changed**2 / (CHANGE_OUTLIER_LEVELS**2 + changed**2)).sum(1)
+                count += int(use.sum())
+        return float(total[0] / max(count, 1)), float(total[1] / max(count, 1))
+
+    def _numbers(self, shot: TorsoShot) -> list[int]:
+        """Of the cameras that see the sheet at the first timestep and now, in images of one size."""
+        return [
+            number
+            for number, view in shot.views.items()
+            if number in self._references
+            and self._references[number].corners.size
+            and view.levels[0].channels.shape[:2] == self._references[number].shown.shape
+            and min(self._references[number].shown.shape) >= MIN_FLOW_SIDE_PX
+        ]
+
+    def _reference(self, shot: TorsoShot, number: int) -> _Reference:
+        model, sheet, camera = self._take.model, self._sheet, shot.views[number].levels[0].camera
+        mesh = self._take.mesh(self._motion[self._first].parameters)
+        mesh[sheet.vertices] = self._positions(self._first, np.zeros_like(self._drape))
+        triangle, barycentric = rasterize(mesh, model.faces, camera)
+        shown = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
+        rows, columns = np.nonzero(shown)
+        corners, weights = sheet.rows(model.faces[triangle[rows, columns]]), barycentric[rows, columns]
+        at = np.einsum("pk,pki->pi", weights, mesh[sheet.vertices][corners])
+        visible = self._visible(self._first, shot, number, at)
+        shown[rows, columns] = visible
+        fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
+        return _Reference(shown, _luma(shot, number), corners[visible], weights[visible], fitted[visible])
+
+    def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
+        """(N, 3) of the sheet's vertices."""
+        torso = self._motion[timestep]
+        return np.asarray(_rigid(self._take, torso, self._sheet.vertices) + (self._drape + bend) @ _axes(torso).T)
+
+    def _visible(self, timestep: int, shot: TorsoShot, number: int, at: np.ndarray) -> np.ndarray:
+        """(P,) bool: points that lie in the mask and are not hidden by the head."""
+        mask, view = self._take.cameras[number].mask(timestep), shot.views[number]
+        assert mask is not None
+        share = sampled(mask.astype(np.float32), view.camera.project(at)[0])
+        return np.asarray(shot.shows(number, at) & inside(view.levels[0].camera, at) & (share > 127))
+
+    def _returned(self, timestep: int, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
+        reference = self._references[number]
+        at = np.einsum("pk,pki->pi", reference.barycentric, self._positions(timestep, bend)[reference.corners])
+        source, _ = shot.views[number].levels[0].camera.project(at)
+        luma = reference.luma.copy()
+        values = sampled(_luma(shot, number).astype(np.float32), source)
+        luma[reference.pixels] = values.astype(np.uint8)
+        return _Returned(luma, at, source, self._visible(timestep, shot, number, at))
+
+    def _stepped(self, timestep: int, shot: TorsoShot, bend: np.ndarray) -> np.ndarray:
+        """The offsets after a Gauss–Newton step."""
+        from scipy.sparse import csr_array, diags_array
+        from scipy.sparse.linalg import spsolve
+
+        matrix, right = self._precision, -(self._precision @ bend.ravel())
+        axes = _axes(self._motion[timestep])
+        for number in self._numbers(shot):
+            reference, now = self._references[number], self._returned(timestep, shot, number, bend)
+            miss, weight = _missed(reference, now)
+            used = np.flatnonzero(weight)[::PIXEL_STEP]
+            turned = projection_derivative(shot.views[number].levels[0].camera, now.at[used]) @ axes
+            rates = turned[:, :, None, :] * reference.barycentric[used][:, None, :, None]
+            rows = np.broadcast_to(np.arange(2 * len(used)).reshape(-1, 2, 1, 1), rates.shape)
+            columns = np.broadcast_to((3 * reference.corners[used][..., None] + np.arange(3))[:, None], rates.shape)
+            rate = csr_array((rates.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * len(used), bend.size))
+            weighted = rate.T @ diags_array(np.repeat(FLOW_SHARE / FLOW_SIGMA_PX**2 * weight[used], 2))
+            matrix, right = matrix + weighted @ rate, right + weighted @ miss[used].ravel()
+        return np.asarray(bend + spsolve(matrix.tocsc(), right).reshape(-1, 3))
+
+
+def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarray]:
+    """By how many pixels (P, 2) the images show points beside where they are, and weights (P,) from 0 to 1."""
+    import cv2
+
+    opencv: Any = cv2  # whose type stubs lack DIS
+    flow = opencv.DISOpticalFlow_create(opencv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(reference.luma, now.luma, None)
+    rows, columns = reference.pixels
+    places = np.stack([columns, rows], axis=1) + 0.5 + flow[rows, columns]
+    shown = np.full((*reference.shown.shape, 3), np.nan, np.float32)
+    shown[rows, columns] = np.concatenate([now.source, now.luma[rows, columns][:, None]], axis=1)
+    found = sampled(shown, places)
+    weight = now.visible & reference.fitted & np.isfinite(found).all(1)
+    found = np.where(weight[:, None], found, 0)
+    miss = np.where(weight[:, None], found[:, :2] - now.source, 0)
+    changed = found[:, 2] - reference.luma[rows, columns]
+    distance = np.linalg.norm(miss, axis=1)
+    share = 1 / ((1 + (distance / FLOW_OUTLIER_PX) ** 2) * (1 + (changed / CHANGE_OUTLIER_LEVELS) ** 2))
+    return miss, weight * share
+
+
+def _luma(shot: TorsoShot, number: int) -> np.ndarray:
+    """(H, W) uint8 of a camera's finest image."""
+    return np.clip(shot.views[number].levels[0].channels[..., 0], 0, 255).astype(np.uint8)
