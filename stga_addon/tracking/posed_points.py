@@ -116,7 +116,7 @@ class PosedPoints:
         parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
         across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ np.stack(turns)).reshape(-1, 3, 9)
         by_joint = (arms @ across).reshape(*arms.shape, 3)
-        return by_joint.transpose(1, 2, 0, 3).reshape(len(by_joint[0]), 3, POSE_SIZE)
+        return np.asarray(by_joint.transpose(1, 2, 0, 3).reshape(len(by_joint[0]), 3, POSE_SIZE))
 
     def _placed(self, rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
         """World positions (5, 3, K) of joints (5, 3, K), or their derivatives, in which the result is linear."""
