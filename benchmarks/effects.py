@@ -30,7 +30,7 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.development.benchmark.statistics import Spread, spread_of
-from stga_addon.training.effects.catalog import EFFECTS
+from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.effects.rules import RULES

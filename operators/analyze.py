@@ -6,7 +6,7 @@ import bpy
 
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import Analyze
-from ..stga_addon.training.effects.decisions import parse_choices
+from ..stga_addon.training.effect_decisions import parse_choices
 from . import ids
 from .common import capture_source, head_of, needs_head, reporting, scene_settings
 from .request import needs_idle, start

@@ -8,7 +8,7 @@ from ..stga_addon.scene.display.display_modes import ELLIPSOIDS, LIMITS, QUADS
 from ..stga_addon.scene.display.hints import use_transparent_bounces, view_transform_hint
 from ..stga_addon.scene.display.splat_nodes import DISPLAY
 from ..stga_addon.scene.display.splat_object import set_input
-from ..stga_addon.scene.gpu.viewport_display import is_shown_as_trained
+from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from . import ids
 from .common import reporting
 

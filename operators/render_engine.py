@@ -2,9 +2,8 @@
 
 import bpy
 
-from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.light import settings as lighting
-from ..stga_addon.scene.render import engine
+from ..stga_addon.scene.render import engine, viewport_display
 from .common import preferences
 from .training_python import training_python
 

@@ -10,7 +10,7 @@ from ..stga_addon.requests.values import Extend, Refine, Resume
 from ..stga_addon.requests.values import Train as TrainRequest
 from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.effects.decisions import parse_choices
+from ..stga_addon.training.effect_decisions import parse_choices
 from ..stga_addon.training.run.folder import read_run
 from ..stga_addon.training.settings import PRESETS, make_settings
 from ..stga_addon.worker.environment import stored_adapters

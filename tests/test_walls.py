@@ -6,9 +6,11 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
+T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ("__init__.py", "operators", "ui", "stga_addon")
 SOURCES = sorted(
@@ -112,9 +114,9 @@ def import_graph() -> dict[Path, set[Path]]:
     }
 
 
-def reached(graph: dict[Path, set[Path]], path: Path) -> set[Path]:
-    """All files that a file imports, or that those import in turn."""
-    seen, left = set[Path](), [path]
+def reached(graph: dict[T, set[T]], path: T) -> set[T]:
+    """All files, or parts, that one imports, or that those import in turn."""
+    seen, left = set[T](), [path]
     while left:
         new = graph[left.pop()] - seen
         seen |= new
@@ -180,6 +182,17 @@ def test_no_file_imports_itself_by_way_of_others():
     """Catches circles inside a room, those of types only, and those through modules that are loaded by name."""
     graph = import_graph()
     assert not [name_of(path) for path in SOURCES if path in reached(graph, path)]
+
+
+@pytest.mark.parametrize("room", sorted({path.parent for path in SOURCES} - {ROOT, ROOT / "stga_addon"}), ids=name_of)
+def test_no_part_of_a_room_imports_itself_by_way_of_others(room):
+    """Catches two folders, or a folder and a file beside it, that need each other though no two of their files do."""
+    inside = {path: path.relative_to(room).parts[0] for path in SOURCES if path.is_relative_to(room)}
+    parts: dict[str, set[str]] = {part: set() for part in inside.values()}
+    for path, others in import_graph().items():
+        if path in inside:
+            parts[inside[path]] |= {inside[other] for other in others if other in inside} - {inside[path]}
+    assert not [part for part in parts if part in reached(parts, part)]
 
 
 @pytest.mark.parametrize(

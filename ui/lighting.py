@@ -10,8 +10,8 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import get_input
+from ..stga_addon.scene.display.stored_light import read_light
 from ..stga_addon.scene.light.settings import lighting_settings
-from ..stga_addon.scene.light.stored import read_light
 from ..stga_addon.scene.light.world import world_light
 from .request import draw_running
 from .sidebar import SidebarPanel

@@ -13,8 +13,8 @@ from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
 from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_transform_hint
 from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
-from ..stga_addon.scene.gpu import viewport_display
 from ..stga_addon.scene.objects import layers_of
+from ..stga_addon.scene.render import viewport_display
 from .continue_panel import ContinuePanel
 from .drive import DrivePanel
 from .effects import EffectsPanel

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from ..errors import StgaError
 from ..worker.status import WorkerState, WorkerStatus, read_status, request_cancel
-from .engines.engine import Engine
+from .engine import Engine
 from .folder import is_done, is_running, prepare, read_record, write_record
 from .identity import job_digest
 from .job import Job

@@ -10,7 +10,7 @@ from ..requests.open_head import OpenHead
 from ..requests.results import Analyzed
 from ..requests.values import Analyze
 from ..schema import to_json
-from ..training.effects.decisions import parse_choices
+from ..training.effect_decisions import parse_choices
 from ..training.run.folder import RUN
 from .arguments import add_capture, add_device, add_effects
 from .carry_out import carry_out

@@ -8,7 +8,7 @@ from ..errors import StgaError
 from ..requests.open_head import OpenHead
 from ..requests.values import Resume, Train
 from ..selection import SelectionOptions
-from ..training.effects.decisions import parse_choices
+from ..training.effect_decisions import parse_choices
 from ..training.run.folder import Run, has_run, read_run
 from ..training.settings import PRESETS, SCHEDULES, STRATEGIES, TrainingSettings, make_settings
 from .arguments import add_capture, add_device, add_effects, duration, real_number, usable_path, whole_number

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import file_size, read_json
-from .live.facial_mocap import parse_packet
+from .facial_mocap import parse_packet
 from .names import COUNT, arkit_name, columns_of
 from .performance import Performance
 from .timecode import seconds_of

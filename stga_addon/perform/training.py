@@ -21,8 +21,8 @@ from ..report.preset_timing import time_presets
 from ..report.run_summary import CurveUpdater, report_run
 from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
-from ..training.effects.catalog import RELIGHT
-from ..training.effects.decisions import TRACKING
+from ..training.effect_catalog import RELIGHT
+from ..training.effect_decisions import TRACKING
 from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
 from ..training.optimize.flame_refinement import with_refined_tracking
 from ..training.run.continuation import continued_settings, select_for_takes

@@ -12,8 +12,8 @@ from ..errors import StgaError
 from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
 from .backdrop import BACKDROPS
-from .effects.catalog import EFFECTS
-from .effects.decisions import CHOICES
+from .effect_catalog import EFFECTS
+from .effect_decisions import CHOICES
 
 STRATEGIES = ("selective", "global", "gaussian-avatars")
 CONTINUATIONS = ("refine", "extend")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from stga_addon.batch.engines.engine import Ended, Engine
+from stga_addon.batch.engine import Ended, Engine
 from stga_addon.batch.job import Job
 from stga_addon.batch.lease import hold_folder
 from stga_addon.batch.plan import Plan, make_plan

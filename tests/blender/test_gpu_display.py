@@ -17,11 +17,11 @@ from stga_addon.scene.display.splat_object import (  # noqa: E402
     show_world_splats,
     update_splats,
 )
-from stga_addon.scene.gpu import viewport_display  # noqa: E402
 from stga_addon.scene.gpu.packing import StaticSplats, View, drawing_order, frame_block, posed_frames  # noqa: E402
-from stga_addon.scene.gpu.viewport_display import GpuDisplay, region_view  # noqa: E402
 from stga_addon.scene.layers import DisplaySettings, SceneLayer  # noqa: E402
+from stga_addon.scene.render import viewport_display  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+from stga_addon.scene.render.viewport_display import GpuDisplay, region_view  # noqa: E402
 
 from .test_splat_object import animated_head, avatar_of, random_splats  # noqa: E402
 

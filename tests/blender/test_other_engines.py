@@ -103,7 +103,7 @@ def test_relit_color_of_a_frame(tmp_path: Path) -> None:
     from stga_addon.light.relight import Relighter
     from stga_addon.scene.display.materials import DISPLAY_COLOR
     from stga_addon.scene.light import settings
-    from stga_addon.scene.light.frame_colors import forget_frame, relight_frame
+    from stga_addon.scene.render.frame_colors import forget_frame, relight_frame
 
     from .test_engine import camera_at, show, textured, with_light
     from .test_splat_object import avatar_of

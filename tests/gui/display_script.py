@@ -29,11 +29,10 @@ from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, show_avatar  # noqa: E402
-from stga_addon.scene.gpu import viewport_display  # noqa: E402
 from stga_addon.scene.gpu.renderer import SplatRenderer  # noqa: E402
-from stga_addon.scene.gpu.viewport_display import display, region_view  # noqa: E402
-from stga_addon.scene.render import engine  # noqa: E402
+from stga_addon.scene.render import engine, viewport_display  # noqa: E402
 from stga_addon.scene.render.view_transform import inverse_view  # noqa: E402
+from stga_addon.scene.render.viewport_display import display, region_view  # noqa: E402
 
 RENDER_PATIENCE_S = 60.0
 

@@ -62,7 +62,7 @@ from stga_addon.requests.values import (
     Track,
     Train,
 )
-from stga_addon.training.effects.decisions import EffectDecision
+from stga_addon.training.effect_decisions import EffectDecision
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.run.progress import describe_figures
 from stga_addon.training.settings import make_settings

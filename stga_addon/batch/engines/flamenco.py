@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from ...requests.values import RenderBlend
 from ...worker.launch import PACKAGES_FOLDER
+from ..engine import job_command
 from ..job import Job
 from ..plan import Plan
-from .engine import job_command
 
 TEMPLATE = """// A batch of stga as a job type of Flamenco 3: put this file into the manager's `scripts` folder,
 // and submit a job of this type. Each task continues what it began before.

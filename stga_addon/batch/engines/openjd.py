@@ -9,9 +9,9 @@ from typing import Any
 from ...errors import StgaError
 from ...requests.folder import worker_arguments
 from ...worker.launch import PACKAGES_FOLDER
+from ..engine import training_python
 from ..job import Job, Resources
 from ..plan import Plan
-from .engine import training_python
 
 VERSION = "jobtemplate-2023-09"
 MAX_STEPS, MAX_TASKS, MAX_NAME = 100, 1024, 64

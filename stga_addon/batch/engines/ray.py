@@ -15,8 +15,8 @@ from ...errors import StgaError
 from ...worker.environment import PYTHON_VARIABLE
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, inspect_worker, read_status
+from ..engine import Ended, job_command
 from ..job import Job
-from .engine import Ended, job_command
 from .local import processors
 
 MAX_WAITING = 1000

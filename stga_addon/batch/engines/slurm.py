@@ -16,8 +16,8 @@ from ...errors import StgaError
 from ...files import replacing
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, WorkerState, inspect_worker
+from ..engine import Ended, job_command
 from ..job import Job, Resources
-from .engine import Ended, job_command
 
 TIMEOUT_S = 60.0
 MAX_ARRAY = 1000

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from ...files import replacing, write_json
+from ..engine import Engine
 from ..folder import prepare
 from ..job import Job
 from ..plan import Plan
 from ..run import Batch
-from .engine import Engine
 
 
 @dataclass(frozen=True)

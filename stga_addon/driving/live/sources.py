@@ -4,8 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from . import facial_mocap, live_link_face, vmc
-from .packet import FacePacket
+from .. import facial_mocap
+from ..packet import FacePacket
+from . import live_link_face, vmc
 
 Decoded = tuple[FacePacket | None, Any]
 """The frame that a datagram completes, if any, and what is known of its sender from then on."""

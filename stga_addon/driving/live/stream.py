@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
-from .packet import FacePacket
+from ..packet import FacePacket
 from .sources import Source
 
 Sender = tuple[str, str]

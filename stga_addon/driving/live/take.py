@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..open_motion import MotionOptions, corrected
+from ..packet import FacePacket
 from ..performance import Performance
 from ..read_performance import DEFAULT_FPS, MAX_ROWS
-from .packet import FacePacket
 
 RESTING_PACKETS = 15
 """Whose mean is the resting face: a quarter of a second."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..names import COLUMN, COUNT, arkit_name
+from ..packet import FacePacket
 from .osc import Message, Value, messages
-from .packet import FacePacket
 
 VALUE, APPLY = "/VMC/Ext/Blend/Val", "/VMC/Ext/Blend/Apply"
 TIME, BONE = "/VMC/Ext/T", "/VMC/Ext/Bone/Pos"

@@ -13,7 +13,6 @@ from .. import tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, read_values, triangle_mesh
 from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
-from ..light.stored import read_light, write_light
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
 from .node_builder import is_splat_tree
@@ -29,6 +28,7 @@ from .splat_attributes import (
     write_attributes,
     write_splats,
 )
+from .stored_light import read_light, write_light
 
 SETTING_NAMES = {
     splat_nodes.SIZE: "size",

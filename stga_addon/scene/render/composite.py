@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from ...capture.color import linear_to_srgb, srgb_to_linear
-from ..gpu.viewport_display import world_color
 from .view_transform import InverseView
+from .viewport_display import world_color
 
 
 def combined(

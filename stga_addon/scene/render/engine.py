@@ -20,7 +20,6 @@ from ..gpu.context import has_gpu_context
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer
 from ..gpu.shaders import MIN_ALPHA
-from ..gpu.viewport_display import ENGINE
 from ..layers import SceneLayer
 from . import engine_panels, redraw
 from .camera import render_camera
@@ -29,6 +28,7 @@ from .engine_viewport import EngineViewport
 from .rasterizer import Rasterizer
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import inverse_view, measure, needs_inverse
+from .viewport_display import ENGINE
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
 VIEW_TRANSFORM_UNKNOWN = (

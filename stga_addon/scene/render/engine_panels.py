@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from ..gpu.viewport_display import ENGINE
+from .viewport_display import ENGINE
 
 # Those that are for some engines only and apply to this one too.
 SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")

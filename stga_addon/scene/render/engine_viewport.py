@@ -13,7 +13,6 @@ from ...errors import StgaError
 from ...raster.posed_splats import PosedSplats
 from ...render.client import RenderClient
 from ..gpu.renderer import SplatRenderer
-from ..gpu.viewport_display import is_drawn_by_engine, region_view
 from ..layers import SceneLayer
 from ..light.settings import settings_values
 from .camera import viewport_camera
@@ -21,6 +20,7 @@ from .composite import combined, scene_background, srgb_background
 from .rasterizer import Rasterizer
 from .scene_splats import SplatCache, visible_layers
 from .viewport import RenderRequest, ViewportImage, ViewportRenderer
+from .viewport_display import is_drawn_by_engine, region_view
 
 
 class EngineViewport:

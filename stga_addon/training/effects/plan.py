@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from ...avatar.offsets.table import OFFSETS
 from ...capture.model import Capture
 from ...errors import StgaError
+from ..effect_catalog import EFFECTS, Effect
+from ..effect_decisions import EffectDecision
 from ..settings import TrainingSettings
-from .catalog import EFFECTS, Effect
-from .decisions import EffectDecision
 from .facts import CaptureFacts
 from .rules import RULES, Verdict
 

@@ -17,7 +17,7 @@ from ...flame.forward import FlameFrame
 from ...flame.forward_torch import flame_forward, flame_tensors
 from ...flame.sequence import FRAME_FIELDS, FlameSequence, read_motion, sequence_mesh, with_identity
 from ...raster.cpu.layout import Parameters
-from ..effects.decisions import TRACKING
+from ..effect_decisions import TRACKING
 
 REFINEMENT_START_SHARE = 0.15
 """Share of the budget before the first step: gradients of untrained splats carry no information."""

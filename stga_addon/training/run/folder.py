@@ -22,7 +22,7 @@ from ...files import read_json, remove_leftovers, write_json
 from ...render.device import EXPECTED_DEVICE, is_device
 from ...schema import complaint, from_json, setting, to_json
 from ...worker.lock import hold_lock, lock_owner
-from ..effects.decisions import EffectDecision
+from ..effect_decisions import EffectDecision
 from ..settings import TrainingSettings
 from .identity import LATER_SETTINGS, RunIdentity
 

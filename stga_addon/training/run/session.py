@@ -18,7 +18,7 @@ from ...errors import StgaError
 from ...files import replacing
 from ...schema import to_json
 from ...selection import select_capture
-from ..effects.decisions import TRACKING
+from ..effect_decisions import TRACKING
 from ..evaluate.evaluation_views import EvaluationView, choose_evaluation_views, read_evaluation_view
 from ..evaluate.evaluator import Evaluation, Evaluator, Spent
 from ..evaluate.match_exposure import known_exposure

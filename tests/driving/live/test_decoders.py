@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stga_addon.driving import facial_mocap as mocap
 from stga_addon.driving.head_map import head_turns
-from stga_addon.driving.live import facial_mocap as mocap
 from stga_addon.driving.live import live_link_face as link
 from stga_addon.driving.live import osc, vmc
 from stga_addon.driving.names import ARKIT_SHAPES, COLUMN

@@ -16,7 +16,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 from stga_addon.export.ply import read_ply
-from stga_addon.training.effects.catalog import EFFECTS, Effect
+from stga_addon.training.effect_catalog import EFFECTS, Effect
 from stga_addon.training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
 from stga_addon.training.effects.rules import RULES, Verdict
 from stga_addon.training.optimize.trainer import Trainer

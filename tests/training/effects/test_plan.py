@@ -9,8 +9,8 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
+from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects import plan as planning
-from stga_addon.training.effects.catalog import EFFECTS
 from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
 from stga_addon.training.effects.rules import Verdict
 from stga_addon.training.run.folder import Run, read_run, write_run

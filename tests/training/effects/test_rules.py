@@ -11,9 +11,9 @@ from stga_addon.files import write_json
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
+from stga_addon.training.effect_catalog import EFFECTS, RELIGHT
+from stga_addon.training.effect_decisions import parse_choices
 from stga_addon.training.effects import rules
-from stga_addon.training.effects.catalog import EFFECTS, RELIGHT
-from stga_addon.training.effects.decisions import parse_choices
 from stga_addon.training.effects.evidence import fit_cameras, stable_colors
 from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
 from stga_addon.training.effects.plan import plan_effects

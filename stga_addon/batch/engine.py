@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from ...requests.folder import worker_arguments
-from ...worker.environment import PYTHON_VARIABLE
-from ...worker.status import WorkerSnapshot
-from ..job import Job
+from ..requests.folder import worker_arguments
+from ..worker.environment import PYTHON_VARIABLE
+from ..worker.status import WorkerSnapshot
+from .job import Job
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 
-from ..names import COLUMN, COUNT, arkit_name
+from .names import COLUMN, COUNT, arkit_name
 from .packet import FacePacket
 
 REQUEST = b"iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719"

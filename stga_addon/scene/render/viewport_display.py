@@ -15,17 +15,17 @@ from bpy.app.handlers import persistent
 
 from ...capture.color import linear_to_srgb
 from ...errors import StgaError
-from .. import tags
+from ...scene import tags
 from ..compat import world_nodes
 from ..display import splat_nodes
 from ..display.display_modes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
-from ..render.camera import viewport_camera
-from ..render.scene_splats import SplatCache, visible_layers
-from ..render.view_transform import keeps_colors
-from .front_bones import NO_BONES, front_bones
-from .packing import NEAR_M, View
-from .renderer import SplatRenderer, fastest_format
+from ..gpu.front_bones import NO_BONES, front_bones
+from ..gpu.packing import NEAR_M, View
+from ..gpu.renderer import SplatRenderer, fastest_format
+from .camera import viewport_camera
+from .scene_splats import SplatCache, visible_layers
+from .view_transform import keeps_colors
 
 ENGINE = "STGA_SPLATS"
 """The render engine, which draws all splats in *Rendered* mode."""

@@ -8,7 +8,7 @@ import numpy as np
 from ...errors import StgaError
 from ..arrays import flat_floats
 from ..display.splat_attributes import RELIT_COLOR, write_attributes
-from ..render.scene_splats import SplatCache, visible_layers
+from .scene_splats import SplatCache, visible_layers
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ...errors import StgaError
-from ...schema import complaint
-from .catalog import EFFECTS
+from ..errors import StgaError
+from ..schema import complaint
+from .effect_catalog import EFFECTS
 
 CHOICES = ("auto", "on", "off")
 TRACKING = "tracking.npz"
