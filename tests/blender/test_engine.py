@@ -242,7 +242,7 @@ def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
     found = displayed(render(tmp_path), 0.0)
     error = np.abs(found - np.clip(expected, 0, 1))
     assert error.mean() < TOLERANCE / 4
-    assert error.max() < (0.2 if device == "GPU" else 2 * TOLERANCE)  # edges of shadows
+    assert error.max() < (0.3 if device == "GPU" else 2 * TOLERANCE)  # edges of shadows
     assert np.abs(displayed(recorded, 0.0) - expected).mean() > 0.05
 
 
