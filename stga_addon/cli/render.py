@@ -27,7 +27,7 @@ COVERED = 0.0
 """Degrees of a turntable that covers what the cameras saw."""
 SAME_FIELDS = (
     "cameras", "turntable", "camera", "fps", "frames", "capture", "flame", "motion", "background", "principal_point",
-    "device", "light",
+    "device", "light", "world",
 )  # fmt: skip
 """Options that are fields of the request."""
 
@@ -74,6 +74,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     )
     parser.add_argument(
         "--light-turn", type=real_number, metavar="DEGREES", help="turn that light around the head during the video"
+    )
+    parser.add_argument(
+        "--world", action="store_true", help="put the run's world behind the avatar (train with --effect world=on)"
     )
     add_device(parser)
     parser.add_argument("--background", type=color, default="white", help="white (default), black or R,G,B in 0…1")

@@ -1,15 +1,18 @@
 """Evaluation of a finished run on a split."""
 
+from dataclasses import replace
+
 from ..avatar.file import read_avatar
 from ..errors import StgaError
+from ..export.ply import read_ply
 from ..files import write_json
 from ..progress import Progress, Report, Say
 from ..requests.results import Written
 from ..requests.values import Evaluate
 from ..training.evaluate.lpips import MIN_SIDE_PX
-from ..training.evaluate.metrics import Quality, evaluate_avatar
+from ..training.evaluate.metrics import Quality, evaluate_avatar, psnr_recorded
 from ..training.optimize.flame_refinement import with_refined_tracking
-from ..training.run.folder import AVATAR
+from ..training.run.folder import AVATAR, WORLD_FILE
 from ..training.run.open_run import open_run
 
 
@@ -24,6 +27,9 @@ def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")
     quality = evaluate_avatar(read_avatar(folder / AVATAR), capture, split, perceptual=True)
+    if (folder / WORLD_FILE).is_file():
+        world = read_ply(folder / WORLD_FILE)
+        quality = replace(quality, psnr_recorded=psnr_recorded(read_avatar(folder / AVATAR), world, capture, split))
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})
     return Written(path, (f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)))
@@ -35,6 +41,8 @@ def _details(quality: Quality) -> list[str]:
         for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region"))
         if region in quality.regions
     ]
+    if quality.psnr_recorded is not None:
+        lines.append(f"  before its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB")
     if quality.psnr_unmatched is not None:
         lines.append(f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB")
     if quality.lpips is None:

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from ..avatar.file import Avatar, read_avatar
+from ..avatar.splats import Splats
 from ..capture.camera import Camera, central_camera
 from ..capture.camera_path import covered_angles, to_and_fro, turntable
 from ..capture.model import View
@@ -27,6 +28,7 @@ from ..render.render import render_avatar, render_colors, to_uint8
 from ..render.video import sequence_writer, video_writer
 from ..requests.results import Written
 from ..requests.values import Render
+from ..training.run.folder import WORLD_FILE
 from .inputs import avatar_path, open_avatar
 from .motion import open_avatar_motion
 
@@ -160,6 +162,8 @@ def _subject(request: Render, composer: Composer) -> _Subject:
     if is_ply(request.source):
         if request.light is not None:
             raise StgaError(f"{request.source}: is a PLY, whose light is not known; --light needs an avatar")
+        if request.world:
+            raise StgaError(f"{request.source}: is a PLY; --world needs the folder of a run")
         splats = read_ply(request.source)
         return _Subject(
             lambda view, _: render_splats(splats, view.camera, request.background, composer=composer),
@@ -208,17 +212,26 @@ def _pictured(
     request: Render, avatar: Avatar, mesh: Callable[[View], np.ndarray], composer: Composer
 ) -> Callable[[View, float], np.ndarray]:
     """The picture of an avatar on the mesh of a view, as it was recorded or under the light that is asked for."""
+    behind = _world(request.source) if request.world else None
     if request.light is None:
-        return lambda view, _: render_avatar(avatar, mesh(view), view.camera, request.background, composer)
+        return lambda view, _: render_avatar(avatar, mesh(view), view.camera, request.background, composer, behind)
     relighter, lighting = Relighter(avatar), read_lighting(request.light)
 
     def picture(view: View, share: float) -> np.ndarray:
         posed = mesh(view)
         light = turned(lighting, _middle(posed), request.light_turn * share) if request.light_turn else lighting
         colors = relighter.colors(posed, view.camera.position, light)
-        return render_colors(avatar, posed, view.camera, colors, request.background, composer)
+        return render_colors(avatar, posed, view.camera, colors, request.background, composer, behind)
 
     return picture
+
+
+def _world(source: Path) -> Splats:
+    """Raises StgaError where the run of an avatar has no world."""
+    path = avatar_path(source).with_name(WORLD_FILE)
+    if not path.is_file():
+        raise StgaError(f"{path}: is missing; --world shows what a training with --effect world=on has written")
+    return read_ply(path)
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:

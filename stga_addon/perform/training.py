@@ -13,26 +13,28 @@ from ..capture.open import open_capture
 from ..capture.region import SELECTED_WEIGHT, find_region
 from ..capture.takes import first_timesteps, join_takes, require_same_head, require_same_scale
 from ..errors import StgaError
+from ..export.ply import write_ply
 from ..format import format_duration
-from ..progress import Progress, Report, Say
+from ..progress import Cancelled, Progress, Report, Say
 from ..raster.cpu.precompile import begin_compiling
 from ..render.device import choose_device
 from ..report.preset_timing import time_presets
 from ..report.run_summary import CurveUpdater, report_run
 from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
-from ..training.effect_catalog import RELIGHT
+from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.effect_decisions import TRACKING
 from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
 from ..training.optimize.flame_refinement import with_refined_tracking
 from ..training.run.continuation import continued_settings, select_for_takes
-from ..training.run.folder import AVATAR, Continuation, Run, Take, has_run, read_run
+from ..training.run.folder import AVATAR, WORLD_FILE, Continuation, Run, Take, has_run, read_run
 from ..training.run.identity import file_digest, identity_of
 from ..training.run.loop import train
 from ..training.run.open_run import OpenedRun, device_of, open_run
 from ..training.run.progress import Progress as TrainingProgress
 from ..training.run.progress import Report as TrainingReport
 from ..training.run.replay import is_faced
+from ..training.world.world_splats import world_of
 from .relighting import add_light
 
 MAX_NAMED_VIEWS = 6
@@ -88,7 +90,8 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
     avatar = prepared.train(report_training)
     # Whoever stops a training does not wait for the light; `stga relight` finds it out later.
     light = () if is_stopped else _light_of(prepared, avatar, report_light)
-    lines = [*report_run(prepared.folder), *light, f"avatar: {avatar}"]
+    world = () if is_stopped else _world_of(prepared, report_light)
+    lines = [*report_run(prepared.folder), *light, *world, f"avatar: {avatar}"]
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
     return Written(avatar, tuple(lines))
@@ -102,6 +105,19 @@ def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ..
         return add_light(avatar, with_refined_tracking(prepared.capture, prepared.folder), report=report)
     except StgaError as error:  # an avatar without it is whole
         return (f"light: not estimated ({error})",)
+
+
+def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
+    """Write what stands still behind the person into the run's folder, where its effect is on; what there is to say."""
+    if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
+        return ()
+    path, run = prepared.folder / WORLD_FILE, prepared.run
+    try:
+        splats = world_of(prepared.capture, run.settings, report)
+    except Cancelled:
+        return ("world: not made (stopped)",)
+    write_ply(path, splats)
+    return (f"world: {path} ({len(splats)} splats)",)
 
 
 def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:

@@ -240,6 +240,7 @@ class Render:
     principal_point  convention of `cameras`; None: that of the avatar
     light           environment (.hdr) or lights (.toml) that the avatar is shown in; None: as recorded
     light_turn      degrees by which that light turns around the head during a video or turntable
+    world           whether the run's world stands behind the avatar
     """
 
     source: Path
@@ -261,6 +262,7 @@ class Render:
     motion_options: MotionOptions = field(default_factory=MotionOptions)
     light: Path | None = None
     light_turn: float = setting(0.0, -36000, 36000)
+    world: bool = False
 
     @property
     def is_film(self) -> bool:

@@ -4,11 +4,12 @@ from pathlib import Path
 from typing import Any
 
 from ..avatar.file import Avatar
+from ..avatar.splats import Splats
 from ..capture.model import Capture
 from . import tags
 from .blend_file import current_scene
 from .cameras import central, configure_scene, import_cameras
-from .display.splat_object import hide_object, show_avatar
+from .display.splat_object import hide_object, show_avatar, show_world_splats
 from .objects import capture_root
 from .rig.head import import_head
 from .timeline import go_to_frame
@@ -35,3 +36,11 @@ def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     go_to_frame(head[tags.TIMESTEPS][0])
     frame_alone(head, current_scene(), fps)
     return shown
+
+
+def show_world(splats: Splats, head: Any) -> Any:
+    """Show the world's splats where the capture of the head stands, hidden until they are wanted; returns them."""
+    world = show_world_splats(splats, "World")
+    world.parent = capture_root(Path(head[tags.CAPTURE]))
+    hide_object(world, current_scene())
+    return world

@@ -25,6 +25,8 @@ class Effect:
 
 RELIGHT = "relight"
 """The light of the capture is estimated after training, so that the lights of a scene can take its place."""
+WORLD = "world"
+"""What stands still behind the person becomes splats of its own, after training."""
 _EFFECTS = (
     Effect(
         "view-color",
@@ -71,6 +73,7 @@ _EFFECTS = (
         added_later=True,
     ),
     Effect(RELIGHT, "seconds after training, and 30 bytes a vertex in the avatar file"),
+    Effect(WORLD, "seconds to a minute after training, and a file of its own"),
     Effect("teeth", "splats on 168 triangles", on={"teeth": True}, off={"teeth": False}),
     Effect("torso", "none: splats below the neck follow other triangles", on={"torso": True}, off={"torso": False}),
     Effect("neck", "9 shape keys and drivers in Blender"),

@@ -7,6 +7,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from ...avatar.strain import STRAIN_GAIN, color_range, rest_strain
+from ...capture.camera import Camera
 from ...capture.model import Capture, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.sequence import joint_angles
@@ -142,6 +143,29 @@ class CaptureFacts:
         return bool((self.samples.white[np.isnan(self.samples.foreground)] < MIN_WHITE_SHARE).any())
 
     @cached_property
+    def backdrop_spread(self) -> float | None:
+        """By how many of 255 levels what lies outside the masks differs within a sampled view and between them; None
+        where views have no mask or nothing lies outside."""
+        known = ~np.isnan(self.samples.background_spread)
+        if self.unmasked or not known.any():
+            return None
+        backgrounds = self.samples.background[known]
+        return max(
+            float(self.samples.background_spread[known].max()), float(abs(backgrounds - backgrounds.mean(0)).max())
+        )
+
+    @cached_property
+    def moving_cameras(self) -> int:
+        """How many cameras have another pose or lens in some training view than in their first."""
+        first: dict[int, Camera] = {}
+        moved = set()
+        for view in self.capture.views["train"]:
+            known = first.setdefault(view.camera_index, view.camera)
+            if known is not view.camera and not _is_same(known, view.camera):
+                moved.add(view.camera_index)
+        return len(moved)
+
+    @cached_property
     def sampled_timesteps(self) -> tuple[int, ...]:
         """At most MAX_TIMESTEPS of the tracked timesteps, evenly spread."""
         return tuple(evenly_spread(self.capture.timesteps, MAX_TIMESTEPS))
@@ -194,3 +218,8 @@ class CaptureFacts:
         """Whether the mesh has the rows of teeth that are added to FLAME's."""
         flame = self.capture.flame
         return flame is not None and len(flame.model.v_template) == TEMPLATE_VERTICES + TEETH_VERTICES
+
+
+def _is_same(one: Camera, other: Camera) -> bool:
+    names = ("width", "height", "fl_x", "fl_y", "cx", "cy", "world_to_camera")
+    return all(np.allclose(getattr(one, name), getattr(other, name), atol=1e-6) for name in names)

@@ -107,12 +107,10 @@ def background(facts: CaptureFacts) -> Verdict:
             f"{count} of {total} sampled images have no mask, and show more than white behind the head: {MESH_AS_MASK}"
         )
         return Verdict(True, reason, changes={"backdrop": "mesh"})
-    known = ~np.isnan(samples.background_spread)
-    if facts.unmasked or not known.any():
+    spread = facts.backdrop_spread
+    if spread is None:
         return Verdict(False, "not every image has a mask or transparency that shows where the head ends", fixed=True)
-    backgrounds = samples.background[known]
-    color, spread = backgrounds.mean(0), float(samples.background_spread[known].max())
-    spread = max(spread, float(abs(backgrounds - color).max()))
+    color = samples.background[~np.isnan(samples.background_spread)].mean(0)
     if spread > MAX_BACKGROUND_SPREAD_LEVELS:
         reason = f"every image has a mask; what lies outside, which varies by {spread:.0f} of 255 levels, is replaced"
         return Verdict(True, reason, changes={"backdrop": "masked"})
@@ -193,6 +191,17 @@ def relight(facts: CaptureFacts) -> Verdict:
     return Verdict(True, "the lights of a scene that has any light the avatar; elsewhere colors stay as recorded")
 
 
+def world(facts: CaptureFacts) -> Verdict:
+    spread = facts.backdrop_spread
+    if spread is None:
+        return Verdict(False, "not every image has a mask that shows where the person ends", fixed=True)
+    if spread <= MAX_BACKGROUND_SPREAD_LEVELS:
+        return Verdict(False, "what lies behind the person is of one color", fixed=True)
+    if facts.moving_cameras:
+        return Verdict(False, f"{facts.moving_cameras} of {facts.cameras} cameras move", fixed=True)
+    return Verdict(False, "kept only where it is asked for; no export has it but its own file")
+
+
 def teeth(facts: CaptureFacts) -> Verdict | None:
     if not facts.has_teeth:
         return None
@@ -255,7 +264,7 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
 
 _RULES: tuple[Rule, ...] = (
     view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection, strain_color,
-    strain_position, relight, teeth, torso, neck, jaw, eyes, dynamic_offsets, tracking,
+    strain_position, relight, world, teeth, torso, neck, jaw, eyes, dynamic_offsets, tracking,
 )  # fmt: skip
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
 """Effect -> its rule, a function of that name."""

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ...avatar.file import Avatar
+from ...avatar.splats import Splats
+from ...capture.images import read_image
 from ...capture.model import Capture, View
 from ...render.render import render_avatar
 from ..optimize.losses import mean_ssim
@@ -28,6 +30,7 @@ class Quality:
     detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
                        None for a region
     psnr_unmatched     PSNR without fitting the exposure of views; None where none was fitted
+    psnr_recorded      of the avatar before its world, against whole images as recorded; None where it has no world
     """
 
     psnr: float
@@ -36,6 +39,7 @@ class Quality:
     regions: Mapping[str, "Quality"] = field(default_factory=dict)
     detail_difference: float | None = None
     psnr_unmatched: float | None = None
+    psnr_recorded: float | None = None
 
     def as_json(self) -> dict[str, float]:
         """Flat: "psnr", "ssim", "psnr_mask" and so on, without what was not measured."""
@@ -100,6 +104,18 @@ def evaluate_avatar(
         perceptual,
         exposure,
     )
+
+
+def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -> float:
+    """Mean PSNR in dB of the avatar before its world, in all views of a split, against images as recorded."""
+    known = known_exposure(avatar.settings.get("exposure") or (), capture.views.get("train", ()))
+    found = []
+    for view in capture.views[split]:
+        mesh = np.asarray(capture.mesh(view.timestep))
+        image = render_avatar(avatar, mesh, view.camera, avatar.background, behind=world)
+        target = read_image(view)
+        found.append(psnr(exposed_rendering(image, target, known.get(view.camera_index))[0], target))
+    return float(np.mean(found))
 
 
 def psnr(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:

@@ -8,6 +8,7 @@ strain_range.npz  strain that colors and positions follow; only where they do, a
 tracking.npz    refined FLAME parameters, those that avatar.npz was trained with
 metrics.jsonl   one line per evaluation
 residuals.npz   of a finished run: error of the avatar on each triangle
+world.ply       what stands still behind the person, in world space; only where the effect `world` is on
 """
 
 import re
@@ -30,6 +31,7 @@ FORMAT, VERSION = "stga-run", 5
 OLDEST_VERSION = 4
 """Read as well: LATER_SETTINGS are all that it lacks."""
 RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
+WORLD_FILE = "world.ply"
 
 
 @dataclass(frozen=True)

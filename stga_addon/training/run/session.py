@@ -31,7 +31,7 @@ from ..schedule import image_scale, view_order
 from ..settings import TrainingSettings
 from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
 from .continuation import continued_evaluation_views, starting_state
-from .folder import AVATAR, CHECKPOINT, RUN, Run, read_run, write_run
+from .folder import AVATAR, CHECKPOINT, RUN, WORLD_FILE, Run, read_run, write_run
 from .metrics_log import METRICS, cut_metrics, read_metrics
 from .progress import Progress, Report
 from .replay import continued_order
@@ -196,7 +196,7 @@ def begin_session(
     if continuation is not None:
         state = starting_state(continuation, settings, len(capture.faces))
         _check_state(folder, capture, settings, state)
-    for stale in (TRACKING, CHECKPOINT, METRICS, STRAIN_RANGE):  # of a run whose run.json was removed
+    for stale in (TRACKING, CHECKPOINT, METRICS, STRAIN_RANGE, WORLD_FILE):  # of a run whose run.json was removed
         (folder / stale).unlink(missing_ok=True)
     strain_range = _strain_range(folder, capture, run, report)
     trainer = Trainer(capture, settings, selection, state, run.device, strain_range)

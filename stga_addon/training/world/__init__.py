@@ -1,0 +1,1 @@
+"""World: what stands still behind the person, as splats of its own."""

@@ -1,0 +1,90 @@
+"""Clean plates: what each camera would show without the person, from all timesteps together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...capture.camera import Camera
+from ...capture.images import read_image, read_mask
+from ...capture.model import Capture, View, evenly_spread
+from ..optimize.exposure import Correction
+
+MAX_PLATE_VIEWS = 24
+"""Views of a camera that its plate is the median of."""
+MATTE_MARGIN_SHARE = 0.008
+"""Around the person nothing is taken from a view, where a matte is uncertain; share of the image's height."""
+PERSON = 256
+"""Above every level of a pixel: sorts behind them."""
+
+
+@dataclass(frozen=True)
+class CleanPlate:
+    """A camera, and what it shows without the person.
+
+    image  (H, W, 3) float32 in 0…1
+    seen   (H, W) bool: pixels that some view shows; the others are filled from around
+    """
+
+    camera: Camera
+    image: np.ndarray
+    seen: np.ndarray
+
+
+def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
+    """The plate of each camera that has masks, of the training views.
+
+    correct: the exposure of images. Raises StgaError where a file cannot be read.
+    """
+    by_camera: dict[int, list[View]] = {}
+    for view in capture.views.get("train", ()):
+        if view.mask is not None:
+            by_camera.setdefault(view.camera_index, []).append(view)
+    return [_plate(evenly_spread(views, MAX_PLATE_VIEWS), correct) for _, views in sorted(by_camera.items())]
+
+
+def _plate(views: Sequence[View], correct: Correction | None) -> CleanPlate:
+    stack = []
+    for view in views:
+        image, mask = read_image(view), read_mask(view)
+        if correct is not None:
+            image = correct(view, image, None)
+        assert mask is not None
+        stack.append(np.where(_grown(mask > 0)[..., None], PERSON, image).astype(np.uint16))
+    levels = np.sort(np.stack(stack, axis=-1), axis=-1)
+    count = (levels[:, :, 0] < PERSON).sum(axis=-1)
+    middle = np.maximum(count - 1, 0)[..., None, None] // 2
+    image = np.take_along_axis(levels, np.broadcast_to(middle, (*count.shape, 3, 1)), axis=-1)[..., 0]
+    seen = count > 0
+    return CleanPlate(views[0].camera, filled(image.astype(np.float32) / 255, seen), seen)
+
+
+def _grown(person: np.ndarray) -> np.ndarray:
+    from scipy.ndimage import binary_dilation
+
+    return np.asarray(binary_dilation(person, iterations=max(1, round(MATTE_MARGIN_SHARE * len(person)))))
+
+
+def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3) float32 with smooth colors where it is not `seen` (H, W) bool.
+
+    Push and pull: pixels without a color get that of the image at half the size, whose pixels are the means of those
+    that have one.
+    """
+    if seen.all() or not seen.any():
+        return image
+    height, width = seen.shape
+    weighted = np.zeros((height + height % 2, width + width % 2, 4), np.float32)
+    weighted[:height, :width, :3], weighted[:height, :width, 3] = image * seen[..., None], seen
+    half = weighted.reshape(len(weighted) // 2, 2, -1, 2, 4).mean(axis=(1, 3))
+    known = half[..., 3] > 0
+    smaller = filled(half[..., :3] / np.maximum(half[..., 3:], 1e-6), known)
+    larger = _twice(smaller)[:height, :width]
+    return np.where(seen[..., None], image, larger)
+
+
+def _twice(image: np.ndarray) -> np.ndarray:
+    """The image at twice the size, interpolated linearly."""
+    from scipy.ndimage import zoom
+
+    return np.asarray(zoom(image, (2, 2, 1), order=1, mode="nearest", grid_mode=True))
