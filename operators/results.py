@@ -15,6 +15,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.folder import read_request, read_result
 from ..stga_addon.requests.monitor_state import Kind, RequestState, Shown, SliceBuilt
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
 from ..stga_addon.scene.display.splat_object import (
     build_next_node_group,
@@ -74,6 +75,8 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
         answer = _present(scene, state, *loaded)
         if isinstance(answer, SliceBuilt):
             ended.pop_all()
+        elif state.subject is not None:
+            show_world(state.subject / AVATAR, _head(scene, state))
     return answer
 
 

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
+from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display.hints import use_transparent_bounces
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes
 from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
@@ -36,6 +37,7 @@ class ShowAvatar(bpy.types.Operator, FileImport):
         path, head = file_path(self.filepath, "avatar"), head_of(context)
         avatar = read_avatar(path)
         show(context.scene, avatar, head, f"{head.name} {path.stem}", self.hide_head)
+        show_world(path, head)
         scene_settings(context).avatar = self.filepath
         if self.hide_head and head.library is not None:
             self.report({"WARNING"}, f"{head.name}: is linked, and covers the splats in renders; hide it in its file")

@@ -16,7 +16,7 @@ from ..errors import StgaError, shorten
 from ..files import read_json, write_json
 from ..format import format_duration
 from ..requests.open_head import OpenHead
-from ..training.run.folder import AVATAR, WORLD_FILE, has_run
+from ..training.run.folder import AVATAR, has_run
 from .arguments import usable_path
 from .carry_out import carry_out
 from .track import add_footage, tracking_request
@@ -149,7 +149,6 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     from ..avatar.file import read_avatar
     from ..capture.open import open_capture
     from ..export.playback import playback_fps
-    from ..export.ply import read_ply
     from ..scene.avatar_scene import set_up_head, show_on_head, show_world
     from ..scene.blend_file import empty_file, save_file
     from ..tracking.folder import is_flame
@@ -160,8 +159,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     empty_file()
     head = set_up_head(refine(capture), flame)
     show_on_head(avatar, head, f"//{RUN}/{AVATAR}", playback_fps(capture, numbered=True))
-    if (out / RUN / WORLD_FILE).is_file():
-        show_world(read_ply(out / RUN / WORLD_FILE), head)
+    show_world(out / RUN / AVATAR, head)
     finish(head)
     save_file(out / BLEND)
     return Path(out / BLEND)

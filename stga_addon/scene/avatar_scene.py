@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from ..avatar.file import Avatar
-from ..avatar.splats import Splats
 from ..capture.model import Capture
+from ..export.ply import read_ply
+from ..training.run.folder import WORLD_FILE
 from . import tags
 from .blend_file import current_scene
 from .cameras import central, configure_scene, import_cameras
@@ -14,6 +15,8 @@ from .objects import capture_root
 from .rig.head import import_head
 from .timeline import go_to_frame
 from .viewports import frame_alone
+
+WORLD_NAME = "World splats"
 
 
 def set_up_head(capture: Capture, flame: Path | None) -> Any:
@@ -38,9 +41,17 @@ def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     return shown
 
 
-def show_world(splats: Splats, head: Any) -> Any:
-    """Show the world's splats where the capture of the head stands, hidden until they are wanted; returns them."""
-    world = show_world_splats(splats, "World")
-    world.parent = capture_root(Path(head[tags.CAPTURE]))
+def show_world(avatar_file: Path, head: Any) -> Any:
+    """Show the splats of the world that lie beside an avatar file, where the head's capture stands: hidden until they
+    are wanted. Returns them; None where there are none, or the scene has them already. Raises StgaError."""
+    path = avatar_file.with_name(WORLD_FILE).resolve()
+    if not path.is_file() or any(thing.get(tags.WORLD) == str(path) for thing in current_scene().objects):
+        return None
+    world = show_world_splats(read_ply(path), WORLD_NAME)
+    world.parent = head.parent
+    world.matrix_parent_inverse = head.matrix_parent_inverse
+    world[tags.WORLD] = str(path)
+    for layer in current_scene().view_layers:
+        layer.update()  # which an object that was just made is not in yet
     hide_object(world, current_scene())
     return world

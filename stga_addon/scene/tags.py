@@ -22,6 +22,7 @@ ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antial
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
 AVATAR = "stga_avatar"  # on splats that were made without the panel: the avatar's file
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
+WORLD = "stga_world"  # on splats of a run's world: their file
 
 # Kinds of object.
 ROOT, HEAD, RIG, CAMERA, SPLATS = "root", "head", "rig", "camera", "splats"

@@ -9,6 +9,7 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
 from mathutils import Vector  # noqa: E402
 
+from stga_addon.export.ply import write_ply  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.display.display_modes import AS_TRAINED, ELLIPSOIDS, LIMITS, POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
@@ -44,6 +45,21 @@ def test_viewports_look_at_the_head(head):
         assert 0.5 * size < region.view_distance < 5 * size
         expected = np.array(bpy.context.scene.camera.matrix_world.to_3x3().normalized())
         np.testing.assert_allclose(np.array(region.view_rotation.to_matrix()), expected, atol=1e-5)
+
+
+def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
+    """Catches a wall that covers the scene or lies on its side, and a second one each time the avatar is shown."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    write_ply(tmp_path / "world.ply", avatar.splats)
+    for _ in range(2):
+        bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    (world,) = [thing for thing in bpy.data.objects if thing.get(tags.WORLD)]
+    head = bpy.context.scene.stga.head
+    bpy.context.view_layer.update()
+    assert (world.hide_get(), world.hide_render, bpy.context.scene.stga.splats is not world) == (True, True, True)
+    np.testing.assert_allclose(np.array(world.matrix_world), np.array(head.matrix_world), atol=1e-6)
+    assert len(world.data.vertices) == len(avatar.splats)
 
 
 @pytest.mark.parametrize("moved", [False, True])

@@ -148,6 +148,24 @@ def test_a_room_behind_the_head(painted):
     assert "varies by 40 of 255 levels, is replaced" in verdict.reason
 
 
+def test_a_world_is_kept_where_it_is_asked_for(painted):
+    """Catches splats of a wall that nobody asked for, and a world that is told from a camera that moves."""
+    facts = CaptureFacts(painted(), make_settings(iterations=1))
+    assert rules.world(facts).fixed
+    varied = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
+    assert rules.world(CaptureFacts(painted(masks=False), make_settings(iterations=1))).fixed
+    facts = CaptureFacts(facts.capture, facts.settings)
+    facts.samples = varied
+    assert (rules.world(facts).on, rules.world(facts).fixed) == (False, False)
+    first, *rest = facts.capture.views["train"]
+    pose = first.camera.world_to_camera.copy()
+    pose[0, 3] += 0.001
+    again = replace(first, camera=replace(first.camera, world_to_camera=pose), timestep=first.timestep + 1)
+    moved = CaptureFacts(replace(facts.capture, views={"train": (first, *rest, again)}), facts.settings)
+    moved.samples = varied
+    assert (rules.world(moved).fixed, rules.world(moved).reason[:9]) == (True, "1 of 8 ca")
+
+
 def test_a_room_without_masks(painted):
     """Catches a run that makes splats of the wall behind the head, or that does not say what it leaves out."""
     capture = painted(masks=False, background=(90, 110, 70))

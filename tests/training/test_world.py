@@ -1,0 +1,132 @@
+"""What stands still behind a person: clean plates, splats that show them, and what is rendered and measured so."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture import factory
+from cli.test_cli import refused
+from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
+from stga_addon.render.render import render
+from stga_addon.training.world.clean_plates import CleanPlate, clean_plates
+from stga_addon.training.world.world_splats import shell_radius, trained_on
+
+WALL_M = 1.0
+"""Behind the person, who is at the origin."""
+
+
+def wall(camera: Camera, texture: np.ndarray) -> np.ndarray:
+    """(H, W, 3): what a camera sees of a textured wall at z = −WALL_M, one texel to a centimeter, by its rays."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    origin = camera.position
+    toward = camera.unproject(np.stack([x.ravel(), y.ravel()], 1) + 0.5, np.ones(x.size)) - origin
+    at = origin + (-WALL_M - origin[2]) / toward[:, 2:] * toward
+    texel = 100 * at[:, [1, 0]].T + 256
+    colors = [map_coordinates(channel, texel, order=1, mode="wrap") for channel in texture.T]
+    return np.stack(colors, 1).reshape(camera.height, camera.width, 3).astype(np.float32)
+
+
+def camera_at(degrees: float) -> Camera:
+    angle = np.radians(degrees)
+    eye = (1.1 * np.sin(angle), 0.05, 1.1 * np.cos(angle))
+    return look_at(eye, (0, 0, 0), width=120, height=160, focal_length=280)
+
+
+def plates_of(texture: np.ndarray) -> list[CleanPlate]:
+    cameras = [camera_at(degrees) for degrees in (-24, -8, 8, 24)]
+    return [CleanPlate(camera, wall(camera, texture), np.ones((160, 120), bool)) for camera in cameras]
+
+
+def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
+    """Catches a wall at a wrong distance, and splats that show it from the cameras of the plates alone."""
+    noise = np.random.default_rng(0).random((512, 512, 3))
+    texture = gaussian_filter(noise, (4, 4, 0), mode="wrap")
+    texture = (texture - texture.min()) / (texture.max() - texture.min())
+    plates, center = plates_of(texture), np.zeros(3)
+    assert shell_radius(plates, center) == pytest.approx(WALL_M, rel=0.1)
+    splats = trained_on(plates, center)
+    for camera, least in ((plates[0].camera, 27.0), (camera_at(0), 24.0)):
+        error = render(splats, camera).transpose(1, 2, 0) - wall(camera, texture)
+        assert -10 * np.log10((error**2).mean()) > least
+
+
+def test_a_wall_of_one_color() -> None:
+    """Catches a distance that is read from noise, and a wall that is darker between its splats or at its border."""
+    plates = plates_of(np.full((512, 512, 3), 0.6))
+    assert shell_radius(plates, np.zeros(3)) == pytest.approx(3 * 1.1, rel=0.01)
+    for plate in plates:
+        assert abs(render(trained_on(plates, np.zeros(3)), plate.camera) - 0.6).max() < 0.02
+
+
+STRIPES = (np.array([110, 90, 150]) + 50 * np.cos(np.arange(factory.WIDTH)[None, :, None] / 3)).round().astype(np.uint8)
+"""(1, W, 3): what stands behind the ball, the same for every camera."""
+
+
+@pytest.fixture(scope="module")
+def walled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy's capture, its ball before stripes."""
+    root = factory.write_mesh_capture(tmp_path_factory.mktemp("walled"), (0, 1, 3, 4), range(4))
+    inside = factory.silhouette()[..., None]
+    for path in (root / "images").iterdir():
+        image = np.asarray(Image.open(path).convert("RGB"))
+        Image.fromarray(np.where(inside, image, STRIPES)).save(path)
+    return root
+
+
+EFFECTS = ("--effect", "world=on", "--effect", "exposure=off")
+
+
+@pytest.fixture(scope="module")
+def run(walled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "run"
+    assert main(["train", str(walled), "--out", str(folder), "--iterations", "60", *EFFECTS]) == 0
+    return folder
+
+
+def test_plates_without_the_person(walled: Path) -> None:
+    """Catches a person who remains in a plate, a wall that is blurred, and holes without a color."""
+    for plate in clean_plates(open_capture(walled)):
+        stripes = np.broadcast_to(STRIPES, plate.image.shape) / 255
+        assert 0.3 < plate.seen.mean() < 1
+        assert not plate.seen[factory.silhouette()].any()
+        np.testing.assert_allclose(plate.image[plate.seen], stripes[plate.seen], atol=1e-6)
+        hidden = plate.image[~plate.seen]
+        assert (hidden >= stripes.min((0, 1)) - 1e-6).all()
+        assert (hidden <= stripes.max((0, 1)) + 1e-6).all()
+
+
+def test_measured_with_the_world(walled: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches figures of matted images that are called those of whole ones: the same from `stga render --world`."""
+    assert main(["eval", str(run), "--split", "train"]) == 0
+    assert "before its world, against whole images as recorded" in capsys.readouterr().out
+    found = json.loads((run / "quality_train.json").read_text())["psnr_recorded"]
+    cameras = walled / "transforms_train.json"
+    assert main(["render", str(run), "--world", "--cameras", str(cameras), "--out", str(run / "pictures")]) == 0
+    errors = []
+    for view in open_capture(walled).views["train"]:
+        rendered, recorded = (
+            np.asarray(Image.open(path).convert("RGB")) / 255
+            for path in (run / "pictures" / Path(view.name).name, view.image)
+        )
+        errors.append(-10 * np.log10(((rendered - recorded) ** 2).mean()))
+    assert found == pytest.approx(np.mean(errors), abs=0.05)
+    assert found > 18
+
+
+def test_no_world(walled: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a traceback where there is no world, and one that is asked for where nothing tells it apart."""
+    avatar, cameras = tmp_path / "avatar.npz", walled / "transforms_test.json"
+    avatar.write_bytes((run / "avatar.npz").read_bytes())
+    asked = ("--world", "--capture", walled, "--cameras", cameras, "--out", tmp_path / "out")
+    assert "world.ply: is missing; --world shows what a training with --effect world=on" in refused(
+        capsys, "render", avatar, *asked
+    )
+    plain = factory.write_mesh_capture(tmp_path / "plain", (0, 1), range(3))
+    told = refused(capsys, "train", plain, "--out", tmp_path / "run", "--iterations", "1", *EFFECTS)
+    assert "world=on: is not possible, because what lies behind the person is of one color" in told
