@@ -14,7 +14,9 @@ T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ("__init__.py", "operators", "ui", "stga_addon")
 SOURCES = tuple(
-    path for name in SHIPPED for path in ([ROOT / name] if name.endswith(".py") else sorted((ROOT / name).rglob("*.py")))
+    path
+    for name in SHIPPED
+    for path in ([ROOT / name] if name.endswith(".py") else sorted((ROOT / name).rglob("*.py")))
 )
 MODULE_NAME = re.compile(r"(?:(\.+)|stga_addon\.)([a-z_]\w*(?:\.[a-z_]\w*)*)", re.ASCII)
 """A string that may name a module, relative or absolute."""
