@@ -56,7 +56,7 @@ def test_killed_workers_resume_to_the_same_bits(
 ) -> None:
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
-    seeds, iterations = max(2, KILLS // 3), max(ITERATIONS, 80 * KILLS)
+    seeds, iterations = max(1, KILLS // 3), max(ITERATIONS, 80 * KILLS)
     whole, plan = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
     ended, killed, resumable = threading.Event(), list[str](), list[str]()
     thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
