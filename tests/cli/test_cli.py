@@ -599,19 +599,6 @@ def test_as_a_module(root: Path, trained: Path, tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith(f"stga: {trained}: already holds a run")
     assert "Traceback" not in done.stderr
-    assert stga("train", root).returncode == 2
-    assert stga().returncode == 2
-
-
-def test_training_as_a_module(root: Path, tmp_path: Path) -> None:
-    """Catches a progress bar that breaks without a terminal, and output that hides where the avatar is."""
-    out = tmp_path / "run"
-    done = stga("train", root, "--out", out, "--iterations", 4, "--strategy", "gaussian-avatars")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == f"avatar: {out / 'avatar.npz'}"
-    assert "100%" in done.stderr
-    assert "PSNR" in done.stderr
-    assert len(read_avatar(out / "avatar.npz").splats) == 320
 
 
 @pytest.mark.parametrize("content", ["{}", "[]", "null", "3", '{"capture": 5}', "{", None])

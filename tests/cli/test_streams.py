@@ -80,7 +80,8 @@ def test_closed_descriptors(capture: Path, tmp_path: Path) -> None:
 
 
 def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path) -> None:
-    """Catches a traceback, another exit code than 130 and a lost checkpoint after Ctrl-C."""
+    """Catches a progress bar that breaks without a terminal, and a traceback or another exit code than 130 after
+    Ctrl-C."""
     out = tmp_path / "run"
     command = [sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out), "--budget", "60s"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -92,4 +93,5 @@ def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path)
     error = process.communicate(timeout=60)[1]
     assert process.returncode == 130, error
     assert error.splitlines()[-1] == "stga: interrupted"
+    assert "Compiling kernels:" in error
     assert "Traceback" not in error
