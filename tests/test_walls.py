@@ -21,7 +21,10 @@ SOURCES = tuple(
 MODULE_NAME = re.compile(r"(?:(\.+)|stga_addon\.)([a-z_]\w*(?:\.[a-z_]\w*)*)", re.ASCII)
 """A string that may name a module, relative or absolute."""
 BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
+BLENDERS = ("stga_addon/scene/", "stga_addon/development/demo/studio.py", "operators/", "ui/")
+"""Where Blender's modules are imported."""
 HEAVY = {"torch", "numba", "wgpu"}
+TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/flame/forward_torch.py")
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},
@@ -142,31 +145,13 @@ def test_the_walls_are_looked_at():
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_bpy_only_where_blender_is(path):
-    """Catches an engine that can no longer run, or be tested, outside Blender."""
-    if (
-        name_of(path).startswith(("stga_addon/scene/", "stga_addon/development/demo/studio.py", "operators/", "ui/"))
-        or path == ROOT / "__init__.py"
-    ):
-        return
-    assert not {module.split(".")[0] for module, level in imports(path) if level == 0} & BLENDER
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_torch_and_numba_only_where_training_is(path):
-    """Catches an extension that needs PyTorch to be enabled, or to import and show."""
-    if name_of(path).startswith(("stga_addon/raster/", "stga_addon/training/")):
-        return
-    if name_of(path) == "stga_addon/flame/forward_torch.py":
-        return
-    assert not {module.split(".")[0] for module, _ in imports(path)} & HEAVY
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_own_modules_by_relative_import(path):
-    """Catches `import stga_addon…`, which is not there once Blender installs the extension as bl_ext.….stga."""
+def test_packages_are_imported_only_where_they_may_be(path):
+    """Catches an engine that cannot run or be tested outside Blender, an extension that needs PyTorch to be enabled, to
+    import and to show, and `import stga_addon…`, which is not there once Blender installs it as bl_ext.….stga."""
     absolute = {module.split(".")[0] for module, level in imports(path) if level == 0}
     assert not absolute & {"stga_addon", "operators", "ui", "stga"}
+    assert path == ROOT / "__init__.py" or name_of(path).startswith(BLENDERS) or not absolute & BLENDER
+    assert name_of(path).startswith(TRAININGS) or not {module.split(".")[0] for module, _ in imports(path)} & HEAVY
 
 
 @pytest.mark.parametrize("path", [p for p in SOURCES if p.is_relative_to(ROOT / "stga_addon")], ids=name_of)

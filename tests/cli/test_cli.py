@@ -252,13 +252,6 @@ def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
     assert np.linalg.norm(read_ply(tmp_path / "None.ply").xyz, axis=1).mean() == pytest.approx(0.1, abs=0.01)
 
 
-def test_export_a_neutral_ply_without_capture(trained: Path, tmp_path: Path) -> None:
-    """Catches a capture being asked for where none is needed."""
-    out = tmp_path / "a.ply"
-    assert main(["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(out)]) == 0
-    assert len(read_ply(out)) == len(read_avatar(trained / "avatar.npz").splats)
-
-
 def test_export_a_sequence(trained: Path, tmp_path: Path) -> None:
     """Catches frames numbered from zero instead of by their timestep."""
     assert main(["export", str(trained), "--format", "ply-sequence", "--out", str(tmp_path / "s")]) == 0
@@ -543,13 +536,15 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_bare_blender_python_selects_and_exports(trained: Path, tmp_path: Path) -> None:
-    """Catches an import by which `select` and `export` need more than the numpy of Blender's own Python."""
+    """Catches an import by which `select` and `export` need more than the numpy of Blender's own Python, and a capture
+    that is asked for where none is needed."""
     root, model = factory.write_flame_capture(tmp_path / "flame")
     exported = ["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(tmp_path / "a.ply")]
     for arguments in (["--help"], ["select", str(root), "--flame", str(model)], exported):
         command = [sys.executable, "-c", WITH_NUMPY_ALONE, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
         assert (done.returncode, done.stderr) == (0, "")
+    assert len(read_ply(tmp_path / "a.ply")) == len(read_avatar(trained / "avatar.npz").splats)
 
 
 def test_interruption_and_mistakes_have_their_codes(
