@@ -4,7 +4,9 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
+from zlib import crc32
 
 # Before OpenMP is loaded: its threads wait in a loop, and in tests, which run one per core, they would take the time of
 # another test. Kernels have threads of their own (`raster/cpu/threads.py`), which sleep.
@@ -29,6 +31,35 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], FileLock]
     return lambda name: FileLock(common / f"{name}.lock")
 
 
+BITS = """
+import contextlib, runpy
+with open(os.environ["NUMBA_CACHE_DIR"] + "/bits.txt", "w") as file, contextlib.redirect_stdout(file):
+    runpy.run_path({!r})
+"""
+
+
+@pytest.fixture(scope="session")
+def kernel_bundle(alone: Callable[[str], FileLock], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Folder of all kernels as the complete edition brings them, and what raster/kernel_bits.py printed where they were
+    compiled, in one process, which takes half a minute. build/kernels keeps both until a kernel changes."""
+    from stga_addon.development import compiled_kernels
+    from stga_addon.development.wheels import Target, this_platform
+
+    script = Path(__file__).with_name("raster") / "kernel_bits.py"
+    target = Target(this_platform(), "{}.{}".format(*sys.version_info[:2]), ("4.2.0", ""))
+    wheels = tmp_path_factory.mktemp("wheels")
+    (wheels / f"numba-{version('numba')}-tests{crc32(script.read_bytes())}").touch()
+    changed = compiled_kernels.SCRIPT.replace("from", "os.cpu_count = lambda: 1\nfrom", 1)
+    changed = changed.replace("print(", BITS.format(str(script)) + "print(")
+    with alone("kernels"), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled_kernels, "SCRIPT", changed)
+        kernels = compiled_kernels.compile_kernels(target, wheels)
+    if not kernels:
+        pytest.skip("no edition brings kernels for this platform")
+    folder = kernels[0].parents[1]
+    return folder, (folder / "bits.txt").read_text()
+
+
 @pytest.fixture(scope="session")
 def toy_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball of 10 cm, of one color per view: timesteps 0, 1, 3, 4 (the last one `test`), cameras 0 to 3 (the last one
@@ -43,15 +74,15 @@ def toy(toy_root: Path) -> Capture:
 
 @pytest.fixture(scope="session")
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """footage/ of the demo's head in gray, head.npz and its exact landmarks points/; for tests that only read it."""
+    """footage/ of the demo's head, head.npz and its exact landmarks points/, for tests that only read it; in black, so
+    that landmarks alone are tracked, in a third of the time."""
     from tracking.test_track import record
 
     from stga_addon.development.demo.head import synthetic_flame
     from stga_addon.tracking.head_model import HeadModel
-    from stga_addon.tracking.mesh_image import shaded_image
 
-    folder, head = tmp_path_factory.mktemp("take"), HeadModel(synthetic_flame(0), "flame")
-    record(folder, head, lambda mesh, camera: shaded_image(mesh, head.model.faces, camera))
+    folder = tmp_path_factory.mktemp("take")
+    record(folder, HeadModel(synthetic_flame(0), "flame"))
     return folder
 
 

@@ -4,7 +4,7 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,13 +13,18 @@ import pytest
 T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ("__init__.py", "operators", "ui", "stga_addon")
-SOURCES = sorted(
-    path for name in SHIPPED for path in ([ROOT / name] if name.endswith(".py") else (ROOT / name).rglob("*.py"))
+SOURCES = tuple(
+    path
+    for name in SHIPPED
+    for path in ([ROOT / name] if name.endswith(".py") else sorted((ROOT / name).rglob("*.py")))
 )
 MODULE_NAME = re.compile(r"(?:(\.+)|stga_addon\.)([a-z_]\w*(?:\.[a-z_]\w*)*)", re.ASCII)
 """A string that may name a module, relative or absolute."""
 BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
+BLENDERS = ("stga_addon/scene/", "stga_addon/development/demo/studio.py", "operators/", "ui/")
+"""Where Blender's modules are imported."""
 HEAVY = {"torch", "numba", "wgpu"}
+TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/flame/forward_torch.py")
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},
@@ -64,19 +69,24 @@ def name_of(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def imports(path: Path) -> Iterator[tuple[str, int]]:
+@cache
+def imports(path: Path) -> tuple[tuple[str, int], ...]:
     """(dotted module, level) of every import, at the top or inside a function; `from x import y` gives x.y."""
+    found: list[tuple[str, int]] = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, 0) for alias in node.names)
+            found += ((alias.name, 0) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             prefix = f"{node.module}." if node.module else ""
-            yield from ((prefix + alias.name, node.level) for alias in node.names)
+            found += ((prefix + alias.name, node.level) for alias in node.names)
+    return tuple(found)
 
 
-def imports_by_name(path: Path) -> Iterator[tuple[str, int]]:
+@cache
+def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
     """The same for every string that is the name of a module, whatever reads it: `import_module`, `find_spec`, a table
     of them, or another Python after `-m`."""
+    named: list[tuple[str, int]] = []
     depth = len(path.relative_to(ROOT).parts)
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         text = node.value if isinstance(node, ast.Constant) else None
@@ -86,7 +96,8 @@ def imports_by_name(path: Path) -> Iterator[tuple[str, int]]:
         module, level = (found[2], len(found[1])) if found[1] else (f"stga_addon.{found[2]}", depth)
         if level <= depth and module_file(path.parents[level - 1].joinpath(*module.split("."))):
             inside = level == depth and path.is_relative_to(ROOT / "stga_addon")  # has no name for the folder above
-            yield (module.removeprefix("stga_addon."), level - 1) if inside else (module, level)
+            named.append((module.removeprefix("stga_addon."), level - 1) if inside else (module, level))
+    return tuple(named)
 
 
 def module_file(path: Path) -> Path | None:
@@ -102,7 +113,8 @@ def imported_file(path: Path, module: str, level: int) -> Path | None:
     return module_file(target) or module_file(target.parent)
 
 
-def import_graph() -> dict[Path, set[Path]]:
+@cache
+def import_graph(sources: tuple[Path, ...]) -> dict[Path, set[Path]]:
     """File -> the other files that it imports."""
     return {
         path: {
@@ -110,7 +122,7 @@ def import_graph() -> dict[Path, set[Path]]:
             for each in (*imports(path), *imports_by_name(path))
             if (found := imported_file(path, *each)) not in (None, path)
         }
-        for path in SOURCES
+        for path in sources
     }
 
 
@@ -133,31 +145,13 @@ def test_the_walls_are_looked_at():
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_bpy_only_where_blender_is(path):
-    """Catches an engine that can no longer run, or be tested, outside Blender."""
-    if (
-        name_of(path).startswith(("stga_addon/scene/", "stga_addon/development/demo/studio.py", "operators/", "ui/"))
-        or path == ROOT / "__init__.py"
-    ):
-        return
-    assert not {module.split(".")[0] for module, level in imports(path) if level == 0} & BLENDER
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_torch_and_numba_only_where_training_is(path):
-    """Catches an extension that needs PyTorch to be enabled, or to import and show."""
-    if name_of(path).startswith(("stga_addon/raster/", "stga_addon/training/")):
-        return
-    if name_of(path) == "stga_addon/flame/forward_torch.py":
-        return
-    assert not {module.split(".")[0] for module, _ in imports(path)} & HEAVY
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_own_modules_by_relative_import(path):
-    """Catches `import stga_addon…`, which is not there once Blender installs the extension as bl_ext.….stga."""
+def test_packages_are_imported_only_where_they_may_be(path):
+    """Catches an engine that cannot run or be tested outside Blender, an extension that needs PyTorch to be enabled, to
+    import and to show, and `import stga_addon…`, which is not there once Blender installs it as bl_ext.….stga."""
     absolute = {module.split(".")[0] for module, level in imports(path) if level == 0}
     assert not absolute & {"stga_addon", "operators", "ui", "stga"}
+    assert path == ROOT / "__init__.py" or name_of(path).startswith(BLENDERS) or not absolute & BLENDER
+    assert name_of(path).startswith(TRAININGS) or not {module.split(".")[0] for module, _ in imports(path)} & HEAVY
 
 
 @pytest.mark.parametrize("path", [p for p in SOURCES if p.is_relative_to(ROOT / "stga_addon")], ids=name_of)
@@ -180,7 +174,7 @@ def test_imports_run_one_way(path):
 
 def test_no_file_imports_itself_by_way_of_others():
     """Catches circles inside a room, those of types only, and those through modules that are loaded by name."""
-    graph = import_graph()
+    graph = import_graph(SOURCES)
     assert not [name_of(path) for path in SOURCES if path in reached(graph, path)]
 
 
@@ -189,7 +183,7 @@ def test_no_part_of_a_room_imports_itself_by_way_of_others(room):
     """Catches two folders, or a folder and a file beside it, that need each other though no two of their files do."""
     inside = {path: path.relative_to(room).parts[0] for path in SOURCES if path.is_relative_to(room)}
     parts: dict[str, set[str]] = {part: set() for part in inside.values()}
-    for path, others in import_graph().items():
+    for path, others in import_graph(SOURCES).items():
         if path in inside:
             parts[inside[path]] |= {inside[other] for other in others if other in inside} - {inside[path]}
     assert not [part for part in parts if part in reached(parts, part)]
@@ -217,8 +211,7 @@ def test_every_way_to_import_is_seen(source, target, tmp_path, monkeypatch):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(source if path.name == "a.py" else "NAME = '.npz', 'stga_addon.none', '..c.none'\n")
     monkeypatch.setitem(globals(), "ROOT", tmp_path)
-    monkeypatch.setitem(globals(), "SOURCES", files)
-    graph = import_graph()
+    graph = dict(import_graph(tuple(files)))
     assert graph.pop(files[0]) == {tmp_path / "stga_addon" / target}
     assert not any(graph.values())
 

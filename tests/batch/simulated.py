@@ -1,4 +1,4 @@
-"""An engine that does no work, and batches of jobs that ask for none."""
+"""An engine that does no work, one without workers, and batches of jobs that ask for none."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -9,6 +9,7 @@ from stga_addon.batch.job import Job
 from stga_addon.batch.lease import hold_folder
 from stga_addon.batch.plan import Plan, make_plan
 from stga_addon.batch.run import Batch, run_batch
+from stga_addon.perform.perform import perform_in_folder
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 
 Outcome = Callable[[Job], tuple[WorkerState | None, str]]
@@ -58,6 +59,14 @@ class SimulatedEngine:
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+class InProcessEngine(SimulatedEngine):
+    """Carries each job out in this process."""
+
+    def end(self, job: Job) -> Ended:
+        perform_in_folder(job.request_folder, lambda text: None)
+        return Ended(inspect_worker(job.request_folder), False)
 
 
 def empty_jobs(base: Path, count: int, tables: Mapping[str, Any] | None = None) -> Plan:

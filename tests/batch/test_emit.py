@@ -7,14 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from capture.factory import write_mesh_capture
 
 from stga_addon.batch.engines.openjd import MAX_STEPS, openjd_template
 from stga_addon.batch.engines.table import emit
+from stga_addon.batch.plan import make_plan
 from stga_addon.batch.run import Batch
 from stga_addon.errors import StgaError
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
-from .tiny import tiny_plan
 
 OPENJD = shutil.which("openjd", path=str(Path(sys.executable).parent)) or shutil.which("openjd")
 AUTHOR = """
@@ -43,15 +44,16 @@ def test_openjd_runs_the_batch(tmp_path: Path) -> None:
     """Catches a template that schedulers refuse, or whose tasks do not do what the plan asks for."""
     if OPENJD is None:
         pytest.skip("openjd-cli is not installed: pip install openjd-cli")
-    pytest.importorskip("torch")
-    plan = tiny_plan(tmp_path, seeds=1, iterations=3)
+    write_mesh_capture(tmp_path / "capture")
+    look = {"request": "select", "capture": "capture"}
+    plan = make_plan({"out": "runs", "job": {"look": look, "again": {**look, "after": ["look"]}}}, tmp_path, "plan")
     path = emit("openjd", Batch(plan))
     openjd("check", str(path))
     summary = json.loads(openjd("summary", str(path), "--output", "json"))
     assert summary["total_tasks"] == 2
-    (train, evaluate) = (step["name"] for step in json.loads(path.read_text())["steps"])
-    openjd("run", str(path), "--step", evaluate, "--run-dependencies")
-    assert train.endswith("train")
+    first, second = (step["name"] for step in json.loads(path.read_text())["steps"])
+    openjd("run", str(path), "--step", second, "--run-dependencies")
+    assert first.endswith("look")
     assert not Batch(plan).unfinished
 
 

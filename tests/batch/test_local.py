@@ -19,7 +19,7 @@ from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE
 
 from .conftest import TrainedHere
-from .simulated import carry_out
+from .simulated import InProcessEngine, carry_out
 from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytest.importorskip("torch")
@@ -56,7 +56,7 @@ def test_killed_workers_resume_to_the_same_bits(
 ) -> None:
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
-    seeds, iterations = max(2, KILLS // 3), max(ITERATIONS, 80 * KILLS)
+    seeds, iterations = max(1, KILLS // 3), max(ITERATIONS, 80 * KILLS)
     whole, plan = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
     ended, killed, resumable = threading.Event(), list[str](), list[str]()
     thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
@@ -91,8 +91,11 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "2 jobs, 2 to do; 12 s of work" in printed
 
 
-def test_captures_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_captures_of_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches options that are forgotten where captures are given, or silently ignored where a plan is."""
+    monkeypatch.setattr("stga_addon.batch.engines.table.make_engine", lambda *_: InProcessEngine())
     tiny_plan(tmp_path)
     capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
     options = ["--iterations", "2", "--device", "cpu", "--threads", "1", "--principal-point", "opencv", "--seed", "5"]

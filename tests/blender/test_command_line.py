@@ -140,7 +140,8 @@ def test_missing_training_environment(stga, extension, folder, monkeypatch, caps
 
 @pytest.mark.slow
 def test_training_is_the_panels(stga, bare, folder, tmp_path):
-    """Catches a headless run that ignores painted groups or settings, and so gives other numbers for the same seed."""
+    """Catches a headless run, or a worker of the panel's, that ignores painted groups or settings: with the same seed,
+    all give the same numbers."""
     pytest.importorskip("torch")
     bpy.ops.stga.import_capture(directory=str(folder))
     bpy.ops.stga.select(threshold=0.0005)
@@ -150,7 +151,8 @@ def test_training_is_the_panels(stga, bare, folder, tmp_path):
     painted = read_selection(head)
     save_and_open(tmp_path / "head.blend")
     options = {"iterations": 8, "strategy": "selective", "seed": 3}
-    assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), wait=True, **options) == {"FINISHED"}
+    by_worker = {"wait": True, "python": sys.executable}
+    assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options) == {"FINISHED"}
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
     assert stga("train", "--out", tmp_path / "headless", *arguments) == 0
     bare()

@@ -13,7 +13,6 @@ import pytest
 pytest.importorskip("bpy")
 
 
-from stga_addon.development.compiled_kernels import compile_kernels
 from stga_addon.development.editions import complete
 from stga_addon.development.package import build_zip, wheel_folder
 from stga_addon.development.wheels import Target, check_wheels, collect_wheels, this_platform
@@ -79,12 +78,14 @@ def target() -> Target:
 
 
 @pytest.fixture(scope="module")
-def archive(target: Target, demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def archive(
+    target: Target, demo: Path, kernel_bundle: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     try:
         check_wheels(collect_wheels(wheel_folder(target), target), target)
     except StgaError as error:
         pytest.skip(f"wheels not present and not downloadable: {error}")
-    kernels = compile_kernels(target, wheel_folder(target))
+    kernels = sorted(kernel_bundle[0].glob("*/*"))
     return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo, kernels=kernels)
 
 

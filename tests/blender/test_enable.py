@@ -53,14 +53,15 @@ def test_enabling_needs_numpy_alone_and_no_time(tmp_path: Path) -> None:
     """
     variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     variables["PYTHONPYCACHEPREFIX"] = str(tmp_path)
-    shares = []
+    share = float("inf")
     for _ in range(3):
+        if share < MAX_ENABLE_WORK:
+            break
         command = [sys.executable, "-c", ENABLE, str(ROOT)]
         done = subprocess.run(command, env=variables, capture_output=True, text=True, cwd=ROOT / "tests")
         line = next((line for line in done.stdout.splitlines() if line.startswith("RESULT ")), None)
         assert line is not None, done.stderr[-2000:]
         share, panels = json.loads(line.removeprefix("RESULT "))
         assert "STGA_PT_show" in panels
-        shares.append(share)
-    print(f"enabling took as long as {min(shares):.1f} compilations")
-    assert min(shares) < MAX_ENABLE_WORK
+    print(f"enabling took as long as {share:.1f} compilations")
+    assert share < MAX_ENABLE_WORK

@@ -361,7 +361,8 @@ def test_shadow_onto_the_scene(engine, tmp_path):
     scene.camera.location = (0.4, -0.2, 3.0)
     scene.collection.objects.link(scene.camera)
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = engine, 4, False
-    scene.eevee.taa_render_samples = 2
+    scene.eevee.taa_render_samples, scene.eevee.shadow_pool_size = 1, "16"
+    scene.eevee.shadow_resolution_scale = 0.1
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.view_settings.view_transform = "Raw"
     set_input(shown, PERCENTAGE, 0.0)

@@ -11,7 +11,6 @@ bpy = pytest.importorskip("bpy")
 
 from mathutils import Quaternion  # noqa: E402
 from tracking.test_head_model import blender_head  # noqa: E402
-from tracking.test_track import record  # noqa: E402
 
 from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
 from stga_addon.perform.perform import perform_in_folder  # noqa: E402
@@ -20,14 +19,6 @@ from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.tracking.head_model import HeadModel, read_head_model  # noqa: E402
 
 HEAD = HeadModel(synthetic_flame(0), "flame")
-
-
-@pytest.fixture(scope="module")
-def take(tmp_path_factory):
-    """The take in black, which is tracked by its landmarks alone: in a third of the time."""
-    folder = tmp_path_factory.mktemp("take")
-    record(folder, HEAD)
-    return folder
 
 
 def track(take, out, **more):

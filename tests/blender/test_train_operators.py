@@ -14,7 +14,7 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
-from stga_addon.files import read_npz, write_json  # noqa: E402
+from stga_addon.files import write_json  # noqa: E402
 from stga_addon.requests.monitor_state import Kind  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 
@@ -83,21 +83,6 @@ def test_training_in_process(extension, tmp_path, layout):
     path = bpy.context.scene.stga.avatar
     assert bpy.ops.stga.show_avatar(filepath=path) == {"FINISHED"}
     assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(read_avatar(Path(path)).splats)
-
-
-@pytest.mark.slow
-def test_worker_trains_the_same(head, tmp_path):
-    """Catches painted groups or settings that reach the one kind of training and not the other."""
-    pytest.importorskip("torch")
-    chosen = {"iterations": 8, "seed": 5, "strategy": "selective"}
-    assert bpy.ops.stga.train(directory=str(tmp_path / "here"), **chosen) == {"FINISHED"}
-    assert bpy.ops.stga.train(directory=str(tmp_path / "there"), python=sys.executable, **chosen) == {"FINISHED"}
-    here, there = (read_npz(tmp_path / run / "avatar.npz") for run in ("here", "there"))
-    for name in here:
-        np.testing.assert_array_equal(here[name], there[name], err_msg=name)
-    painted = read_npz(tmp_path / "there/selection.npz")
-    assert painted["00003"].any()
-    assert not painted["00000"].any()
 
 
 @pytest.mark.slow

@@ -2,8 +2,8 @@
 
     python workflow.py ZIP FOLDER PYTHON
 
-FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. PYTHON is the one that trains
-where this one cannot; "" if there is none. Prints RESULT and JSON.
+FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. PYTHON is the one that trains,
+with the kernels in the zip; "" if there is none. Prints RESULT and JSON.
 """
 
 import importlib
@@ -33,7 +33,7 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
         bpy.context.preferences.addons[MODULE].preferences.training_python = python
     trained = 0
     if can_train() or python:
-        ops.train(directory=str(folder / "run"), iterations=3)
+        ops.train(directory=str(folder / "run"), iterations=3, python=python if can_train() else "")
         ops.show_avatar(filepath=bpy.context.scene.stga.avatar)
         trained = len(positions()) // 3
         bpy.data.objects.remove(bpy.context.scene.stga.splats)
@@ -45,10 +45,8 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
     bpy.ops.wm.open_mainfile(filepath=str(folder / "head.blend"))
     ops.export_avatar(filepath=str(folder / "plys"), format="ply-sequence")
     shown, frame = positions(), bpy.context.scene.frame_current
-    if can_train():
-        cameras, out = str(folder / "capture/transforms_test.json"), str(folder / "pictures")
-        command_line = importlib.import_module(MODULE + ".operators.command_line")
-        assert command_line._run(["render", "--cameras", cameras, "--out", out]) == 0
+    command_line = importlib.import_module(MODULE + ".operators.command_line")
+    assert command_line._run(["select", "--threshold", "0.0005"]) == 0
 
     bpy.ops.preferences.addon_disable(module=MODULE)
     repos = bpy.context.preferences.extensions.repos

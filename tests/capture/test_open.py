@@ -380,16 +380,6 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("damage", "message"), BROKEN_MESH_CAPTURES)
-def test_broken_mesh_captures(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
-    """Catches a damaged capture that opens, or fails without naming the file and the field."""
-    root = factory.write_mesh_capture(tmp_path / "capture")
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (60, 40), np.uint8)).save(root / "fg_masks/00000_00.png")
-    damage(root)
-    with pytest.raises(StgaError, match=message):
-        open_capture(root)
-
-
 def parameters(change: dict[str, np.ndarray | None]) -> Callable[[Path], None]:
     def damage(root: Path) -> None:
         arrays: dict[str, Any] = factory.flame_parameters(0) | change
@@ -409,15 +399,6 @@ BROKEN_FLAME_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
     (parameters({"static_offset": np.zeros((1, 100, 3))}), r"00000\.npz: .*static_offset"),
     (parameters({"expr": np.array([{}], object)}), r"00000\.npz: "),
 ]
-
-
-@pytest.mark.parametrize(("damage", "message"), BROKEN_FLAME_CAPTURES)
-def test_broken_flame_captures(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
-    """Catches damaged parameters that open, or fail without naming the file and the field."""
-    root, model_file = factory.write_flame_capture(tmp_path / "capture")
-    damage(root)
-    with pytest.raises(StgaError, match=message):
-        open_capture(root, model_file).mesh(0)
 
 
 def ids(array: np.ndarray) -> Callable[[Path], None]:
@@ -442,13 +423,26 @@ BROKEN_RELEASES: list[tuple[Callable[[Path], object], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("damage", "message"), BROKEN_RELEASES)
-def test_broken_releases(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
-    """Catches a damaged release that opens, or fails without naming the file and the field."""
-    root = factory.write_release(tmp_path / "capture")
+BROKEN_CAPTURES = [
+    *((factory.write_mesh_capture, 0, *row) for row in BROKEN_MESH_CAPTURES),
+    *((factory.write_flame_capture, 0, *row) for row in BROKEN_FLAME_CAPTURES),
+    *((factory.write_release, 1, *row) for row in BROKEN_RELEASES),
+]
+
+
+@pytest.mark.parametrize(("write", "timestep", "damage", "message"), BROKEN_CAPTURES)
+def test_broken_captures(
+    tmp_path: Path, write: Callable[[Path], Any], timestep: int, damage: Callable[[Path], object], message: str
+) -> None:
+    """Catches a damaged capture that opens, or fails without naming the file and the field."""
+    written = write(tmp_path / "capture")
+    root, model_file = written if isinstance(written, tuple) else (written, None)
+    if write == factory.write_mesh_capture:
+        noise = np.random.default_rng(0).integers(0, 255, (60, 40), np.uint8)
+        Image.fromarray(noise).save(root / "fg_masks/00000_00.png")
     damage(root)
     with pytest.raises(StgaError, match=message):
-        open_capture(root).mesh(1)
+        open_capture(root, model_file).mesh(timestep)
 
 
 def test_what_is_no_capture(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ from stga_addon.training.run.folder import read_run
 
 pytest.importorskip("torch")
 
-CASES = int(os.environ.get("STGA_FUZZ_CASES", 300))
+CASES = int(os.environ.get("STGA_FUZZ_CASES", 100))
 """Of every run of the tests; `make fuzz` tries 20,000."""
 PARTS = 10
 """Tests that the cases are spread over, so that several processes share them."""

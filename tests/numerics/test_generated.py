@@ -76,7 +76,7 @@ def test_any_scene_is_the_references(back_end: str, scene: Scene) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=6000 if FUZZING else 400, **(BOUNDED | {"derandomize": not FUZZING}))
+@settings(max_examples=6000 if FUZZING else 150, **(BOUNDED | {"derandomize": not FUZZING}))
 @given(scenes())
 def test_any_scene_is_the_references_at_length(scene: Scene) -> None:
     """The same with many more scenes; in `make fuzz` with others every time."""

@@ -11,6 +11,8 @@ from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.optimize.density import MIN_OPACITY, control_density
 from stga_addon.training.optimize.state import TrainState, keep_rows, new_state, tensors_of
+from stga_addon.training.optimize.strategies import DensityControl
+from stga_addon.training.settings import TrainingSettings
 
 from .toys import bits, random_state
 
@@ -130,6 +132,19 @@ def test_budget_and_share_bound_the_growth(budget: int, share: float, split: int
     left = {tuple(p) for p in new.splats().xyz.tolist()}
     assert not gone & left
     assert {tuple(p) for p in state.splats().xyz[listed[split:]].tolist()} <= left
+
+
+def test_turns_end_where_the_splats_have_grown_enough() -> None:
+    """Catches growth that is counted anew in every turn, and turns outside of their part of the training."""
+    settings = TrainingSettings(density_interval=2, density_span=(0.2, 0.8), growth=0.25)
+    turns, state, counts = DensityControl(settings, COUNT, np.ones(FACES, bool)), busy_state([]), []
+    due = [turns.is_due(iteration, progress) for iteration, progress in ((2, 0.1), (2, 0.2), (3, 0.5), (2, 0.8))]
+    assert due == [False, True, False, False]
+    for iteration in range(2, 10, 2):
+        state.screen_gradient.fill_(1.0)
+        state = turns.apply(state, iteration)
+        counts.append(len(state))
+    assert counts == [44, 48, 50, 50]
 
 
 def test_the_screen_gradient_is_a_mean() -> None:

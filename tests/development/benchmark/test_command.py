@@ -4,9 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
+from batch.simulated import InProcessEngine
 from capture import factory
 
-from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.cli.main import main
 from stga_addon.training.run.folder import read_run
 
@@ -38,6 +38,7 @@ def test_slices_are_jobs_of_a_batch(
     printed = capsys.readouterr().out
     assert re.search(r"benchmark-seed0 +Benchmark +1 thread, 1 GB +1 s\n", printed)
     assert "2 jobs, 2 to do; 2 s of work" in printed
+    monkeypatch.setattr("stga_addon.batch.engines.table.make_engine", lambda *_: InProcessEngine())
     assert main(command) == 0
     printed = capsys.readouterr().out
     assert "2 of 2 jobs finished" in printed
@@ -46,7 +47,7 @@ def test_slices_are_jobs_of_a_batch(
     runs = [read_run(tmp_path / f"out/benchmark-seed{seed}/draft") for seed in (0, 1)]
     assert [run.settings.seed for run in runs] == [0, 1]
     assert "benchmark-seed1" in (tmp_path / "out/report.html").read_text()
-    monkeypatch.setattr(LocalEngine, "submit", lambda *_: pytest.fail("it trains again"))
+    monkeypatch.setattr(InProcessEngine, "submit", lambda *_: pytest.fail("it trains again"))
     assert main(command) == 0
     assert capsys.readouterr().out.endswith(printed.partition("report.html\n")[2])
 
