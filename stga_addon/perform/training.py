@@ -18,7 +18,7 @@ from ..format import format_duration
 from ..progress import Cancelled, Progress, Report, Say
 from ..raster.cpu.precompile import begin_compiling
 from ..render.device import choose_device
-from ..report.preset_timing import time_presets
+from ..report.preset_timing import time_preset
 from ..report.run_summary import CurveUpdater, report_run
 from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
@@ -171,16 +171,15 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     begin_compiling()
     device, why = choose_device(request.device)
     capture = open_capture(request.capture, request.flame, request.principal_point)
-    settings = request.settings
-    if request.preset_time:
-        report(Progress(stage="Timing the preset"))
-        (timing,) = time_presets(capture, [str(settings.preset)], device=device)
-        say(f"{timing.preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
-        settings = replace(settings, seconds=timing.seconds, iterations=None)
     report(Progress(stage="Analyzing the capture"))
     flame = None if request.flame is None else request.flame.resolve()
-    run = Run(capture.root, flame, request.principal_point, settings, device=device)
+    run = Run(capture.root, flame, request.principal_point, request.settings, device=device)
     run = with_effect_plan(run, capture, device)
+    if request.preset_time:
+        report(Progress(stage="Timing the preset"))
+        timing = time_preset(capture, run.settings, device=device)
+        say(f"{timing.preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
+        run = replace(run, settings=replace(run.settings, seconds=timing.seconds, iterations=None))
     say(why)
     return Prepared(request.run, run, capture, _given(request.selection), resumes=False, falls_back=False)
 
