@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import file_size, read_json
-from ..flame.masks import faces_within
+from ..flame.model import faces_within
 from .camera import MAX_COORDINATE_M
 from .glb_chunks import glb_chunks
 

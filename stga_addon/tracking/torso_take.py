@@ -9,8 +9,7 @@ from scipy.ndimage import binary_dilation
 from ..capture.camera import Camera
 from ..capture.mesh_raster import silhouette
 from ..flame.forward import axis_angle_matrices
-from ..flame.masks import MIN_TORSO_WEIGHT
-from ..flame.model import JOINTS
+from ..flame.model import JOINTS, MIN_TORSO_WEIGHT
 from ..flame.quaternions import from_matrices, to_axis_angle
 from .appearance import pyramid
 from .dense_terms import PyramidView, inside

@@ -15,7 +15,7 @@ from stga_addon.development.demo.head import synthetic_head, write_flame
 from stga_addon.development.demo.paint import paint
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, joint_positions
-from stga_addon.flame.masks import torso_faces
+from stga_addon.flame.model import torso_faces
 from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.folder import PLACES_FILE, REPORT_FILE
