@@ -108,9 +108,9 @@ def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
 
 
 def rig_or_none(head: Any) -> Any:
-    """The head's FLAME rig, or None where it has none."""
+    """The FLAME rig of a head; None where it has none, or is no head."""
     try:
-        return rig_of(head)
+        return rig_of(head) if is_head(head) else None
     except StgaError:
         return None
 

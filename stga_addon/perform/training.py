@@ -14,7 +14,7 @@ from ..capture.region import SELECTED_WEIGHT, find_region
 from ..capture.takes import first_timesteps, join_takes, require_same_head, require_same_scale
 from ..errors import StgaError
 from ..export.ply import write_ply
-from ..format import format_duration
+from ..format import format_duration, format_table
 from ..progress import Cancelled, Progress, Report, Say
 from ..raster.cpu.precompile import begin_compiling
 from ..render.device import choose_device
@@ -73,7 +73,7 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
     prepared = prepare(request, report, say)
     for warning in prepared.capture.warnings:
         say(f"warning: {warning}")
-    for line in _table(describe_effects(prepared.run.effect_plan)):
+    for line in format_table(describe_effects(prepared.run.effect_plan)):
         say(line)
     draw, latest, is_stopped = CurveUpdater(prepared.folder), Progress(), False
 
@@ -146,11 +146,6 @@ def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selecte
     for timestep, faces in selection.items():
         say(f"{timestep:5d}  {faces.mean():6.1%}")
     return Selected(selection)
-
-
-def _table(rows: list[tuple[str, str]]) -> list[str]:
-    width = max((len(label) for label, _ in rows), default=0)
-    return [f"{label:<{width}}  {value}" for label, value in rows]
 
 
 def _as_progress(progress: TrainingProgress) -> Progress:
