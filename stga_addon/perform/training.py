@@ -18,7 +18,6 @@ from ..format import format_duration, format_table
 from ..progress import Cancelled, Progress, Report, Say
 from ..raster.cpu.precompile import begin_compiling
 from ..render.device import choose_device
-from ..report.preset_timing import time_preset
 from ..report.run_summary import CurveUpdater, report_run
 from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
@@ -26,6 +25,7 @@ from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.effect_decisions import TRACKING
 from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
 from ..training.optimize.flame_refinement import with_refined_tracking
+from ..training.preset_timing import time_preset
 from ..training.run.continuation import continued_settings, select_for_takes
 from ..training.run.folder import AVATAR, WORLD_FILE, Continuation, Run, Take, has_run, read_run
 from ..training.run.identity import file_digest, identity_of

@@ -7,8 +7,8 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.report import preset_timing
-from stga_addon.report.preset_timing import WARM_UP_ITERATIONS, seconds_per_iteration, time_presets
+from stga_addon.training import preset_timing
+from stga_addon.training.preset_timing import WARM_UP_ITERATIONS, seconds_per_iteration, time_presets
 from stga_addon.training.settings import PRESETS, Preset, make_settings
 
 

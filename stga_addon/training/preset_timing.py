@@ -11,12 +11,12 @@ from ..capture.loader import LoadedView
 from ..capture.model import Capture, View
 from ..errors import StgaError
 from ..selection import select_capture
-from ..training.effects.plan import plan_effects
-from ..training.optimize.image_preparation import image_preparation
-from ..training.optimize.precompile import precompile_kernels
-from ..training.optimize.trainer import Trainer
-from ..training.schedule import image_scale, view_order
-from ..training.settings import PRESETS, TrainingSettings, make_settings
+from .effects.plan import plan_effects
+from .optimize.image_preparation import image_preparation
+from .optimize.precompile import precompile_kernels
+from .optimize.trainer import Trainer
+from .schedule import image_scale, view_order
+from .settings import PRESETS, TrainingSettings, make_settings
 
 CALIBRATION_S = 2.0
 """Training time that is measured per preset."""
