@@ -23,7 +23,7 @@ from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.effect_decisions import TRACKING
-from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
+from ..training.effects.plan import add_effects, describe_effects, plan_effects
 from ..training.optimize.flame_refinement import with_refined_tracking
 from ..training.preset_timing import time_preset
 from ..training.run.continuation import continued_settings, select_for_takes
@@ -167,15 +167,15 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     device, why = choose_device(request.device)
     capture = open_capture(request.capture, request.flame, request.principal_point)
     report(Progress(stage="Analyzing the capture"))
-    flame = None if request.flame is None else request.flame.resolve()
-    run = Run(capture.root, flame, request.principal_point, request.settings, device=device)
-    run = with_effect_plan(run, capture, device)
+    settings, plan = plan_effects(capture, request.settings, device)
     if request.preset_time:
         report(Progress(stage="Timing the preset"))
-        timing = time_preset(capture, run.settings, device=device)
+        timing = time_preset(capture, settings, device=device)
         say(f"{timing.preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
-        run = replace(run, settings=replace(run.settings, seconds=timing.seconds, iterations=None))
+        settings = replace(settings, seconds=timing.seconds, iterations=None)
     say(why)
+    flame = None if request.flame is None else request.flame.resolve()
+    run = Run(capture.root, flame, request.principal_point, settings, plan, device)
     return Prepared(request.run, run, capture, _given(request.selection), resumes=False, falls_back=False)
 
 
@@ -238,12 +238,12 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     settings = continued_settings(
         opened.run.settings, "extend", growth, request.seconds, request.iterations, request.seed
     )
-    before = replace(run, settings=settings, device=device)
-    say(f"takes: {1 + len(before.takes)}; the new ones need {needed.mean():.0%} of the triangles")
-    run = with_effects_of_takes(before, capture)
-    for old, new in zip(before.effect_plan, run.effect_plan, strict=True):
+    say(f"takes: {1 + len(run.takes)}; the new ones need {needed.mean():.0%} of the triangles")
+    settings, plan = add_effects(capture, settings, run.effect_plan)
+    for old, new in zip(run.effect_plan, plan, strict=True):
         if new.on != old.on:
             say(f"{new.effect}  {new}")
+    run = replace(run, settings=settings, effect_plan=plan, device=device)
     return Prepared(request.run, run, capture, selection, resumes=False, falls_back=False)
 
 

@@ -43,8 +43,7 @@ def time_presets(capture: Capture, seconds: float = CALIBRATION_S, device: str =
     timings = []
     for name in PRESETS:
         settings = make_settings(preset=name, iterations=1, effects={})
-        if capture.views.get("train"):
-            settings, _ = plan_effects(capture, settings, device)
+        settings, _ = plan_effects(capture, settings, device)
         timings.append(time_preset(capture, settings, seconds, device))
     return timings
 
