@@ -13,6 +13,7 @@ from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
+from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
 from .contact_sheet import write_contact_sheet
@@ -20,7 +21,7 @@ from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
 from .footage.model import Footage
 from .footage.open import open_footage
 from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
-from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints, parameters_of
+from .posed_points import PosedPoints, SurfacePoints
 from .solve import (
     EXPRESSION_ACCELERATION,
     JOINT_ACCELERATION_RAD,
@@ -142,7 +143,7 @@ def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
     or of the capture where there is none. Raises StgaError where the file is not of the capture's timesteps."""
     path, timesteps = out / SOLVED_FILE, list(sequence.timesteps)
     if not os.path.lexists(path):
-        return timesteps, np.stack([parameters_of(sequence.frame(timestep)) for timestep in timesteps])
+        return timesteps, np.stack([sequence.frame(timestep).parameters for timestep in timesteps])
     arrays = read_npz(path)
     shape = len(timesteps), sequence.model.n_expression + RIGID_SIZE
     if not _are_parameters(arrays.get("parameters"), shape):
