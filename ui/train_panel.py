@@ -13,8 +13,8 @@ from ..operators.training_python import has_training_python
 from ..stga_addon.format import format_duration
 from ..stga_addon.requests.monitor_state import Kind, RequestState
 from ..stga_addon.scene import tags
-from ..stga_addon.training.effect_decisions import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
+from ..stga_addon.training.run.tracking_file import TRACKING
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
 from .options import set_options

@@ -22,9 +22,7 @@ from ..report.run_summary import CurveUpdater, report_run
 from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
 from ..training.effect_catalog import RELIGHT, WORLD
-from ..training.effect_decisions import TRACKING
 from ..training.effects.plan import add_effects, describe_effects, plan_effects
-from ..training.optimize.flame_refinement import with_refined_tracking
 from ..training.preset_timing import time_preset
 from ..training.run.continuation import continued_settings, select_for_takes
 from ..training.run.folder import AVATAR, WORLD_FILE, Continuation, Run, Take, has_run, read_run
@@ -34,6 +32,7 @@ from ..training.run.open_run import OpenedRun, device_of, open_run
 from ..training.run.progress import Progress as TrainingProgress
 from ..training.run.progress import Report as TrainingReport
 from ..training.run.replay import is_faced
+from ..training.run.tracking_file import TRACKING, with_refined_tracking
 from ..training.world.world_splats import world_of
 from .relighting import add_light
 

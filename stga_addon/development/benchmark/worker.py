@@ -63,8 +63,8 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
     from ...avatar.file import read_avatar
     from ...perform.training import prepare
     from ...training.evaluate.metrics import evaluate_avatar
-    from ...training.optimize.flame_refinement import with_refined_tracking
     from ...training.preset_timing import seconds_per_iteration
+    from ...training.run.tracking_file import with_refined_tracking
 
     turns = Turns(requests, replies)
     try:

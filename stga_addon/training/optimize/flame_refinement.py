@@ -3,21 +3,17 @@
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from ...avatar.embedding import FaceFrames
-from ...capture.flame_capture import with_sequence
 from ...capture.model import Capture
 from ...errors import StgaError
-from ...files import read_npz, write_npz
 from ...flame.forward import POSE_SIZE, TRANSLATION_SIZE, FlameFrame, frame_of
 from ...flame.forward_torch import flame_forward, flame_tensors
-from ...flame.sequence import FRAME_FIELDS, FlameSequence, read_motion, sequence_mesh, with_identity
+from ...flame.sequence import FlameSequence, sequence_mesh, with_identity
 from ...raster.cpu.layout import Parameters
-from ..effect_decisions import TRACKING
 
 REFINEMENT_START_SHARE = 0.15
 """Share of the budget before the first step: gradients of untrained splats carry no information."""
@@ -158,38 +154,3 @@ def frame_gradient(
     on, count = face[rows], len(frames.origin)
     sums = [np.bincount(on, column, count) for column in (fx, fy, fz, *rotation, scale)]
     return np.stack(sums[:3], -1) / frames.scale[:, None], np.stack(sums[3:6], -1), sums[6]
-
-
-def write_tracking(folder: Path, tracking: Tracking) -> None:
-    """Write a run folder's tracking.npz: the refined motion, for `read_motion`, and the tracked parameters."""
-    sequence = tracking.sequence
-    frame = frame_of(tracking.parameters().T)
-    arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
-    arrays["shape"] = sequence.shape
-    if sequence.static_offset is not None:
-        arrays["static_offset"] = sequence.static_offset
-    arrays["timesteps"], arrays["tracked"] = np.array(sequence.timesteps), tracking.tracked
-    write_npz(folder / TRACKING, arrays, compressed=True)
-
-
-def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
-    """The capture with the parameters that the run in `folder` refined; unchanged if it refined none.
-
-    A timestep is replaced only if the capture's tracked parameters are those that the run started from, so that
-    another capture stays unchanged. Raises StgaError if the run's file is damaged.
-    """
-    path, sequence = folder / TRACKING, capture.flame
-    if sequence is None or not path.exists():
-        return capture
-    motion, tracked = read_motion(path, sequence.model), read_npz(path).get("tracked", np.zeros(0))
-    if len(tracked) != len(motion.timesteps):
-        raise StgaError(f"{path}: tracked has shape {tracked.shape}, expected {len(motion.timesteps)} timesteps first")
-    before = dict(zip(motion.timesteps, tracked, strict=True))
-
-    def frame(timestep: int) -> FlameFrame:
-        found = sequence.frame(timestep)
-        if timestep not in before or not np.array_equal(found.parameters, before[timestep]):
-            return found
-        return replace(motion.frame(timestep), dynamic_offset=found.dynamic_offset)
-
-    return with_sequence(capture, replace(sequence, frame=frame))
