@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
+from ..stga_addon.capture.region import SELECTED_WEIGHT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.values import Extend as ExtendRequest
 from ..stga_addon.requests.values import Refine as RefineRequest
@@ -114,7 +115,7 @@ def _painted_region(head: Any, group: str) -> np.ndarray:
             raise StgaError(f"{head.name}: has no vertex group '{group}' to refine; paint one, or select in Edit Mode")
         weights = read_triangle_weights(head, found.name)
         where = f"no triangle has all its corners in the vertex group '{found.name}'"
-    if not (weights >= tags.SELECTED_WEIGHT).any():
+    if not (weights >= SELECTED_WEIGHT).any():
         raise StgaError(f"{head.name}: {where}")
     return weights
 

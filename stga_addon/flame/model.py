@@ -23,6 +23,8 @@ KEY_MASKS = {
     "mouth": ("lips", "teeth"),
     "nose": ("nose",),
 }
+EYEBALL_WEIGHT = 0.9
+"""Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
 MIN_TORSO_WEIGHT = 0.7
 """Skinning weight of the root joint at the torso's vertices; the published FLAME's last ring has 0.9."""
 

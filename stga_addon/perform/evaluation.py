@@ -18,8 +18,6 @@ from ..training.run.open_run import open_refined
 def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
     """Measure PSNR, SSIM and LPIPS, and write them into the run's folder. Raises StgaError."""
     folder, split = request.run, request.split
-    if not folder.is_dir():
-        raise StgaError(f"{folder}: is not a folder; expected that of a run")
     report(Progress(stage="Evaluating"))
     capture = open_refined(folder, request.capture, request.flame)
     views = capture.views.get(split, ())

@@ -23,8 +23,6 @@ from ..training.run.open_run import open_refined
 def relight(request: Relight, report: Report, say: Say) -> Written:
     """Estimate the light, or take the known one, and write it into the run's avatar file. Raises StgaError."""
     folder = request.run
-    if not folder.is_dir():
-        raise StgaError(f"{folder}: is not a folder; expected that of a run")
     capture = open_refined(folder, request.capture, request.flame)
     known = Known()
     if request.light is not None:

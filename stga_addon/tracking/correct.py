@@ -13,7 +13,7 @@ from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
-from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE
+from ..flame.forward import RIGID_SIZE
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
 from .contact_sheet import write_contact_sheet
@@ -23,10 +23,8 @@ from .footage.open import open_footage
 from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
 from .posed_points import PosedPoints, SurfacePoints
 from .solve import (
-    EXPRESSION_ACCELERATION,
-    JOINT_ACCELERATION_RAD,
     LANDMARK_SIGMA_M,
-    TRANSLATION_ACCELERATION_M,
+    acceleration_precision,
 )
 from .write_capture import moving_arrays
 
@@ -105,7 +103,7 @@ def corrected(
     ]
     matrix = block_diag(blocks)
     second = _second_differences(near)
-    matrix = matrix + kron(second.T @ second, diags(_acceleration_precision(size)))
+    matrix = matrix + kron(second.T @ second, diags(acceleration_precision(model)))
     matrix = csc_matrix(matrix)
     open_ = np.repeat(free[near], size)
     if open_.any():
@@ -131,11 +129,6 @@ def _stiffness(model: FlameModel, points: SurfacePoints, parameters: np.ndarray)
     _, jacobian = PosedPoints(model, points).linearized(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
     flat = jacobian.reshape(-1, jacobian.shape[2]) / LANDMARK_SIGMA_M
     return np.asarray(flat.T @ flat)
-
-
-def _acceleration_precision(size: int) -> np.ndarray:
-    sigma = (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M)
-    return np.repeat(sigma, (size - RIGID_SIZE, POSE_SIZE, TRANSLATION_SIZE)) ** -2.0
 
 
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:

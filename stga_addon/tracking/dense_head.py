@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
 from .appearance import LEVELS_M, light_basis, robust
 from .head_model import HeadModel
-from .mesh_image import vertex_normals
 from .photo_consistency import facing, in_sight
 from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .seen_surface import large_parts, surface_points

@@ -49,6 +49,8 @@ def open_run(
 
 def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
     """The capture of a run, with the FLAME parameters that the run refined. Errors as of `open_run`."""
+    if not folder.is_dir():
+        raise StgaError(f"{folder}: is not a folder; expected that of a run")
     return with_refined_tracking(open_run(folder, capture, flame).capture, folder)
 
 
