@@ -22,10 +22,7 @@ from .footage.model import Footage
 from .footage.open import open_footage
 from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
 from .posed_points import PosedPoints, SurfacePoints
-from .solve import (
-    LANDMARK_SIGMA_M,
-    acceleration_precision,
-)
+from .solve import LANDMARK_SIGMA_M, acceleration_precision
 from .write_capture import moving_arrays
 
 SOLVED_FILE = "tracking_solved.npz"
