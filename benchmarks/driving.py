@@ -18,6 +18,8 @@ from time import perf_counter
 
 import numpy as np
 
+from stga_addon.flame.forward import RIGID_SIZE
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from driving.heads import generated_flame, random_poses
@@ -31,7 +33,7 @@ from stga_addon.driving.transfer import exchanged_neutral, quiet_neutral
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import JOINTS, FlameModel
 from stga_addon.flame.sequence import FlameSequence, with_identity
-from stga_addon.tracking.posed_points import RIGID_SIZE, PosedPoints
+from stga_addon.tracking.posed_points import PosedPoints
 
 IDENTITIES = 3
 FREE_STEPS = 3

@@ -31,7 +31,7 @@ from stga_addon.perform.training import Prepared, prepare
 from stga_addon.progress import ignore
 from stga_addon.requests.values import Extend, Refine
 from stga_addon.selection import SelectionOptions, select_capture
-from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
+from stga_addon.training.effects.plan import add_effects, plan_effects
 from stga_addon.training.evaluate.match_exposure import known_exposure
 from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.optimize.image_preparation import image_preparation
@@ -107,7 +107,8 @@ def comparisons(options: argparse.Namespace, seed: int) -> Iterator[tuple[str, P
         parent = trained(old, options, seed)
         extend = Extend(unused, parent, (new,), seconds=options.seconds, seed=seed, device="cpu")
         prepared = prepare(extend, ignore, print)
-        prepared = replace(prepared, run=with_effects_of_takes(prepared.run, prepared.capture))
+        settings, plan = add_effects(prepared.capture, prepared.run.settings, prepared.run.effect_plan)
+        prepared = replace(prepared, run=replace(prepared.run, settings=settings, effect_plan=plan))
         yield "extend", prepared, extend_arms(prepared, seed)
     if options.refine:
         refine = Refine(
@@ -151,7 +152,7 @@ def trained(take: Path, options: argparse.Namespace, seed: int) -> Path:
     if not (folder / "residuals.npz").exists():
         capture = open_capture(take, options.flame)
         settings = make_settings(iterations=options.base, seed=seed, effects={"tracking": "off"})
-        run = with_effect_plan(Run(capture.root, options.flame, "vhap", settings), capture, "cpu")
+        run = Run(capture.root, options.flame, "vhap", *plan_effects(capture, settings))
         train(capture, folder, run, resume=(folder / "run.json").exists())
     return folder
 

@@ -50,10 +50,10 @@ from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs
 from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch
-from stga_addon.training.optimize.backends import make_backend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.losses import image_gradient, whole_image
 from stga_addon.training.optimize.state import new_state
+from stga_addon.training.optimize.trainer import make_backend
 from stga_addon.training.settings import make_settings
 
 RATES = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-9)
@@ -221,9 +221,8 @@ def device_step(
     device: str, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
 ) -> tuple[Backend, Batch]:
     """A whole iteration on a device of `choose_device`, from the posed mesh's frames on, and its global batch."""
-    lengths = np.sqrt(2 * face_areas(mesh, faces)).astype(np.float32)
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, lambda timestep: mesh, lambda timestep, zero_pose: mesh)
-    given = make_settings(iterations=1), lengths, FrameStore(capture, "stga"), new_state(splats)
+    given = make_settings(iterations=1), FrameStore(capture, "stga"), new_state(splats)
     backend = make_backend(device, *given)
     view = View(0, 0, camera, "benchmark", Path())
     return backend, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)

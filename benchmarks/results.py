@@ -86,7 +86,8 @@ def main() -> None:
     title = f"What does a single setting cost or bring? ({first.name})"
     sections += benchmark_section(title, first, plan, KNOBS, folder, f"--knobs --budget {KNOBS_BUDGET} --seeds 1")
     for capture in options.captures:
-        sections += extend_section(capture, folder / f"extend-{capture.name}")
+        words = EXTEND_WORDS if capture is first else ": as above."
+        sections += extend_section(capture, folder / f"extend-{capture.name}", words)
     options.out.write_text("\n".join(sections), encoding="utf-8")
     print(options.out)
 
@@ -151,8 +152,8 @@ def benchmark_section(title: str, capture: Path, plan: Plan, table: str, folder:
     return [f"## {title}", "", f"`stga benchmark {capture.name} {arguments}`", "", report, ""]
 
 
-def extend_section(capture: Path, folder: Path) -> list[str]:
-    """The report of `benchmarks/extend.py`: extending and refining against the other ways to go on."""
+def extend_section(capture: Path, folder: Path, words: str) -> list[str]:
+    """The report of `benchmarks/extend.py`: extending and refining against the other ways to go on; words: on it."""
     report, arguments = folder / "report.md", EXTEND_ARGUMENTS
     if not report.exists():
         call(
@@ -161,7 +162,7 @@ def extend_section(capture: Path, folder: Path) -> list[str]:
         )  # fmt: skip
     title = f"## What do extending and refining a trained avatar bring? ({capture.name})"
     command = f"`python benchmarks/extend.py {capture.name} {' '.join(arguments)}`"
-    return [title, "", command + EXTEND_WORDS, "", report.read_text(encoding="utf-8")]
+    return [title, "", command + words, "", report.read_text(encoding="utf-8")]
 
 
 def flame_of(capture: Path) -> Path | None:

@@ -24,21 +24,15 @@ from stga_addon.capture.flame_capture import with_sequence
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.capture.rigid import Similarity, similarity
-from stga_addon.flame.forward import FlameFrame
+from stga_addon.flame.forward import POSE_SIZE, TRANSLATION_SIZE, FlameFrame, frame_of
 from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.effects.rules import tracking
 from stga_addon.training.evaluate.metrics import evaluate_avatar
-from stga_addon.training.optimize.flame_refinement import (
-    POSE_SIZE,
-    TRANSLATION_SIZE,
-    parameters_of,
-    with_parameters,
-    with_refined_tracking,
-)
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.tracking_file import with_refined_tracking
 from stga_addon.training.settings import make_settings
 
 EXPRESSION_ERROR, JOINT_ERROR_RAD, TRANSLATION_ERROR_M = 0.15, 0.0175, 0.002
@@ -60,7 +54,7 @@ def lose_track(capture: Capture, error: float) -> Capture:
         if timestep not in disturbed:
             return tracked
         steps = np.random.default_rng(timestep).normal(0, error * sizes)
-        return with_parameters(tracked, parameters_of(tracked) + steps)
+        return frame_of(tracked.parameters + steps, tracked.dynamic_offset)
 
     return with_sequence(capture, replace(sequence, frame=frame))
 

@@ -22,7 +22,6 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.motion import PARTS, retimed
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
 from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
 from ..stga_addon.scene.rig.trained import store_range, stored_range
@@ -30,12 +29,14 @@ from . import ids
 from .common import (
     FileImport,
     capture_of,
+    file_filter,
     file_path,
     flame_model_path,
     flame_of,
     head_of,
     is_head,
     needs_rig_or_shapes,
+    path_property,
     reporting,
     rig_or_none,
 )
@@ -76,12 +77,11 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     bl_label = "Apply Motion"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(
-        name="File",
-        description="FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a face performance: CSV "
+    filepath: path_property(
+        "File",
+        "FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a face performance: CSV "
         "of Live Link Face or Audio2Face, its take folder, JSON of named weights, iFacialMocap's text",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
+        options={"SKIP_SAVE"},
     )
     source: bpy.props.StringProperty(
         name="Source",
@@ -183,7 +183,7 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         options={"SKIP_SAVE"},
     )
     filename_ext = ".npz"
-    filter_glob: bpy.props.StringProperty(default="*.npz;*.csv;*.json;*.txt", options={"HIDDEN"})
+    filter_glob: file_filter(".npz", ".csv", ".json", ".txt")
 
     @classmethod
     def description(cls, context: Any, properties: Any) -> str:
@@ -191,9 +191,7 @@ class ApplyMotion(bpy.types.Operator, FileImport):
             return "Animate this head with its tracking as refined by training; its earlier animation is kept"
         return ""  # that of the class
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_rig_or_shapes(cls, context)
+    poll = classmethod(needs_rig_or_shapes)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         return self.execute(context) if self.source else super().invoke(context, event)

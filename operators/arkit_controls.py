@@ -18,9 +18,7 @@ class AddArkitControls(bpy.types.Operator):
     bl_label = "Add ARKit Controls"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_rig(cls, context)
+    poll = classmethod(needs_rig)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

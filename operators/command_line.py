@@ -17,7 +17,7 @@ from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.effect_decisions import TRACKING
+from ..stga_addon.training.run.tracking_file import TRACKING
 from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
 from ..stga_addon.worker.launch import start_python
 from . import ids

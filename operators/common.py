@@ -1,6 +1,6 @@
 """Shared by the operators: error reports, polls, paths, and the capture behind a head."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -108,19 +108,31 @@ def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
 
 
 def rig_or_none(head: Any) -> Any:
-    """The head's FLAME rig, or None where it has none."""
+    """The FLAME rig of a head; None where it has none, or is no head."""
     try:
-        return rig_of(head)
+        return rig_of(head) if is_head(head) else None
     except StgaError:
         return None
+
+
+def path_property(
+    name: str, description: str, subtype: str = "FILE_PATH", options: Collection[str] = (), **more: Any
+) -> Any:
+    """A path, which may begin with "//"."""
+    return bpy.props.StringProperty(
+        name=name, description=description, subtype=subtype, options={*PATH_OPTIONS, *options}, **more
+    )
+
+
+def file_filter(*suffixes: str) -> Any:
+    """The files that a file browser shows."""
+    return bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in suffixes), options={"HIDDEN"})
 
 
 class FileImport(ImportHelper):
     """Mixin of operators that import a file: asks for it, unless called with one, as when a file is dropped."""
 
-    filepath: bpy.props.StringProperty(
-        name="File", description="File to import", subtype="FILE_PATH", options=PATH_OPTIONS | {"SKIP_SAVE"}
-    )
+    filepath: path_property("File", "File to import", options={"SKIP_SAVE"})
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         if self.filepath:
@@ -131,12 +143,10 @@ class FileImport(ImportHelper):
 
 def flame_property() -> Any:
     """FLAME model of an import operator."""
-    return bpy.props.StringProperty(
-        name="FLAME Model",
-        description="FLAME model file (.pkl or .npz), for captures and motions tracked with FLAME; "
-        "empty: that of the preferences",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    return path_property(
+        "FLAME Model",
+        "FLAME model file (.pkl or .npz), for captures and motions tracked with FLAME; empty: that of the preferences",
+        options={"SKIP_SAVE"},
     )
 
 

@@ -5,15 +5,15 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
+from ..stga_addon.capture.region import SELECTED_WEIGHT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.values import Extend as ExtendRequest
 from ..stga_addon.requests.values import Refine as RefineRequest
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import read_triangle_weights, selected_triangles
 from ..stga_addon.training.run.folder import AVATAR, next_folder
 from . import ids
-from .common import capture_source, file_path, head_of, reporting, scene_settings
+from .common import capture_source, file_path, head_of, path_property, reporting, scene_settings
 from .train import DeviceOptions, TrainingOperator, device_of, start_training
 
 
@@ -39,12 +39,7 @@ class RefineOptions:
 class ExtendOptions:
     """What a run is extended by, and for how long: of the operator, and of the panel that calls it."""
 
-    take: bpy.props.StringProperty(
-        name="Take",
-        description="Folder of a further capture of the same head",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS,
-    )
+    take: path_property("Take", "Folder of a further capture of the same head", "DIR_PATH")
     seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=60.0, min=0.1)
 
 
@@ -56,9 +51,7 @@ class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
     bl_label = "Refine"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    directory: bpy.props.StringProperty(
-        name="Run Folder", description="Folder of the run to refine", subtype="DIR_PATH", options=PATH_OPTIONS
-    )
+    directory: path_property("Run Folder", "Folder of the run to refine", "DIR_PATH")
     region: bpy.props.StringProperty(
         name="Region",
         description="Region of the capture, such as mouth, to refine instead of a vertex group",
@@ -92,9 +85,7 @@ class Extend(TrainingOperator, ExtendOptions, DeviceOptions, bpy.types.Operator)
     bl_label = "Extend with Take"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    directory: bpy.props.StringProperty(
-        name="Run Folder", description="Folder of the run to extend", subtype="DIR_PATH", options=PATH_OPTIONS
-    )
+    directory: path_property("Run Folder", "Folder of the run to extend", "DIR_PATH")
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -124,7 +115,7 @@ def _painted_region(head: Any, group: str) -> np.ndarray:
             raise StgaError(f"{head.name}: has no vertex group '{group}' to refine; paint one, or select in Edit Mode")
         weights = read_triangle_weights(head, found.name)
         where = f"no triangle has all its corners in the vertex group '{found.name}'"
-    if not (weights >= tags.SELECTED_WEIGHT).any():
+    if not (weights >= SELECTED_WEIGHT).any():
         raise StgaError(f"{head.name}: {where}")
     return weights
 

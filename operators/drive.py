@@ -12,7 +12,6 @@ from ..stga_addon.driving.live.take import Recording
 from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S
 from ..stga_addon.driving.transfer import trained_range
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.rig.live_pose import LivePose
 from ..stga_addon.scene.rig.trained import store_range, stored_range
 from . import ids, live_session
@@ -24,6 +23,7 @@ from .common import (
     head_of,
     needs_rig,
     needs_rig_or_shapes,
+    path_property,
     reporting,
     rig_or_none,
     scene_settings,
@@ -78,17 +78,11 @@ class DriveOptions:
     mirror: bpy.props.BoolProperty(name="Mirror", description="Exchange left and right, as a mirror does")
     exchange_jaw: exchange_property("jaw")
     exchange_mouth: exchange_property("mouth")
-    detector: bpy.props.StringProperty(
-        name="Detector",
-        description="Google's face_landmarker.task, which detects the shapes in a video",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS,
-    )
-    takes: bpy.props.StringProperty(
-        name="Takes",
-        description="Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS,
+    detector: path_property("Detector", "Google's face_landmarker.task, which detects the shapes in a video")
+    takes: path_property(
+        "Takes",
+        "Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",
+        "DIR_PATH",
         default="//stga_takes",
     )
 
@@ -100,9 +94,7 @@ class MeasureRange(bpy.types.Operator):
     bl_label = "Measure Trained Range"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_rig(cls, context)
+    poll = classmethod(needs_rig)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -119,9 +111,7 @@ class DriveLive(bpy.types.Operator):
     bl_label = "Drive Live"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_rig_or_shapes(cls, context)
+    poll = classmethod(needs_rig_or_shapes)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -10,7 +10,7 @@ from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import ConvertMotion
 from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES, is_video
 from . import ids
-from .common import FileImport, file_path, needs_rig_or_shapes, reporting, scene_settings
+from .common import FileImport, file_filter, file_path, needs_rig_or_shapes, reporting, scene_settings
 from .drive import takes_folder
 from .request import needs_idle, start
 from .training_python import training_python
@@ -24,9 +24,7 @@ class DriveVideo(bpy.types.Operator, FileImport):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filename_ext = ".mp4"
-    filter_glob: bpy.props.StringProperty(
-        default=";".join(f"*{suffix}" for suffix in VIDEO_SUFFIXES), options={"HIDDEN"}
-    )
+    filter_glob: file_filter(*VIDEO_SUFFIXES)
 
     @classmethod
     def poll(cls, context: Any) -> bool:

@@ -8,10 +8,9 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
 from .apply_motion import ApplyMotion
-from .common import file_path, is_head, reporting, scene_settings
+from .common import file_path, is_head, path_property, reporting, scene_settings
 
 MOTION_FIELDS = {*FRAME_FIELDS, *FIELD_ALIASES, "pose"}
 
@@ -23,12 +22,7 @@ class OpenNpz(bpy.types.Operator):
     bl_label = "Open Avatar or Motion"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO", "INTERNAL"}
 
-    filepath: bpy.props.StringProperty(
-        name="File",
-        description="Avatar file or FLAME parameters (.npz)",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
-    )
+    filepath: path_property("File", "Avatar file or FLAME parameters (.npz)", options={"SKIP_SAVE"})
 
     @reporting
     def execute(self, context: Any) -> set[str]:

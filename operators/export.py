@@ -15,12 +15,21 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar, range_bytes
 from ..stga_addon.format import format_bytes
 from ..stga_addon.scene.arrays import evaluated_vertices
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display.splat_object import check_head
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from . import ids
-from .common import capture_of, file_path, flame_of, head_of, needs_head, reporting, scene_settings
+from .common import (
+    capture_of,
+    file_filter,
+    file_path,
+    flame_of,
+    head_of,
+    needs_head,
+    path_property,
+    reporting,
+    scene_settings,
+)
 from .export_range import RangeExport
 from .export_web import exact_motion, scene_playback
 
@@ -35,25 +44,19 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     bl_label = "Export Avatar"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    filepath: bpy.props.StringProperty(
-        name="File or Folder",
-        description="A folder for PLY Sequence and GaussianAvatars, a file for the other formats",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    filepath: path_property(
+        "File or Folder",
+        "A folder for PLY Sequence and GaussianAvatars, a file for the other formats",
+        options={"SKIP_SAVE"},
     )
-    avatar: bpy.props.StringProperty(
-        name="Avatar",
-        description="Avatar file (.npz); empty: the one shown",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
-    )
+    avatar: path_property("Avatar", "Avatar file (.npz); empty: the one shown", options={"SKIP_SAVE"})
     format: bpy.props.EnumProperty(
         name="Format",
         description="File format",
         items=tuple((name, format.label, format.description) for name, format in FORMATS.items()),
     )
 
-    filter_glob: bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+    filter_glob: file_filter(*SUFFIXES)
     motion_only: bpy.props.BoolProperty(
         name="Motion Only",
         description="Leave out blend shapes, skeleton and sliders of the FLAME model. The head's triangles and posed "
@@ -62,9 +65,7 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     _range: RangeExport | None = None
     _is_invoked = False
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_head(cls, context)
+    poll = classmethod(needs_head)
 
     @property
     def filename_ext(self) -> str:

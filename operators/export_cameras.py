@@ -6,9 +6,8 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.scene.camera_export import export_cameras
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
-from .common import file_path, reporting
+from .common import file_filter, file_path, path_property, reporting
 
 
 class ExportCameras(bpy.types.Operator, ExportHelper):
@@ -19,13 +18,8 @@ class ExportCameras(bpy.types.Operator, ExportHelper):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filename_ext = ".json"
-    filepath: bpy.props.StringProperty(
-        name="File",
-        description="transforms.json in the folder of the footage",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
-    )
-    filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
+    filepath: path_property("File", "transforms.json in the folder of the footage", options={"SKIP_SAVE"})
+    filter_glob: file_filter(".json")
     selected_only: bpy.props.BoolProperty(
         name="Selected Only", description="Export selected cameras instead of all in the scene"
     )

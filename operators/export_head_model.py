@@ -10,7 +10,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.shape_keys import has_shape_keys, shape_key_model
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
 from . import ids
-from .common import file_path, reporting
+from .common import file_filter, file_path, reporting
 
 
 class ExportHeadModel(bpy.types.Operator, ExportHelper):
@@ -21,7 +21,7 @@ class ExportHeadModel(bpy.types.Operator, ExportHelper):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filename_ext = ".npz"
-    filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
+    filter_glob: file_filter(".npz")
 
     @classmethod
     def poll(cls, context: Any) -> bool:

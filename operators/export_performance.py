@@ -6,11 +6,10 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.driving.inverse import captured_performance, write_performance
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second
 from . import ids
-from .common import capture_of, file_path, flame_of, head_of, needs_rig, reporting
+from .common import capture_of, file_filter, file_path, flame_of, head_of, needs_rig, path_property, reporting
 
 
 class ExportPerformance(bpy.types.Operator, ExportHelper):
@@ -20,18 +19,11 @@ class ExportPerformance(bpy.types.Operator, ExportHelper):
     bl_label = "Export ARKit Curves"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    filepath: bpy.props.StringProperty(
-        name="File",
-        description="CSV file in Live Link Face's layout",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
-    )
+    filepath: path_property("File", "CSV file in Live Link Face's layout", options={"SKIP_SAVE"})
     filename_ext = ".csv"
-    filter_glob: bpy.props.StringProperty(default="*.csv", options={"HIDDEN"})
+    filter_glob: file_filter(".csv")
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_rig(cls, context)
+    poll = classmethod(needs_rig)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -12,13 +12,22 @@ from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.objects import COLLECTIONS, capture_root, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.scene.viewports import frame_head
 from ..stga_addon.tracking.folder import is_tracked
 from . import ids
-from .common import FileImport, file_path, flame_model_path, flame_property, is_head, reporting, scene_settings
+from .common import (
+    FileImport,
+    file_filter,
+    file_path,
+    flame_model_path,
+    flame_property,
+    is_head,
+    path_property,
+    reporting,
+    scene_settings,
+)
 from .prepare import begin_preparing
 
 
@@ -29,17 +38,14 @@ class ImportCapture(bpy.types.Operator, FileImport):
     bl_label = "Import Capture"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(
-        name="File",
-        description="Transforms file of the capture, such as transforms_train.json; or its folder",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    filepath: path_property(
+        "File", "Transforms file of the capture, such as transforms_train.json; or its folder", options={"SKIP_SAVE"}
     )
-    directory: bpy.props.StringProperty(
-        name="Capture",
-        description="Folder of the capture, with its transforms files or meshes; not needed where a file is given",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    directory: path_property(
+        "Capture",
+        "Folder of the capture, with its transforms files or meshes; not needed where a file is given",
+        "DIR_PATH",
+        options={"SKIP_SAVE"},
     )
     flame: flame_property()
     principal_point: bpy.props.EnumProperty(
@@ -66,7 +72,7 @@ class ImportCapture(bpy.types.Operator, FileImport):
         "to Standard, which the splats' colors are trained for",
         default=True,
     )
-    filter_glob: bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
+    filter_glob: file_filter(".json")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

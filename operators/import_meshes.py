@@ -5,9 +5,8 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
-from .common import FileImport, file_path, reporting
+from .common import FileImport, file_filter, file_path, path_property, reporting
 from .import_capture import bring_in
 
 
@@ -18,15 +17,8 @@ class ImportMeshes(bpy.types.Operator, FileImport):
     bl_label = "Import Mesh Sequence"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    filepath: bpy.props.StringProperty(
-        name="File",
-        description="Any mesh of the sequence; the whole folder is imported",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
-    )
-    filter_glob: bpy.props.StringProperty(
-        default=";".join(f"*{suffix}" for suffix in MESH_SUFFIXES), options={"HIDDEN"}
-    )
+    filepath: path_property("File", "Any mesh of the sequence; the whole folder is imported", options={"SKIP_SAVE"})
+    filter_glob: file_filter(*MESH_SUFFIXES)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

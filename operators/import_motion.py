@@ -6,7 +6,7 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from . import ids
-from .common import FileImport, file_path, flame_model_path, flame_property, reporting
+from .common import FileImport, file_filter, file_path, flame_model_path, flame_property, reporting
 from .import_capture import bring_in
 
 
@@ -19,7 +19,7 @@ class ImportMotion(bpy.types.Operator, FileImport):
 
     filename_ext = ".npz"
     flame: flame_property()
-    filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
+    filter_glob: file_filter(".npz")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

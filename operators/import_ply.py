@@ -8,7 +8,7 @@ import bpy
 from ..stga_addon.export.ply import read_ply
 from ..stga_addon.scene.display.splat_object import show_world_splats
 from . import ids
-from .common import FileImport, file_path, reporting, scene_settings
+from .common import FileImport, file_filter, file_path, reporting, scene_settings
 
 # Up axis of the file -> rotation about x in degrees that turns it to Blender's.
 _ROTATION_DEG = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
@@ -22,7 +22,7 @@ class ImportPly(bpy.types.Operator, FileImport):
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     filename_ext = ".ply"
-    filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: file_filter(".ply")
     up: bpy.props.EnumProperty(
         name="Up",
         description="Axis of the file that points up",

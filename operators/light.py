@@ -7,13 +7,12 @@ import bpy
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import Relight
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import get_input
 from ..stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow
 from ..stga_addon.scene.render.frame_colors import forget_frame, relight_frame
 from . import ids
-from .common import file_path, flame_model_path, reporting, scene_settings
+from .common import file_path, flame_model_path, path_property, reporting, scene_settings
 from .request import needs_idle, start
 from .training_python import training_python
 
@@ -36,9 +35,7 @@ class EstimateLight(bpy.types.Operator):
     bl_label = "Estimate Light"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    directory: bpy.props.StringProperty(
-        name="Run Folder", description="Folder of the avatar's run", subtype="DIR_PATH", options=PATH_OPTIONS
-    )
+    directory: path_property("Run Folder", "Folder of the avatar's run", "DIR_PATH")
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -62,9 +59,7 @@ class RelightFrame(bpy.types.Operator):
         name="Clear", description="Show recorded colors again", default=False, options={"SKIP_SAVE"}
     )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return _needs_splats(cls, context)
+    poll = classmethod(_needs_splats)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -83,9 +78,7 @@ class HeadShadow(bpy.types.Operator):
     bl_label = "Shadow onto the Scene"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return _needs_splats(cls, context)
+    poll = classmethod(_needs_splats)
 
     def execute(self, context: Any) -> set[str]:
         splats = scene_settings(context).splats

@@ -8,10 +8,9 @@ import bpy
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.environment_make import PYPI_SIZE_GB, SIZE_GB, TRACKING_GB, make_arguments
 from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.own_python import own_python
 from . import ids
-from .common import environment_folder, file_path, reporting
+from .common import environment_folder, file_path, path_property, reporting
 from .environment import run_environment_worker
 from .request import needs_idle
 
@@ -25,11 +24,8 @@ class MakeEnvironment(bpy.types.Operator):
     bl_label = "Make Training Environment"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    wheels: bpy.props.StringProperty(
-        name="Wheels",
-        description="Folder of wheel files to install from without a network; empty: download them",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS,
+    wheels: path_property(
+        "Wheels", "Folder of wheel files to install from without a network; empty: download them", "DIR_PATH"
     )
     tracking: bpy.props.BoolProperty(
         name="Tracking",

@@ -33,8 +33,8 @@ from ..stga_addon.requests.monitor_state import (
 )
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.viewports import open_sidebar
-from ..stga_addon.training.effect_decisions import TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
+from ..stga_addon.training.run.tracking_file import TRACKING
 from ..stga_addon.worker.environment import status_folder
 from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker, refuse_running_worker, request_cancel
 from . import ids

@@ -22,9 +22,7 @@ class PoseHead(bpy.types.Operator):
     bl_label = "Pose the Jaw"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_rig(cls, context)
+    poll = classmethod(needs_rig)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -18,7 +18,6 @@ from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.recording import Recorder, check_output
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import RenderRecording
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
@@ -28,7 +27,7 @@ from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.timeline import frames_per_second
 from ..stga_addon.worker.status import status_writer
 from . import ids, monitor
-from .common import file_path, is_head, reporting, scene_settings
+from .common import file_filter, file_path, is_head, path_property, reporting, scene_settings
 from .render_engine import render_device
 from .request import needs_idle, start
 from .training_python import has_training_python, training_python
@@ -45,12 +44,7 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
     bl_label = "Render Video"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    filepath: bpy.props.StringProperty(
-        name="File or Folder",
-        description="An .mp4 file, or a folder for PNGs",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
-    )
+    filepath: path_property("File or Folder", "An .mp4 file, or a folder for PNGs", options={"SKIP_SAVE"})
     path: bpy.props.EnumProperty(
         name="Camera",
         description="How the camera moves",
@@ -83,7 +77,7 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         soft_max=60.0,
     )
     filename_ext = ""
-    filter_glob: bpy.props.StringProperty(default="*.mp4", options={"HIDDEN"})
+    filter_glob: file_filter(".mp4")
 
     @classmethod
     def poll(cls, context: Any) -> bool:

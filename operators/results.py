@@ -57,6 +57,14 @@ def _head(scene: Any, state: RequestState) -> Any:
     return getattr(scene, ids.SETTINGS).head
 
 
+def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
+    """Call an operator, which reports in the window that shows the scene, if there is one; undo takes it back there."""
+    window = next((each for each in bpy.context.window_manager.windows if each.scene == scene), None)
+    with bpy.context.temp_override(**({"window": window} if window is not None else {"scene": scene})):
+        operator("EXEC_DEFAULT", window is not None, **options)
+    return Shown()
+
+
 # Training
 
 
@@ -135,14 +143,10 @@ def _load(path: Path) -> tuple[Avatar, SplatAttributes]:
 
 
 def _import_tracked(scene: Any, state: RequestState) -> Answer:
-    """Import the tracked capture with the operator, which reports in the window that shows the scene."""
+    """Import the tracked capture."""
     assert state.folder is not None
     model = getattr(read_request(state.folder), "model", "") if is_flame(state.place) else ""
-    window = next((each for each in bpy.context.window_manager.windows if each.scene == scene), None)
-    with bpy.context.temp_override(**({"window": window} if window is not None else {"scene": scene})):
-        undoable = window is not None
-        bpy.ops.stga.import_capture("EXEC_DEFAULT", undoable, directory=str(state.place), flame=str(model))
-    return Shown()
+    return _operate(scene, bpy.ops.stga.import_capture, directory=str(state.place), flame=str(model))
 
 
 # Analysis and selection
@@ -179,15 +183,11 @@ def _select_for_take(scene: Any, state: RequestState) -> Answer:
 
 
 def _apply_performance(scene: Any, state: RequestState) -> Answer:
-    """Apply the performance that was written to the scene's head, with the operator, which reports in the window."""
+    """Apply the performance that was written to the scene's head."""
     head = _head(scene, state)
     if not is_head(head):
         raise StgaError(f"{state.subject}: was written, but the scene has no head to apply it to")
-    window = next((each for each in bpy.context.window_manager.windows if each.scene == scene), None)
-    with bpy.context.temp_override(**({"window": window} if window is not None else {"scene": scene})):
-        undoable = window is not None
-        bpy.ops.stga.apply_motion("EXEC_DEFAULT", undoable, filepath=str(state.subject), start=scene.frame_start)
-    return Shown()
+    return _operate(scene, bpy.ops.stga.apply_motion, filepath=str(state.subject), start=scene.frame_start)
 
 
 def _store_light(scene: Any, state: RequestState) -> Answer:

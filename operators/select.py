@@ -9,14 +9,13 @@ import numpy as np
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.display.heat_map import RESIDUAL, has_heat_map, hide_heat_map, show_heat_map, shows_residuals
 from ..stga_addon.scene.vertex_groups import read_regions, read_selection, splats_per_face, write_selection
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.training.run.residual_file import read_residuals
 from ..stga_addon.training.settings import TrainingSettings
 from . import ids
-from .common import capture_of, file_path, head_of, needs_head, needs_own_head, reporting, scene_settings
+from .common import capture_of, file_path, head_of, needs_head, needs_own_head, path_property, reporting, scene_settings
 
 LARGEST_RESIDUAL_QUANTILE = 0.98
 """Triangles with residuals from here up are shown alike, so that a few at the border do not make all others blue."""
@@ -54,9 +53,7 @@ class Select(bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_own_head(cls, context)
+    poll = classmethod(needs_own_head)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -86,9 +83,7 @@ class ToggleRegion(bpy.types.Operator):
 
     name: bpy.props.StringProperty(name="Name", description="A region of the capture, or a vertex group of the head")
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_own_head(cls, context)
+    poll = classmethod(needs_own_head)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -108,9 +103,7 @@ class CountSelected(bpy.types.Operator):
     bl_label = "Update Counts"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_head(cls, context)
+    poll = classmethod(needs_head)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -138,16 +131,11 @@ class HeatMap(bpy.types.Operator):
         ),
         options={"SKIP_SAVE"},
     )
-    directory: bpy.props.StringProperty(
-        name="Run Folder",
-        description="Folder of the run whose residuals are shown",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    directory: path_property(
+        "Run Folder", "Folder of the run whose residuals are shown", "DIR_PATH", options={"SKIP_SAVE"}
     )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_own_head(cls, context)
+    poll = classmethod(needs_own_head)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

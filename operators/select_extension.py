@@ -6,9 +6,8 @@ import bpy
 
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import SelectForTake
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
-from .common import capture_source, file_path, head_of, needs_own_head, reporting
+from .common import capture_source, file_path, head_of, needs_own_head, path_property, reporting
 from .request import needs_idle, start
 from .training_python import training_python
 
@@ -21,9 +20,7 @@ class SelectExtension(bpy.types.Operator):
     bl_label = "Select What Extend Trains"
     bl_options: ClassVar[set[str]] = {"REGISTER"}  # the selection, which comes later, is the step to undo
 
-    directory: bpy.props.StringProperty(
-        name="Run Folder", description="Folder of the run to extend", subtype="DIR_PATH", options=PATH_OPTIONS
-    )
+    directory: path_property("Run Folder", "Folder of the run to extend", "DIR_PATH")
 
     @classmethod
     def poll(cls, context: Any) -> bool:

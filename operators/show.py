@@ -10,7 +10,7 @@ from ..stga_addon.scene.display.hints import use_transparent_bounces
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes
 from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
 from . import ids
-from .common import FileImport, file_path, head_of, needs_head, reporting, scene_settings
+from .common import FileImport, file_filter, file_path, head_of, needs_head, reporting, scene_settings
 
 
 class ShowAvatar(bpy.types.Operator, FileImport):
@@ -26,11 +26,9 @@ class ShowAvatar(bpy.types.Operator, FileImport):
         description="Hide the head's mesh, which covers the splats; it still deforms them",
         default=True,
     )
-    filter_glob: bpy.props.StringProperty(default="*.npz", options={"HIDDEN"})
+    filter_glob: file_filter(".npz")
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_head(cls, context)
+    poll = classmethod(needs_head)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

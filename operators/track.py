@@ -7,20 +7,14 @@ import bpy
 
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import SolveAgain, Track
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from . import ids
-from .common import file_path, reporting
+from .common import file_path, path_property, reporting
 from .export_head_model import write_shape_key_model
 from .request import needs_idle, start
 from .training_python import training_python
 
 HEAD_MODEL = "head_model.npz"
 """In the capture's folder: the shape keys that it was tracked with."""
-
-
-def path_property(name: str, description: str, subtype: str = "FILE_PATH", **more: Any) -> Any:
-    """A path of the operator, and of the panel that calls it."""
-    return bpy.props.StringProperty(name=name, description=description, subtype=subtype, options=PATH_OPTIONS, **more)
 
 
 class TrackOptions:
@@ -62,11 +56,8 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
     bl_label = "Track Footage"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    landmarks: bpy.props.StringProperty(
-        name="Landmarks",
-        description="Folder with landmark files of another detector",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS | {"SKIP_SAVE"},
+    landmarks: path_property(
+        "Landmarks", "Folder with landmark files of another detector", "DIR_PATH", options={"SKIP_SAVE"}
     )
     python: bpy.props.StringProperty(
         name="Python",

@@ -15,7 +15,6 @@ from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.rig.flame_rig import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
-from ..stga_addon.tracking.posed_points import parameters_of
 from . import ids
 from .common import capture_of, flame_of, head_of, is_head, needs_head, needs_rig, reporting, scene_settings
 from .request import needs_idle
@@ -86,7 +85,7 @@ class MarkKey(bpy.types.Operator):
         if frame in keys:
             del keys[frame]
         else:
-            keys[frame] = parameters_of(sample_pose(head, flame_of(capture_of(head), head.name).model))
+            keys[frame] = sample_pose(head, flame_of(capture_of(head), head.name).model).parameters
             key_current_pose(head, rig_of(head), frame)
         head[tags.TRACKING_KEYS] = json.dumps({str(timestep): keys[timestep].tolist() for timestep in sorted(keys)})
         return {"FINISHED"}

@@ -8,14 +8,13 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import Extend, Refine, Resume
 from ..stga_addon.requests.values import Train as TrainRequest
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effect_decisions import parse_choices
 from ..stga_addon.training.run.folder import read_run
 from ..stga_addon.training.settings import PRESETS, make_settings
 from ..stga_addon.worker.environment import stored_adapters
 from . import ids
-from .common import capture_source, environment_folder, file_path, head_of, needs_head, reporting
+from .common import capture_source, environment_folder, file_path, head_of, needs_head, path_property, reporting
 from .request import needs_idle, python_of, start
 
 
@@ -102,12 +101,7 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     bl_label = "Train Avatar"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    directory: bpy.props.StringProperty(
-        name="Run Folder",
-        description="Folder for the avatar and its checkpoints",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS,
-    )
+    directory: path_property("Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH")
     seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",

@@ -24,6 +24,7 @@ import numpy as np
 
 from .errors import StgaError
 
+MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
 MAX_COMPRESSION = 16
@@ -199,6 +200,17 @@ def file_size(path: Path) -> int:
     return found.st_size
 
 
+def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """What a file holds. Raises StgaError where it is missing, no regular file or above the limit."""
+    size = file_size(path)
+    if size > limit:
+        raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
 def read_json(path: Path) -> Any:
     """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing, malformed or above 256 MiB."""
     return _parsed(path, "JSON", MAX_JSON_BYTES, parse_json)
@@ -211,13 +223,9 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) -> Any:
-    size = file_size(path)
-    if size > limit:
-        raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
+    data = read_bytes(path, limit)
     try:
-        return parse(path.read_bytes())
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+        return parse(data)
     except (ValueError, RecursionError) as error:
         raise StgaError(f"{path}: is not valid {form} ({error})") from error
 

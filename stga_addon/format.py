@@ -1,4 +1,6 @@
-"""Human-readable formatting of quantities."""
+"""Human-readable formatting of quantities and tables."""
+
+from collections.abc import Sequence
 
 
 def format_duration(seconds: float) -> str:
@@ -19,3 +21,9 @@ def format_bytes(size: float) -> str:
             value = size / factor
             return f"{value:.1f} {unit}" if value < 10 else f"{value:.0f} {unit}"
     return f"{size:.0f} bytes"
+
+
+def format_table(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Lines of labels and values, the values below each other."""
+    width = max((len(label) for label, _ in rows), default=0)
+    return [f"{label:<{width}}  {value}" for label, value in rows]

@@ -36,7 +36,7 @@ class ArkitPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         head = scene_settings(context).head
-        rig = rig_or_none(head) if is_head(head) else None
+        rig = rig_or_none(head)
         if rig is None or not has_controls(rig):
             self.layout.operator(ids.ADD_ARKIT_CONTROLS, icon="ADD")
             return
@@ -56,7 +56,7 @@ class TrainedPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         head = scene_settings(context).head
-        rig = rig_or_none(head) if is_head(head) else None
+        rig = rig_or_none(head)
         trained = stored_range(head) if rig is not None else None
         if trained is None:
             self.layout.operator(ids.MEASURE_RANGE, icon="DRIVER_DISTANCE")

@@ -5,7 +5,7 @@ from typing import Any
 import bpy
 
 from ..operators import ids, monitor
-from ..operators.common import is_head, scene_settings
+from ..operators.common import is_head, rig_or_none, scene_settings
 from ..operators.open_demo import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
@@ -15,7 +15,6 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
-from ..stga_addon.scene.rig.flame_rig import rig_of
 from .sidebar import SidebarPanel
 from .text import draw_text
 from .train_panel import draw_environment_setup, draw_train_button
@@ -69,7 +68,7 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
     play = "Pause" if playing else "Play  (Space)"
     column = layout.column(align=True)
     column.operator("screen.animation_play", text=play, icon="PAUSE" if playing else "PLAY")
-    rig = _rig(settings.head)
+    rig = rig_or_none(settings.head)
     if rig is not None:
         posing = is_posing(context, rig)
         text = "Done Posing" if posing else "Pose the Jaw"
@@ -92,11 +91,3 @@ def _draw_selection_toggle(layout: Any, splats: Any) -> None:
     if identifier is not None:
         owner, prop = modifier_input_owner(modifier, identifier)
         layout.prop(owner, prop, text=splat_nodes.SHOW_SELECTION, icon="RESTRICT_SELECT_OFF", toggle=True)
-
-
-def _rig(head: Any) -> Any:
-    """The head's FLAME rig, or None."""
-    try:
-        return rig_of(head) if is_head(head) else None
-    except StgaError:
-        return None

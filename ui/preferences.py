@@ -5,11 +5,10 @@ from typing import Any
 import bpy
 
 from ..operators import ids, monitor
-from ..operators.common import register_classes, unregister_classes
+from ..operators.common import path_property, register_classes, unregister_classes
 from ..operators.training_python import has_training_python
 from ..stga_addon.requests.environment_job import CAN_MAKE
 from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.worker.environment import PYTHON_VARIABLE
 from ..stga_addon.worker.status import WorkerState
 from .request import draw_failure, draw_running
@@ -18,12 +17,10 @@ from .request import draw_failure, draw_running
 class Preferences(bpy.types.AddonPreferences):
     bl_idname = __package__.rpartition(".")[0]
 
-    flame_model: bpy.props.StringProperty(
-        name="FLAME Model",
-        description="Your own FLAME model file (.pkl or .npz), from flame.is.tue.mpg.de; "
+    flame_model: path_property(
+        "FLAME Model",
+        "Your own FLAME model file (.pkl or .npz), from flame.is.tue.mpg.de; "
         "needed for captures tracked with FLAME, and never part of this add-on",
-        subtype="FILE_PATH",
-        options=PATH_OPTIONS,
     )
 
     training_python: bpy.props.StringProperty(

@@ -6,12 +6,11 @@ from typing import Any
 import bpy
 
 from ..operators import ids
-from ..operators.common import register_classes, unregister_classes
+from ..operators.common import path_property, register_classes, unregister_classes
 from ..operators.continue_run import ExtendOptions, RefineOptions
 from ..operators.drive import DriveOptions
-from ..operators.track import TrackOptions, path_property
+from ..operators.track import TrackOptions
 from ..operators.train import TrainOptions, preset_property
-from ..stga_addon.scene.compat import PATH_OPTIONS
 
 
 class SelectedFrame(bpy.types.PropertyGroup):
@@ -103,12 +102,8 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     splats: bpy.props.PointerProperty(
         name="Splats", description="Splats whose display is set here", type=bpy.types.Object
     )
-    run_folder: bpy.props.StringProperty(
-        name="Run Folder",
-        description="Folder for the avatar and its checkpoints",
-        subtype="DIR_PATH",
-        options=PATH_OPTIONS,
-        default="//stga_run",
+    run_folder: path_property(
+        "Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH", default="//stga_run"
     )
     refine: bpy.props.PointerProperty(type=RefineSettings)
     extend: bpy.props.PointerProperty(type=ExtendSettings)
@@ -123,9 +118,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     )
     training_run: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last run
     result_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # its avatar has reached the scene
-    avatar: bpy.props.StringProperty(
-        name="Avatar", description="Trained avatar file (.npz)", subtype="FILE_PATH", options=PATH_OPTIONS
-    )
+    avatar: path_property("Avatar", "Trained avatar file (.npz)")
 
 
 CLASSES = (SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, DriveSettings, SceneSettings)

@@ -9,7 +9,6 @@ from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
 from ..operators.track import TrackOptions
 from ..operators.track_correct import tracking_keys
-from ..operators.training_python import has_training_python
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.shape_keys import has_shape_keys
@@ -18,7 +17,7 @@ from .options import set_options
 from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .train_panel import draw_environment_setup
+from .train_panel import draw_missing_environment
 
 
 class TrackPanel(SidebarPanel, bpy.types.Panel):
@@ -41,9 +40,7 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
             name = thing.name if has_shape_keys(thing) else "none"
             layout.label(text=f"Shape keys of the active object: {name}", icon="SHAPEKEY_DATA")
         _draw_button(layout, settings)
-        if not has_training_python(context):
-            layout.label(text="No training environment yet", icon="INFO")
-            draw_environment_setup(layout)
+        draw_missing_environment(layout, context)
 
 
 class TrackOptionsPanel(SidebarPanel, bpy.types.Panel):

@@ -13,8 +13,8 @@ from ..operators.training_python import has_training_python
 from ..stga_addon.format import format_duration
 from ..stga_addon.requests.monitor_state import Kind, RequestState
 from ..stga_addon.scene import tags
-from ..stga_addon.training.effect_decisions import TRACKING
 from ..stga_addon.training.run.progress import describe_figures
+from ..stga_addon.training.run.tracking_file import TRACKING
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
 from .options import set_options
@@ -48,9 +48,7 @@ def _draw_choices(layout: Any, context: Any) -> None:
     row = layout.row(align=True)
     draw_train_button(row, settings)
     draw_train_button(row, settings, resume=True)
-    if not has_training_python(context):
-        layout.label(text="No training environment yet", icon="INFO")
-        draw_environment_setup(layout)
+    draw_missing_environment(layout, context)
 
 
 def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
@@ -61,6 +59,13 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     set_options(train, settings, TrainOptions)
     train.directory, train.resume = settings.run_folder, resume
     train.effects = " ".join(chosen_effects(settings))
+
+
+def draw_missing_environment(layout: Any, context: Any) -> None:
+    """Say where there is no training environment yet, and how to make one."""
+    if not has_training_python(context):
+        layout.label(text="No training environment yet", icon="INFO")
+        draw_environment_setup(layout)
 
 
 def draw_environment_setup(layout: Any) -> None:

@@ -174,34 +174,34 @@ def _check(path: Path, avatar: Avatar) -> None:
             f"{path}: principal_point is {shorten(avatar.principal_point)}, "
             f"expected one of {', '.join(PRINCIPAL_POINTS)}"
         )
-    _check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
-    _check_array(path, "faces", avatar.faces, "int32", (-1, 3))
+    check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
+    check_array(path, "faces", avatar.faces, "int32", (-1, 3))
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
     count = len(avatar.splats.xyz) if avatar.splats.xyz.ndim else 0
     for name, kind in ARRAYS.items():
         array = getattr(avatar.splats, name)
-        _check_array(path, name, array, kind.dtype, (count, *kind.shape))
+        check_array(path, name, array, kind.dtype, (count, *kind.shape))
         if kind.sizes and array.shape[1] not in kind.sizes:
             raise StgaError(f"{path}: {name} has {array.shape[1]} coefficients, expected one of {kind.sizes}")
     if avatar.strain_range is not None:
-        _check_array(path, "strain_range", avatar.strain_range, "float32", (len(avatar.faces), 2, STRAIN_COMPONENTS))
+        check_array(path, "strain_range", avatar.strain_range, "float32", (len(avatar.faces), 2, STRAIN_COMPONENTS))
     for name, coefficients in avatar.driven_offsets.items():
-        _check_array(path, name, coefficients, "float32", (len(avatar.faces), OFFSETS[name].signals, 3))
+        check_array(path, name, coefficients, "float32", (len(avatar.faces), OFFSETS[name].signals, 3))
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
-        _check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))
+        check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))
     numbers = [value for value in avatar.background if isinstance(value, (int, float)) and 0 <= value <= 1]
     if len(numbers) != 3 or len(avatar.background) != 3:
         raise StgaError(f"{path}: background is {shorten(avatar.background)}, expected three numbers between 0 and 1")
 
 
-def _check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:
+def check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:
     """Raise StgaError unless dtype and shape (-1: any) are as expected and every number is finite."""
     fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, array.shape, strict=True))
     if not fits or array.dtype != dtype:
         expected = ", ".join("any" if size < 0 else str(size) for size in shape)
         raise StgaError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} ({expected})")
-    if dtype == "float32" and not np.isfinite(array).all():
+    if not np.isfinite(array).all():
         raise StgaError(f"{path}: {name} holds a value that is not finite")
 
 

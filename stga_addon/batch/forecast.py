@@ -66,8 +66,8 @@ def pace(job: Job, request: Train) -> float | None:
         return None
     from ..capture.open import open_capture
     from ..render.device import choose_device
-    from ..report.preset_timing import seconds_per_iteration
     from ..training.effects.plan import plan_effects
+    from ..training.preset_timing import seconds_per_iteration
 
     try:
         with _threads(job.resources.threads):

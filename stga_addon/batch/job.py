@@ -1,6 +1,6 @@
 """Jobs of a batch: a request each, what it comes after and what it needs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -78,6 +78,17 @@ class Job:
         if isinstance(self.request, RenderBlend):
             return all(picture.exists() for picture in self.request.pictures.values())
         return self.product is None or self.product.exists()
+
+
+def alike(jobs: Sequence[Job], most: int) -> list[list[Job]]:
+    """The jobs in groups of the same table and the same needs, of at most so many."""
+    groups: dict[tuple[str, Resources, int], list[Job]] = {}
+    for job in jobs:
+        number = 0
+        while len(groups.setdefault((job.table, job.resources, number), [])) == most:
+            number += 1
+        groups[job.table, job.resources, number].append(job)
+    return list(groups.values())
 
 
 def output_field(kind: type[Any]) -> str | None:

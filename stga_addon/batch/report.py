@@ -164,11 +164,10 @@ def held_out_pair(run: Path) -> np.ndarray | None:
     from ..capture.images import read_image
     from ..render.render import render_avatar
     from ..training.evaluate.evaluation_views import choose_evaluation_views
-    from ..training.optimize.flame_refinement import with_refined_tracking
     from ..training.run.folder import AVATAR
-    from ..training.run.open_run import open_run
+    from ..training.run.open_run import open_refined
 
-    capture = with_refined_tracking(open_run(run).capture, run)
+    capture = open_refined(run)
     views = choose_evaluation_views(capture)
     if not views:
         return None

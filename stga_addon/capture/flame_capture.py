@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..flame.masks import key_regions
-from ..flame.model import FlameModel, read_flame
+from ..flame.model import FlameModel, key_regions, read_flame
 from ..flame.sequence import (
     FlameSequence,
     expression_mesh,

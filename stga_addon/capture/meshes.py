@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import file_size, read_json
-from ..flame.masks import faces_within
+from ..files import read_bytes, read_json
+from ..flame.model import faces_within
 from .camera import MAX_COORDINATE_M
 from .glb_chunks import glb_chunks
 
@@ -34,13 +34,7 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise StgaError(f"{path}: is not a mesh; expected one of {', '.join(MESH_SUFFIXES)}")
-    size = file_size(path)
-    if size > MAX_MESH_BYTES:
-        raise StgaError(f"{path}: has {size} bytes, more than the {MAX_MESH_BYTES} allowed")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    data = read_bytes(path, MAX_MESH_BYTES)
     vertices, faces = _parse_obj(path, data) if suffix == ".obj" else _parse_with_trimesh(path, data, suffix[1:])
     return checked_mesh(path, vertices, faces)
 

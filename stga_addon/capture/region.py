@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_npz
-from ..flame.masks import faces_within
+from ..flame.model import faces_within
 from .meshes import read_regions
 from .model import Capture
 

@@ -135,7 +135,7 @@ def _write_blend(out: Path) -> Path | None:
     if find_spec("bpy") is None:
         print("warning: no .blend file: this Python has no bpy (install bpy, or run the command in Blender)")
         return None
-    from ..training.optimize.flame_refinement import with_refined_tracking
+    from ..training.run.tracking_file import with_refined_tracking
 
     return write_blend(out, lambda capture: with_refined_tracking(capture, out / RUN))
 

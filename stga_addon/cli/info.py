@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..avatar.file import read_avatar
 from ..errors import StgaError
+from ..format import format_table
 from ..requests.open_head import OpenHead
 from ..requests.results import Analyzed
 from ..requests.values import Analyze
@@ -15,7 +16,6 @@ from ..training.run.folder import RUN
 from .arguments import add_capture, add_device, add_effects
 from .carry_out import carry_out
 from .inputs import open_named_capture, principal_point_of
-from .table import print_table
 
 NAME, HELP = "info", "show what a capture, a run or an avatar file holds, and which effects training would use"
 
@@ -47,10 +47,10 @@ def run(options: Namespace) -> None:
     if capture is None:
         print(json.dumps(to_json(found)))
         return
-    print_table(summarize_capture(capture))
+    print(*format_table(summarize_capture(capture)), sep="\n")
     if found.plan:
         print()
-        print_table(describe_effects(found.plan))
+        print(*format_table(describe_effects(found.plan)), sep="\n")
 
 
 def _describe_avatar(path: Path) -> None:
@@ -61,4 +61,7 @@ def _describe_avatar(path: Path) -> None:
     avatar = read_avatar(avatar_path(path))
     rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
     lines = (UNKNOWN_LIGHT,) if avatar.light is None else describe_light(avatar.light)
-    print_table([*rows, *((name, text.strip()) for name, _, text in (line.partition(":") for line in lines))])
+    print(
+        *format_table([*rows, *((name, text.strip()) for name, _, text in (line.partition(":") for line in lines))]),
+        sep="\n",
+    )

@@ -9,14 +9,12 @@ import numpy as np
 
 from ..errors import StgaError
 from ..flame.forward import joint_positions
-from ..flame.model import JOINTS, FlameModel
+from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from ..tracking.posed_points import SurfacePoints
 from .shapes import PUPILS, SKIN_POINTS, face_shapes
 
 EYE_JOINTS = (JOINTS.index("right_eye"), JOINTS.index("left_eye"))
 MIN_EYE_DISTANCE_M, MAX_EYE_DISTANCE_M = 0.03, 0.15
-EYEBALL_WEIGHT = 0.9
-"""Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
 EYEBALL_RADIUS_M = 0.012
 """Of a head without eyeballs: its pupils are taken to lie in front of the eyes' joints."""
 ITERATIONS = 12

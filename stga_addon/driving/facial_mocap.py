@@ -5,13 +5,12 @@ import re
 
 import numpy as np
 
-from .names import COLUMN, COUNT, arkit_name
+from .names import COLUMN, COUNT, MAX_WEIGHT, arkit_name
 from .packet import FacePacket
 
 REQUEST = b"iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719"
 """Makes the app send to the address that this comes from."""
 MAX_PACKET_BYTES = 1 << 16
-MAX_WEIGHT = 10.0
 _VALUE = re.compile(r"([A-Za-z_]+)[-&](-?\d+(?:\.\d+)?)", re.ASCII)
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.rigid import similarity
-from ..flame.forward import FlameFrame
+from ..flame.forward import RIGID_SIZE, FlameFrame
 from ..flame.model import JOINTS, FlameModel
 from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ..flame.sequence import FlameSequence, with_identity
-from ..tracking.posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from ..tracking.posed_points import PosedPoints, SurfacePoints
 from .correspondence import face_points
 from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 from .performance import Performance

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from ..files import replacing
-from ..flame.forward import FlameFrame
+from ..flame.forward import RIGID_SIZE, FlameFrame
 from ..flame.quaternions import from_axis_angle, to_matrices
 from ..flame.sequence import FlameSequence, with_identity
-from ..tracking.posed_points import RIGID_SIZE, PosedPoints
+from ..tracking.posed_points import PosedPoints
 from .head_map import JAW_SHAPES, PRODUCTS, HeadMap, head_map
 from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 from .performance import Performance

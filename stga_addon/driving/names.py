@@ -18,6 +18,8 @@ ARKIT_SHAPES = (
 )  # fmt: skip
 """In the order of Live Link Face's CSV files."""
 COUNT = len(ARKIT_SHAPES)
+MAX_WEIGHT = 10.0
+"""Beyond it, weights of shapes are in percent, or are no weights."""
 COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}
 OPTIONAL = ("tongueOut",)
 """Shapes that sources of 51 lack; they stay zero."""

@@ -10,15 +10,13 @@ import numpy as np
 from ..errors import StgaError, shorten
 from ..files import file_size, read_json
 from .facial_mocap import parse_packet
-from .names import COUNT, arkit_name, columns_of
+from .names import COUNT, MAX_WEIGHT, arkit_name, columns_of
 from .performance import Performance
 from .timecode import seconds_of
 
 SUFFIXES = (".csv", ".json", ".txt")
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
-MAX_WEIGHT = 10.0
-"""Beyond it, weights are in percent, or are no weights."""
 DEFAULT_FPS = 60.0
 """Of files that hold neither times nor a rate: ARKit's own."""
 MIN_FPS, MAX_FPS = 1.0, 1000.0

@@ -6,6 +6,10 @@ import numpy as np
 
 from .model import FlameModel
 
+POSE_SIZE, TRANSLATION_SIZE = 15, 3
+"""The last numbers of a frame's parameters: axis-angles of five joints, and the translation. Expression comes first."""
+RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
+
 
 @dataclass(frozen=True)
 class FlameFrame:
@@ -30,6 +34,18 @@ class FlameFrame:
         """(5, 3) axis-angle of root, neck, jaw, left eye, right eye."""
         joints = [self.rotation, self.neck_pose, self.jaw_pose, self.eyes_pose]
         return np.asarray(np.concatenate(joints).reshape(5, 3))
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """(E + 18,) expression, pose and translation."""
+        return np.concatenate([self.expr, self.pose.ravel(), self.translation])
+
+
+def frame_of(parameters: np.ndarray, dynamic_offset: np.ndarray | None = None) -> FlameFrame:
+    """The frame with these `FlameFrame.parameters`."""
+    expr, pose, translation = np.split(parameters, [-RIGID_SIZE, -TRANSLATION_SIZE])
+    rotation, neck, jaw, eyes = np.split(pose, [3, 6, 9])
+    return FlameFrame(expr, rotation, neck, jaw, translation, eyes, dynamic_offset)
 
 
 def neutral_frame(model: FlameModel) -> FlameFrame:

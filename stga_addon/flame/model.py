@@ -1,4 +1,4 @@
-"""Reading of FLAME head models: template, blend shapes and a skeleton of five joints."""
+"""FLAME head models: template, blend shapes, a skeleton of five joints, and regions of triangles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,6 +16,17 @@ FULL_COMPONENTS, FULL_IDENTITY = 400, 300  # FLAME 2020 and 2023: 300 identity t
 MASK_FILE = "FLAME_masks.pkl"
 MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
 MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
+# Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
+KEY_MASKS = {
+    "left_eye": ("left_eye_region", "left_eyeball"),
+    "right_eye": ("right_eye_region", "right_eyeball"),
+    "mouth": ("lips", "teeth"),
+    "nose": ("nose",),
+}
+EYEBALL_WEIGHT = 0.9
+"""Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
+MIN_TORSO_WEIGHT = 0.7
+"""Skinning weight of the root joint at the torso's vertices; the published FLAME's last ring has 0.9."""
 
 
 @dataclass(frozen=True)
@@ -145,3 +156,23 @@ def _masks(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> dict[
             raise StgaError(f"{source}: mask {name} is not a list of vertex ids from 0 to {vertices - 1}")
         masks[name] = np.unique(flat)
     return masks
+
+
+def faces_within(faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """(F,) bool: triangles (F, 3) whose three corners are all among `vertices` (ids)."""
+    return np.asarray(np.isin(faces, vertices).all(axis=1))
+
+
+def torso_faces(model: FlameModel) -> np.ndarray:
+    """(F,) bool: triangles at the end of the neck, which the root joint carries."""
+    return np.asarray((model.weights[:, JOINTS.index("root")] > MIN_TORSO_WEIGHT)[model.faces].all(axis=1))
+
+
+def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
+    """left_eye, right_eye, mouth and nose as (F,) bool; a region none of whose masks the model has is left out."""
+    regions = {}
+    for region, names in KEY_MASKS.items():
+        present = [model.masks[name] for name in names if name in model.masks]
+        if present:
+            regions[region] = faces_within(model.faces, np.concatenate(present))
+    return regions

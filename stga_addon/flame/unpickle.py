@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import file_size
+from ..files import read_bytes
 
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22
@@ -207,16 +207,10 @@ def _entries(loaded: dict[Any, Any], folder: str) -> dict[Any, Any]:
 
 def _load(path: Path) -> tuple[Any, int]:
     """What the pickle holds, and how many bytes its arrays may have."""
-    size = file_size(path)
-    if size > MAX_FILE_BYTES:
-        raise StgaError(f"{path}: is {size} bytes, more than the {MAX_FILE_BYTES} allowed")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    data = read_bytes(path, MAX_FILE_BYTES)
     try:
         _check_instructions(data)
-        return _RestrictedUnpickler(data).load(), MIN_ALLOWED_BYTES + MAX_EXPANSION * size
+        return _RestrictedUnpickler(data).load(), MIN_ALLOWED_BYTES + MAX_EXPANSION * len(data)
     except _Refused as error:
         raise StgaError(f"{path}: asks for the class {error}, refused: only arrays are read") from error
     except Exception as error:

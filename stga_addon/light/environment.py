@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from ..files import file_size
+from ..files import read_bytes
 from .harmonics import basis
 from .values import Light
 
@@ -28,11 +28,7 @@ def read_hdr(path: Path) -> np.ndarray:
 
     Reads flat and run-length encoded rows (Ward, "Real Pixels", Graphics Gems II). Raises StgaError.
     """
-    file_size(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    data = read_bytes(path)
     header = HEADER.match(data[:MAX_HEADER_BYTES])
     if header is None:
         raise StgaError(f"{path}: is not a Radiance picture (.hdr) with rows from the top")

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from ..capture.mesh_geometry import connected_parts
+
 EYE_ROUGHNESS = 0.2
 """Of highlights on eyes: about as sharp as splats of half a millimeter on a ball of 12 mm can show."""
 MIN_RADIUS_M, MAX_RADIUS_M = 0.007, 0.017
@@ -24,19 +26,6 @@ def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
         if len(members) >= MIN_VERTICES and _is_eyeball(neutral[members].astype(np.float64)):
             found[members] = EYE_ROUGHNESS
     return found
-
-
-def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
-    """(V,) int: the least vertex that each vertex is connected with."""
-    part = np.arange(vertices)
-    while True:
-        least = part[faces].min(1)
-        before = part.copy()
-        for corner in faces.T:
-            np.minimum.at(part, corner, least)
-        part = part[part]
-        if np.array_equal(part, before):
-            return np.asarray(part)
 
 
 def _is_eyeball(points: np.ndarray) -> bool:

@@ -6,9 +6,9 @@ import numpy as np
 
 from ..avatar.embedding import face_frames, points_to_world
 from ..avatar.file import Avatar
+from ..capture.mesh_geometry import connected_parts, vertex_normals
 from ..flame.quaternions import to_matrices
-from .eyes import connected_parts
-from .surface import at_splats, vertex_normals
+from .surface import at_splats
 from .values import Caster
 
 REACH_M = 0.025

@@ -10,6 +10,7 @@ from ..avatar.embedding import face_frames
 from ..avatar.file import Avatar
 from ..avatar.splats import SH_C0, no_strain_color
 from ..capture.color import linear_to_srgb, srgb_to_linear
+from ..capture.mesh_geometry import vertex_normals
 from ..capture.rigid import weighted_procrustes
 from ..errors import StgaError
 from .bounce import Bounce
@@ -18,7 +19,7 @@ from .lamps import Lamps, distant_light
 from .lashes import Lashes, find_lashes
 from .likeness import Kept, kept, kept_shares, recorded_light
 from .shadows import LIFT_M
-from .surface import at_splats, surface_points, vertex_normals
+from .surface import at_splats, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
 REFLECTANCE = 0.04

@@ -1,4 +1,4 @@
-"""Points of the mesh that splats belong to, and its normals."""
+"""Points of the mesh that splats belong to."""
 
 import numpy as np
 
@@ -7,14 +7,6 @@ from ..avatar.file import Avatar
 
 MAX_STEPS = 6
 """Triangles that a splat walks over: with more, splats come nearer to the mesh by less than 1 %."""
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V, 3) unit normals, weighted by the area of triangles; 0 where a vertex has none."""
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(n, 3), len(vertices)) for n in normal.T], axis=-1)
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20))
 
 
 def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:

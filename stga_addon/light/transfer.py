@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from ..capture.mesh_geometry import vertex_normals
 from .harmonics import basis, even_directions
 from .shadows import ShadowMap
-from .surface import vertex_normals
 from .values import Light
 
 DIRECTIONS = 192

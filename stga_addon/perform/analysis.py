@@ -21,7 +21,7 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     _, plan = plan_effects(capture, make_settings(iterations=1, effects=dict(request.effects or {})), device)
     if not request.timed:
         return Analyzed(plan, {})
-    from ..report.preset_timing import time_presets  # imports Numba, which deciding effects does without
+    from ..training.preset_timing import time_presets  # imports Numba, which deciding effects does without
 
     report(Progress(0.5, "Timing the presets"))
     return Analyzed(plan, {timing.preset: timing.seconds for timing in time_presets(capture, device=device)})
@@ -29,7 +29,7 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
 
 def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:
     """Time the presets; says what each is for. Raises StgaError."""
-    from ..report.preset_timing import time_presets
+    from ..training.preset_timing import time_presets
 
     capture = open_capture(request.capture, request.flame, request.principal_point)
     device, why = choose_device(request.device)

@@ -11,18 +11,15 @@ from ..requests.results import Written
 from ..requests.values import Evaluate
 from ..training.evaluate.lpips import MIN_SIDE_PX
 from ..training.evaluate.metrics import Quality, evaluate_avatar, psnr_recorded
-from ..training.optimize.flame_refinement import with_refined_tracking
 from ..training.run.folder import AVATAR, WORLD_FILE
-from ..training.run.open_run import open_run
+from ..training.run.open_run import open_refined
 
 
 def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
     """Measure PSNR, SSIM and LPIPS, and write them into the run's folder. Raises StgaError."""
     folder, split = request.run, request.split
-    if not folder.is_dir():
-        raise StgaError(f"{folder}: is not a folder; expected that of a run")
     report(Progress(stage="Evaluating"))
-    capture = with_refined_tracking(open_run(folder, request.capture, request.flame).capture, folder)
+    capture = open_refined(folder, request.capture, request.flame)
     views = capture.views.get(split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")

@@ -14,7 +14,8 @@ from ..flame.sequence import motion_of
 from ..progress import Say
 from ..requests.values import Export, Played, Render
 from ..training.run.folder import AVATAR, read_run
-from ..training.run.open_run import open_run
+from ..training.run.open_run import open_refined
+from ..training.run.tracking_file import with_refined_tracking
 
 
 def open_avatar(request: Render | Export) -> tuple[Avatar, Capture | None]:
@@ -74,10 +75,8 @@ def check_topology(capture: Capture, avatar: Avatar) -> None:
 
 def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:
     """The capture of a run, or another one whose meshes are to drive its avatar; with the run's refined tracking."""
-    from ..training.optimize.flame_refinement import with_refined_tracking  # imports torch, which Blender may lack
-
     if given is None:
-        return with_refined_tracking(open_run(folder, flame=flame).capture, folder)
+        return open_refined(folder, flame=flame)
     run = read_run(folder)
     return with_refined_tracking(open_capture(given, flame or run.flame, run.principal_point), folder)
 

@@ -16,17 +16,14 @@ from ..light.estimate import Known, estimate_light
 from ..progress import Report, Say, ignore
 from ..requests.results import Written
 from ..requests.values import Relight
-from ..training.optimize.flame_refinement import with_refined_tracking
 from ..training.run.folder import AVATAR
-from ..training.run.open_run import open_run
+from ..training.run.open_run import open_refined
 
 
 def relight(request: Relight, report: Report, say: Say) -> Written:
     """Estimate the light, or take the known one, and write it into the run's avatar file. Raises StgaError."""
     folder = request.run
-    if not folder.is_dir():
-        raise StgaError(f"{folder}: is not a folder; expected that of a run")
-    capture = with_refined_tracking(open_run(folder, request.capture, request.flame).capture, folder)
+    capture = open_refined(folder, request.capture, request.flame)
     known = Known()
     if request.light is not None:
         known = Known(radiance=harmonics_of(read_hdr(request.light)))

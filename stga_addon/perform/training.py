@@ -14,18 +14,16 @@ from ..capture.region import SELECTED_WEIGHT, find_region
 from ..capture.takes import first_timesteps, join_takes, require_same_head, require_same_scale
 from ..errors import StgaError
 from ..export.ply import write_ply
-from ..format import format_duration
+from ..format import format_duration, format_table
 from ..progress import Cancelled, Progress, Report, Say
 from ..raster.cpu.precompile import begin_compiling
 from ..render.device import choose_device
-from ..report.preset_timing import time_presets
 from ..report.run_summary import CurveUpdater, report_run
 from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
 from ..training.effect_catalog import RELIGHT, WORLD
-from ..training.effect_decisions import TRACKING
-from ..training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
-from ..training.optimize.flame_refinement import with_refined_tracking
+from ..training.effects.plan import add_effects, describe_effects, plan_effects
+from ..training.preset_timing import time_preset
 from ..training.run.continuation import continued_settings, select_for_takes
 from ..training.run.folder import AVATAR, WORLD_FILE, Continuation, Run, Take, has_run, read_run
 from ..training.run.identity import file_digest, identity_of
@@ -34,6 +32,7 @@ from ..training.run.open_run import OpenedRun, device_of, open_run
 from ..training.run.progress import Progress as TrainingProgress
 from ..training.run.progress import Report as TrainingReport
 from ..training.run.replay import is_faced
+from ..training.run.tracking_file import TRACKING, with_refined_tracking
 from ..training.world.world_splats import world_of
 from .relighting import add_light
 
@@ -73,7 +72,7 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
     prepared = prepare(request, report, say)
     for warning in prepared.capture.warnings:
         say(f"warning: {warning}")
-    for line in _table(describe_effects(prepared.run.effect_plan)):
+    for line in format_table(describe_effects(prepared.run.effect_plan)):
         say(line)
     draw, latest, is_stopped = CurveUpdater(prepared.folder), Progress(), False
 
@@ -148,11 +147,6 @@ def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selecte
     return Selected(selection)
 
 
-def _table(rows: list[tuple[str, str]]) -> list[str]:
-    width = max((len(label) for label, _ in rows), default=0)
-    return [f"{label:<{width}}  {value}" for label, value in rows]
-
-
 def _as_progress(progress: TrainingProgress) -> Progress:
     avatar = progress.avatar
 
@@ -171,17 +165,16 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     begin_compiling()
     device, why = choose_device(request.device)
     capture = open_capture(request.capture, request.flame, request.principal_point)
-    settings = request.settings
+    report(Progress(stage="Analyzing the capture"))
+    settings, plan = plan_effects(capture, request.settings, device)
     if request.preset_time:
         report(Progress(stage="Timing the preset"))
-        (timing,) = time_presets(capture, [str(settings.preset)], device=device)
+        timing = time_preset(capture, settings, device=device)
         say(f"{timing.preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
         settings = replace(settings, seconds=timing.seconds, iterations=None)
-    report(Progress(stage="Analyzing the capture"))
-    flame = None if request.flame is None else request.flame.resolve()
-    run = Run(capture.root, flame, request.principal_point, settings, device=device)
-    run = with_effect_plan(run, capture, device)
     say(why)
+    flame = None if request.flame is None else request.flame.resolve()
+    run = Run(capture.root, flame, request.principal_point, settings, plan, device)
     return Prepared(request.run, run, capture, _given(request.selection), resumes=False, falls_back=False)
 
 
@@ -244,12 +237,12 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     settings = continued_settings(
         opened.run.settings, "extend", growth, request.seconds, request.iterations, request.seed
     )
-    before = replace(run, settings=settings, device=device)
-    say(f"takes: {1 + len(before.takes)}; the new ones need {needed.mean():.0%} of the triangles")
-    run = with_effects_of_takes(before, capture)
-    for old, new in zip(before.effect_plan, run.effect_plan, strict=True):
+    say(f"takes: {1 + len(run.takes)}; the new ones need {needed.mean():.0%} of the triangles")
+    settings, plan = add_effects(capture, settings, run.effect_plan)
+    for old, new in zip(run.effect_plan, plan, strict=True):
         if new.on != old.on:
             say(f"{new.effect}  {new}")
+    run = replace(run, settings=settings, effect_plan=plan, device=device)
     return Prepared(request.run, run, capture, selection, resumes=False, falls_back=False)
 
 

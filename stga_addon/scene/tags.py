@@ -30,9 +30,8 @@ ROOT, HEAD, RIG, CAMERA, SPLATS = "root", "head", "rig", "camera", "splats"
 # Boolean face attributes of the head mesh, one per region.
 REGION_PREFIX = "stga_region_"
 
-# Vertex groups of the head, one per timestep; a vertex is selected if its weight is at least SELECTED_WEIGHT.
+# Vertex groups of the head, one per timestep; a vertex is selected from a weight of `region.SELECTED_WEIGHT` on.
 GROUP_PREFIX = "stga_"
-SELECTED_WEIGHT = 0.5
 
 
 def group_name(timestep: int) -> str:

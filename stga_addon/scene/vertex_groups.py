@@ -11,6 +11,7 @@ from typing import Any
 import bmesh
 import numpy as np
 
+from ..capture.region import SELECTED_WEIGHT
 from ..errors import StgaError
 from . import tags
 from .arrays import mesh_triangles, read_values
@@ -148,7 +149,7 @@ def _read_vertices(mesh: Any, group_count: int, groups: list[int]) -> np.ndarray
     row_of = np.full(group_count, -1)
     row_of[groups] = np.arange(len(groups))
     rows, vertices = row_of[indices], np.repeat(np.arange(len(members)), counts)
-    selected = (rows >= 0) & (weights >= tags.SELECTED_WEIGHT)
+    selected = (rows >= 0) & (weights >= SELECTED_WEIGHT)
     in_group = np.zeros((len(groups), len(members)), bool)
     in_group[rows[selected], vertices[selected]] = True
     return in_group

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..capture.mesh_geometry import vertex_normals
+from ..flame.forward import RIGID_SIZE
 from .fit import HeadFit
 from .footage.model import Footage
 from .landmarks import CameraLandmarks
-from .mesh_image import vertex_normals
-from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation
 
 MAX_SCALE_DIFFERENCE = 0.043
 """Of a camera from the median of all. Landmarks alone differ by up to 0.041 from the side; 5 % of focal length show."""

@@ -9,10 +9,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ..capture.camera import Camera
+from ..capture.mesh_geometry import vertex_normals
 from ..capture.mesh_raster import rasterize
 from ..files import replacing
 from .footage.model import Footage, FootageCamera
-from .mesh_image import vertex_normals
 
 COLUMNS, ROWS = 4, 5
 PICTURE = 200, 250

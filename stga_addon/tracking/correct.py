@@ -13,6 +13,7 @@ from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
+from ..flame.forward import RIGID_SIZE
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
 from .contact_sheet import write_contact_sheet
@@ -20,13 +21,8 @@ from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
 from .footage.model import Footage
 from .footage.open import open_footage
 from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
-from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints, parameters_of
-from .solve import (
-    EXPRESSION_ACCELERATION,
-    JOINT_ACCELERATION_RAD,
-    LANDMARK_SIGMA_M,
-    TRANSLATION_ACCELERATION_M,
-)
+from .posed_points import PosedPoints, SurfacePoints
+from .solve import LANDMARK_SIGMA_M, acceleration_precision
 from .write_capture import moving_arrays
 
 SOLVED_FILE = "tracking_solved.npz"
@@ -104,7 +100,7 @@ def corrected(
     ]
     matrix = block_diag(blocks)
     second = _second_differences(near)
-    matrix = matrix + kron(second.T @ second, diags(_acceleration_precision(size)))
+    matrix = matrix + kron(second.T @ second, diags(acceleration_precision(model)))
     matrix = csc_matrix(matrix)
     open_ = np.repeat(free[near], size)
     if open_.any():
@@ -132,17 +128,12 @@ def _stiffness(model: FlameModel, points: SurfacePoints, parameters: np.ndarray)
     return np.asarray(flat.T @ flat)
 
 
-def _acceleration_precision(size: int) -> np.ndarray:
-    sigma = (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M)
-    return np.repeat(sigma, (size - RIGID_SIZE, POSE_SIZE, TRANSLATION_SIZE)) ** -2.0
-
-
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
     """Timesteps and parameters (T, E + 18) as they were tracked: those of the file that the first correction writes,
     or of the capture where there is none. Raises StgaError where the file is not of the capture's timesteps."""
     path, timesteps = out / SOLVED_FILE, list(sequence.timesteps)
     if not os.path.lexists(path):
-        return timesteps, np.stack([parameters_of(sequence.frame(timestep)) for timestep in timesteps])
+        return timesteps, np.stack([sequence.frame(timestep).parameters for timestep in timesteps])
     arrays = read_npz(path)
     shape = len(timesteps), sequence.model.n_expression + RIGID_SIZE
     if not _are_parameters(arrays.get("parameters"), shape):

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..capture.camera import Camera, look_at
 from ..errors import StgaError
-from ..flame.model import JOINTS, FlameModel
+from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from .detectors import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
 from .fit import MIN_LANDMARKS
 from .mesh_image import shaded_image
@@ -23,7 +23,6 @@ MAX_SURFACE_DISTANCE = 0.02
 """Share of the head's extent: a landmark farther from the surface than this (6 mm) is not used."""
 MAX_RESIDUAL = 0.013
 """Share of the head's extent: a landmark whose rays miss each other by more (4 mm) is not used."""
-EYEBALL_WEIGHT = 0.9
 CANDIDATES = 48
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.model import evenly_spread
+from ..flame.forward import RIGID_SIZE
 from .appearance import Texture, average_texture, pyramid, robust
 from .dense_head import HELD_OUT_LEVEL, REGIONS, DenseHead
 from .dense_terms import Misfit, PyramidView, flow_start, misfit, photo_term, samples
 from .fit import HeadFit, TimestepLandmarks, by_visibility, observed_landmarks, triangulated
 from .landmarks import Report
-from .posed_points import RIGID_SIZE
 from .seen_surface import RecordedTake
 from .solve import Observation, acceleration_precision, normal_equations, smooth_take
 

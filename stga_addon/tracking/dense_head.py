@@ -6,15 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from ..capture.camera import Camera
-from ..flame.forward import flame_forward
+from ..capture.mesh_geometry import vertex_normals
+from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
 from .appearance import LEVELS_M, light_basis, robust
 from .head_model import HeadModel
-from .mesh_image import vertex_normals
 from .photo_consistency import facing, in_sight
-from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .seen_surface import large_parts, surface_points
 from .solve import parameter_precision
-from .write_capture import flame_frame
 
 HEAD_POINTS = 3000
 """Points over the whole head, of which those near landmarks are used; the landmarks' places come on top, because they
@@ -128,7 +127,7 @@ class DenseHead:
 
     def _visible_now(self, values: np.ndarray, at: np.ndarray, camera: Camera) -> np.ndarray:
         faces = self.head.model.faces
-        vertices = flame_forward(self.head.model, np.zeros(0), flame_frame(values))
+        vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
         cosine = facing(camera, at, _unit(self.points.on(vertex_normals(vertices, faces), faces)))
         small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
         return np.where((cosine > MIN_COSINE) & in_sight(small, vertices, faces, at), cosine**2, 0.0)

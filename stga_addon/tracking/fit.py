@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.mesh_geometry import vertex_normals
 from ..capture.model import evenly_spread
 from ..capture.rigid import Similarity, similarity, weighted_procrustes
+from ..flame.forward import POSE_SIZE, RIGID_SIZE
 from .head_model import HeadModel
-from .mesh_image import vertex_normals
-from .posed_points import POSE_SIZE, RIGID_SIZE, PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .solve import Observation, in_order, person, solve_identity, solve_take
 from .triangulation import Triangulation, rays, triangulate
 

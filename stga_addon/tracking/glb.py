@@ -9,8 +9,8 @@ import numpy as np
 
 from ..capture.glb_chunks import glb_chunks
 from ..errors import StgaError, shorten
+from ..files import read_bytes
 from ..flame.quaternions import to_matrices
-from .footage.reading import read_bytes
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.mesh_geometry import vertex_normals
 from ..capture.mesh_raster import rasterize
 
 SKIN_RGB = np.array([0.78, 0.58, 0.48])
@@ -10,17 +11,6 @@ BACKGROUND = 0.45
 KEY_LIGHT = np.array([0.35, 0.55, 0.75])
 """Direction towards the light in camera axes: x right, y up, z towards the camera."""
 AMBIENT = 0.38
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3), area-weighted; zero for a vertex without triangles."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), len(vertices)) for axis in range(3)], -1
-    )
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.asarray(total / np.maximum(length, 1e-20))
 
 
 def shaded_image(

@@ -4,11 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..flame.forward import FlameFrame, axis_angle_matrices
+from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, axis_angle_matrices
 from ..flame.model import FlameModel
 
-POSE_SIZE, TRANSLATION_SIZE = 15, 3
-RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
 SMALL_ANGLE = 1e-4
 """Radians, below which a quotient by the squared angle is its limit."""
 
@@ -26,11 +24,6 @@ class SurfacePoints:
     def on(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Their positions (N, 3), or other values (N, …) interpolated, from those of the vertices (V, …)."""
         return np.asarray(np.einsum("nk,nk...->n...", self.barycentric, vertices[faces[self.face]]))
-
-
-def parameters_of(frame: FlameFrame) -> np.ndarray:
-    """(E + 18,) expression, pose and translation of a FLAME frame."""
-    return np.concatenate([frame.expr, frame.pose.ravel(), frame.translation])
 
 
 def head_rotation(parameters: np.ndarray) -> np.ndarray:

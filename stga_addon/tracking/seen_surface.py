@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.mesh_geometry import connected_parts, vertex_normals
 from .fit import HeadFit, TimestepLandmarks
 from .head_model import HeadModel
-from .mesh_image import vertex_normals
 from .outline import outline_offsets
 from .photo_consistency import Sweep, facing, gray_view, in_sight, surface_offsets
 from .posed_points import SurfacePoints, head_rotation
@@ -74,14 +74,9 @@ def surface_points(head: HeadModel, count: int) -> SurfacePoints:
 
 def large_parts(head: HeadModel) -> np.ndarray:
     """(F,) bool: triangles of connected parts larger than eyeballs and teeth."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     vertices, faces = head.model.v_template, head.model.faces
-    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
-    _, part = connected_components(graph, directed=False)
-    extent = np.array([np.ptp(vertices[part == number], axis=0).max() for number in range(part.max() + 1)])
+    numbers, part = np.unique(connected_parts(len(vertices), faces), return_inverse=True)
+    extent = np.array([np.ptp(vertices[part == number], axis=0).max() for number in range(len(numbers))])
     return np.asarray((extent > MIN_PART_SHARE * np.ptp(vertices, axis=0).max())[part[faces[:, 0]]])
 
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE
 from ..flame.model import JOINTS, FlameModel
 from .head_model import HeadModel
-from .posed_points import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation
 
 LANDMARK_SIGMA_M = 0.002
 """Standard deviation of a landmark over people and views; coefficients have a standard deviation of 1."""

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..capture.mesh_geometry import vertex_normals
 from ..capture.model import evenly_spread
+from ..flame.forward import RIGID_SIZE
 from .fit import HeadFit, by_visibility, observed_landmarks, rigid_start, triangulated
 from .head_model import HeadModel
 from .landmarks import Report
-from .mesh_image import vertex_normals
 from .photo_consistency import Sweep
-from .posed_points import RIGID_SIZE, SurfacePoints, head_rotation
+from .posed_points import SurfacePoints, head_rotation
 from .seen_surface import (
     RecordedTake,
     SeenSurface,

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..capture.model import evenly_spread
 from ..flame.forward import axis_angle_matrices
-from ..flame.masks import torso_faces
+from ..flame.model import torso_faces
 from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, robust, sampled
 from .dense_terms import (
     FLOW_ITERATIONS,

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..flame.masks import torso_faces
-from ..flame.model import FlameModel
+from ..flame.model import FlameModel, torso_faces
 
 DEPTH_SIGMA_M, MIN_WEIGHT = 0.02, 0.5
 """Over which points' depths are averaged; sum of their weights, below which the surface is not seen."""

@@ -8,9 +8,10 @@ import numpy as np
 from ..avatar.embedding import FaceFrames, face_frames
 from ..capture.camera import Camera
 from ..capture.model import evenly_spread
+from ..flame.forward import RIGID_SIZE
 from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, sampled
 from .dense_terms import OUTLIER_SQUARED
-from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from .posed_points import PosedPoints, SurfacePoints
 from .torso_take import EVIDENCE_LEVEL, PosedTorso, TorsoShot, TorsoTake, grown
 
 POINT_STEP_M, MAX_POINTS = 0.005, 800

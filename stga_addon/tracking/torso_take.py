@@ -8,15 +8,13 @@ from scipy.ndimage import binary_dilation
 
 from ..capture.camera import Camera
 from ..capture.mesh_raster import silhouette
-from ..flame.forward import axis_angle_matrices
-from ..flame.masks import MIN_TORSO_WEIGHT
-from ..flame.model import JOINTS
+from ..flame.forward import RIGID_SIZE, axis_angle_matrices
+from ..flame.model import JOINTS, MIN_TORSO_WEIGHT
 from ..flame.quaternions import from_matrices, to_axis_angle
 from .appearance import pyramid
 from .dense_terms import PyramidView, inside
 from .fit import HeadFit
 from .footage.model import FootageCamera
-from .posed_points import RIGID_SIZE
 from .write_capture import posed_mesh
 
 ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")

@@ -14,6 +14,7 @@ from ..capture.camera import Camera
 from ..capture.mesh_raster import silhouette
 from ..errors import StgaError
 from ..files import read_json, write_json
+from ..flame.forward import RIGID_SIZE
 from ..schema import to_json
 from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
@@ -46,7 +47,7 @@ from .landmarks import (
     write_places,
 )
 from .mattes import with_mattes
-from .posed_points import RIGID_SIZE, PosedPoints, SurfacePoints
+from .posed_points import PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
 from .torso import follow_torso

@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,12 @@ from ..capture.camera import Camera
 from ..capture.flame_capture import CANONICAL_NAME, PARAMETERS
 from ..capture.transforms import camera_entry
 from ..files import replacing, write_json, write_npz
-from ..flame.forward import FlameFrame, flame_forward
+from ..flame.forward import flame_forward, frame_of
 from ..flame.sequence import FRAME_FIELDS
 from .fit import HeadFit
 from .folder import SPLIT_FILES, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
-from .posed_points import RIGID_SIZE
 
 MIN_CAMERAS_TO_HOLD_OUT = 4
 
@@ -58,14 +56,7 @@ def write_capture(
 
 def posed_mesh(fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None) -> np.ndarray:
     """The head's vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this timestep."""
-    return flame_forward(fit.head.model, np.zeros(0), replace(flame_frame(parameters), dynamic_offset=offset))
-
-
-def flame_frame(parameters: np.ndarray) -> FlameFrame:
-    """Parameters (E + 18,) as FLAME's."""
-    expr, rigid = parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
-    rotation, neck, jaw, eyes, translation = np.split(rigid, [3, 6, 9, 15])
-    return FlameFrame(expr, rotation, neck, jaw, translation, eyes)
+    return flame_forward(fit.head.model, np.zeros(0), frame_of(parameters, offset))
 
 
 def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -135,7 +126,7 @@ def _write_heads(
 
 def moving_arrays(parameters: np.ndarray) -> dict[str, np.ndarray]:
     """What changes from timestep to timestep of (E + 18,) parameters, as in VHAP's files: (1, …) float32."""
-    frame = flame_frame(parameters)
+    frame = frame_of(parameters)
     return {name: getattr(frame, name)[None].astype(np.float32) for name in FRAME_FIELDS}
 
 

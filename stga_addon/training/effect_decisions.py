@@ -8,8 +8,6 @@ from ..schema import complaint
 from .effect_catalog import EFFECTS
 
 CHOICES = ("auto", "on", "off")
-TRACKING = "tracking.npz"
-"""File of a run folder with refined FLAME parameters."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from stga_addon.flame.sequence import read_motion  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
-from stga_addon.training.optimize.flame_refinement import Tracking, with_refined_tracking, write_tracking  # noqa: E402
+from stga_addon.training.optimize.flame_refinement import Tracking  # noqa: E402
+from stga_addon.training.run.tracking_file import with_refined_tracking, write_tracking  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
@@ -90,7 +91,7 @@ def test_a_runs_refined_tracking(scene, tmp_path):
     """Catches a head that does not get to where its avatar was trained: timesteps 0, 1 and 3, refined."""
     tracking = Tracking(scene.own, scene.own.timesteps)
     tracking.state.change[:] = np.random.default_rng(0).normal(0, 0.05, tracking.tracked.shape)
-    write_tracking(tmp_path, tracking)
+    write_tracking(tmp_path, tracking.sequence, tracking.parameters(), tracking.tracked)
     shown = with_refined_tracking(open_capture(scene.folder, scene.model_file), tmp_path)
     assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3
     assert bpy.ops.stga.apply_motion(filepath=str(tmp_path / "tracking.npz"), start=0) == {"FINISHED"}
@@ -110,7 +111,7 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     own = open_capture(folder, model)
     tracking = Tracking(own.flame, own.flame.timesteps)
     tracking.state.change[:] = rng.normal(0, 0.05, tracking.tracked.shape)
-    write_tracking(tmp_path, tracking)
+    write_tracking(tmp_path, tracking.sequence, tracking.parameters(), tracking.tracked)
     shown = with_refined_tracking(own, tmp_path)
     path = str(tmp_path / "tracking.npz")
     bpy.ops.stga.apply_motion(filepath=path, start=0, place=place)

@@ -16,8 +16,7 @@ import pytest
 import scipy.sparse
 
 from stga_addon.errors import StgaError
-from stga_addon.flame.masks import key_regions
-from stga_addon.flame.model import read_flame
+from stga_addon.flame.model import key_regions, read_flame
 from stga_addon.flame.unpickle import _RestrictedUnpickler, read_pickled_arrays
 
 from .conftest import random_arrays

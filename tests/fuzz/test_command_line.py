@@ -31,10 +31,10 @@ from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import Performance
-from stga_addon.report import preset_timing
 from stga_addon.requests import values as ask
 from stga_addon.requests.folder import write_request
 from stga_addon.tracking.head_model import HeadModel
+from stga_addon.training import preset_timing
 from stga_addon.training.run.folder import read_run
 
 pytest.importorskip("torch")

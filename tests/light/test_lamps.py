@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from light.scenes import ball_and_plate, blocked
+from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.lamps import Lamps
 from stga_addon.light.shadows import LIFT_M
-from stga_addon.light.surface import vertex_normals
 from stga_addon.light.values import Caster, Light, Lighting
 
 NO_FACES = np.zeros((0, 3), np.int32)

@@ -9,9 +9,9 @@ from light.scenes import blocked
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.light import AvatarLight
 from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
-from stga_addon.light.surface import vertex_normals
 from stga_addon.light.transfer import transfer_of
 from stga_addon.light.values import Light, Lighting
 from stga_addon.scene.gpu.relit_packing import relit_scene

@@ -14,9 +14,8 @@ NUMBERS = """
 override STEP: u32 = 1u;
 @group(0) @binding(0) var<storage, read_write> numbers: array<u32>;
 @compute @workgroup_size(WORKGROUP)
-fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
-        @builtin(local_invocation_index) local: u32) {
-  let n = thread_number(group, groups, local);
+fn main(thread: Thread) {
+  let n = thread_number(thread);
   if n < arrayLength(&numbers) { numbers[n] += STEP * n; }
 }
 """

@@ -22,15 +22,14 @@ from stga_addon.capture.open import open_capture
 from stga_addon.raster.gpu import compose
 from training.test_gpu_backend import batch_of
 from training.test_gpu_driven_offsets import position_settings, state_of
-from stga_addon.training.optimize.backends import make_backend
+from stga_addon.training.optimize.trainer import make_backend
 from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.optimize.losses import limit_units
 
 adapter, root = sys.argv[1:]
 compose.compose(adapter, scene(), CAMERA, True)
 toy, settings = open_capture(Path(root)), position_settings()
-lengths, frames = limit_units(toy, settings.convention), FrameStore(toy, settings.convention, True)
-backend = make_backend(f"gpu:{adapter}", settings, lengths, frames, state_of(toy, settings))
+frames = FrameStore(toy, settings.convention, True)
+backend = make_backend(f"gpu:{adapter}", settings, frames, state_of(toy, settings))
 for part in (None, toy.regions["mouth"]):
     backend.step(batch_of(toy, settings, selected=part))
 assert len(backend.state.steps)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from stga_addon.cli.main import main
-from stga_addon.report import preset_timing
+from stga_addon.training import preset_timing
 from stga_addon.training.run.folder import read_run
 
 

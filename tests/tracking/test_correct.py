@@ -11,17 +11,15 @@ from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, read_npz, write_json, write_npz
-from stga_addon.flame.forward import flame_forward
+from stga_addon.flame.forward import RIGID_SIZE, flame_forward, frame_of
 from stga_addon.requests.folder import write_request
 from stga_addon.requests.values import SolveAgain
 from stga_addon.tracking.correct import SOLVED_FILE, correct_capture, corrected
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, REPORT_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.posed_points import RIGID_SIZE, parameters_of
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
-from stga_addon.tracking.write_capture import flame_frame
 
 from .test_fit import frame_at, places_on
 from .test_track import record
@@ -29,7 +27,7 @@ from .test_track import record
 HEAD = HeadModel(synthetic_flame(0), "flame")
 PERSON = person(HEAD, np.zeros(HEAD.model.n_identity)).model
 JAW = HEAD.model.n_expression + 6
-TAKE = np.stack([parameters_of(frame_at(HEAD, timestep)) for timestep in range(30)])
+TAKE = np.stack([frame_at(HEAD, timestep).parameters for timestep in range(30)])
 
 
 def opened(timestep, angle):
@@ -92,7 +90,7 @@ def tracked(tmp_path_factory):
 
 def parameters_in(out, model):
     sequence = open_capture(out, model).flame
-    return np.stack([parameters_of(sequence.frame(timestep)) for timestep in sequence.timesteps])
+    return np.stack([sequence.frame(timestep).parameters for timestep in sequence.timesteps])
 
 
 def test_a_corrected_capture_shows_the_key(tracked):
@@ -103,7 +101,7 @@ def test_a_corrected_capture_shows_the_key(tracked):
     key[HEAD.model.n_expression + 1] += 0.3  # turns the head
     correct_capture(out, model, {1: key}, span=1)
     capture = open_capture(out, model)
-    expected = flame_forward(capture.flame.model, capture.flame.shape, flame_frame(key), capture.flame.static_offset)
+    expected = flame_forward(capture.flame.model, capture.flame.shape, frame_of(key), capture.flame.static_offset)
     np.testing.assert_allclose(capture.mesh(1), expected, atol=1e-6)
     np.testing.assert_allclose(parameters_in(out, model)[3:], before[3:], atol=1e-7)
     after = read_json(out / "tracking.json")

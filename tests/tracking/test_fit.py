@@ -8,7 +8,7 @@ from flame.conftest import random_arrays, random_frame
 
 from stga_addon.capture.camera import look_at
 from stga_addon.development.demo.head import synthetic_flame
-from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.forward import FlameFrame, flame_forward, frame_of
 from stga_addon.tracking.fit import (
     Similarity,
     TimestepLandmarks,
@@ -23,7 +23,7 @@ from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints
 from stga_addon.tracking.solve import Observation, in_order, person, solve_take
 from stga_addon.tracking.track import interpolated
 from stga_addon.tracking.triangulation import rays, triangulate
-from stga_addon.tracking.write_capture import flame_frame, posed_mesh
+from stga_addon.tracking.write_capture import posed_mesh
 
 WORLD_SCALE, WORLD_ROTATION = 0.23, 1.1
 """The cameras' world: its unit is not the meter and its axes are not the head's."""
@@ -284,7 +284,7 @@ def test_a_linear_model_without_joints_moves_rigidly():
     head = HeadModel(linear_model(None, arrays), "mesh")
     assert head.joints == (True, False, False, False, False)
     fit = np.concatenate([[0.5, -1.0], [0.3, 0.2, 0.1], np.zeros(12), [0.1, 0.2, 0.3]])
-    found = flame_forward(head.model, np.zeros(0), flame_frame(fit))
+    found = flame_forward(head.model, np.zeros(0), frame_of(fit))
     shaped = arrays["mean"] + arrays["expression"] @ [0.5, -1.0]
     lengths = [np.linalg.norm(mesh[:, None] - mesh[None], axis=2) for mesh in (found, shaped)]
     np.testing.assert_allclose(*lengths, atol=1e-12)

@@ -15,7 +15,6 @@ from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.outline import outline_offsets
-from stga_addon.tracking.posed_points import parameters_of
 from stga_addon.tracking.seen_surface import RecordedTake, near_landmarks, no_masks, outlines_agree, surface_points
 from stga_addon.tracking.solve import person
 
@@ -76,7 +75,7 @@ def test_mattes_that_are_too_wide_are_not_followed():
     places, used = places_on(head, 150), np.ones(150, bool)
     shape, frame = np.zeros(head.model.n_identity), frame_at(head, 0)
     mesh, world = flame_forward(head.model, shape, frame), Similarity(1.0, np.eye(3), np.zeros(3))
-    fit = HeadFit(person(head, shape), shape, {0: parameters_of(frame)}, world)
+    fit = HeadFit(person(head, shape), shape, {0: frame.parameters}, world)
     masks = [255 * (rasterize(mesh, head.model.faces, camera)[0] >= 0).astype(np.uint8) for camera in cameras]
     points = surface_points(head, 2000)
     for wide, agree in ((0, True), (2, False)):

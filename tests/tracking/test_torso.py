@@ -14,8 +14,8 @@ from stga_addon.capture.rigid import Similarity, weighted_procrustes
 from stga_addon.development.demo.head import synthetic_head, write_flame
 from stga_addon.development.demo.paint import paint
 from stga_addon.files import read_json, write_npz
-from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, joint_positions
-from stga_addon.flame.masks import torso_faces
+from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, frame_of, joint_positions
+from stga_addon.flame.model import torso_faces
 from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.folder import PLACES_FILE, REPORT_FILE
@@ -24,7 +24,6 @@ from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.mesh_image import shaded_image
-from stga_addon.tracking.posed_points import parameters_of
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.torso import follow_torso
 from stga_addon.tracking.torso_cloth import found_bending
@@ -32,7 +31,7 @@ from stga_addon.tracking.torso_drape import draped, torso_sheet
 from stga_addon.tracking.torso_motion import TorsoPoints, read_torso_motion, read_torso_points
 from stga_addon.tracking.torso_take import NECK, ROOT, TorsoPose, TorsoTake, with_root
 from stga_addon.tracking.track import track
-from stga_addon.tracking.write_capture import flame_frame, posed_mesh
+from stga_addon.tracking.write_capture import posed_mesh
 
 from .test_fit import places_on
 from .test_track import write_footage
@@ -121,7 +120,7 @@ def take(head, heads, torsos, size=SIZE, shifts=None):
             own.images.append(shaded_image(mesh, faces, camera, np.concatenate([colors, cloth_colors])))
             own.masks.append(np.where(rasterize(mesh, faces, camera)[0] >= 0, 255, 0).astype(np.uint8))
         arm = joints[NECK] - joints[ROOT]
-        parameters[timestep] = with_root(parameters_of(frame), axis_angle_matrices(np.array([[0, turned, 0]]))[0], arm)
+        parameters[timestep] = with_root(frame.parameters, axis_angle_matrices(np.array([[0, turned, 0]]))[0], arm)
     fit = HeadFit(one, np.zeros(0), parameters, Similarity(1.0, np.eye(3), np.zeros(3)))
     filmed = [FootageCamera(str(n), camera, own) for n, (camera, own) in enumerate(zip(cameras, frames, strict=True))]
     return fit, parameters, Footage(Path("take"), tuple(filmed), tuple(range(len(heads))))
@@ -267,11 +266,11 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
     model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))  # the throat's correctives are another thing
     joints = joint_positions(model, model.v_template + model.shapedirs @ frame.expr)
     rotation = axis_angle_matrices(rng.normal(0, 0.5, (1, 3)))[0]
-    changed = with_root(parameters_of(frame), rotation, joints[NECK] - joints[ROOT])
-    before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, flame_frame(changed)))
+    changed = with_root(frame.parameters, rotation, joints[NECK] - joints[ROOT])
+    before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, frame_of(changed)))
     apart = model.weights[:, ROOT] == 0
     np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
-    np.testing.assert_allclose(axis_angle_matrices(flame_frame(changed).rotation[None])[0], rotation, atol=1e-12)
+    np.testing.assert_allclose(axis_angle_matrices(frame_of(changed).rotation[None])[0], rotation, atol=1e-12)
 
 
 @pytest.mark.slow

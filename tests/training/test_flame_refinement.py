@@ -24,13 +24,13 @@ from stga_addon.training.optimize.flame_refinement import (
     Tracking,
     frame_gradient,
     refinable_tracking,
-    with_refined_tracking,
 )
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.tracking_file import with_refined_tracking
 from stga_addon.training.schedule import view_order
 
 from .heads import TIMESTEPS, write_head

@@ -21,7 +21,6 @@ from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
-from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, read_run
@@ -56,9 +55,9 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
 def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
     """Both implementations with the same splats."""
     gpu_device.device()  # or skip
-    lengths, frames = limit_units(capture, settings.convention), FrameStore(capture, settings.convention, True)
-    cpu = CpuBackend(settings, lengths, frames, disturbed(capture, settings))
-    return cpu, GpuBackend(Device(), settings, lengths, frames, disturbed(capture, settings))
+    frames = FrameStore(capture, settings.convention, True)
+    cpu = CpuBackend(settings, frames, disturbed(capture, settings))
+    return cpu, GpuBackend(Device(), settings, frames, disturbed(capture, settings))
 
 
 def batch_of(capture: Capture, settings: TrainingSettings, timestep: int = 1, **changes: Any) -> Batch:
@@ -185,8 +184,8 @@ def test_everything_is_compiled_before_the_first_iteration(toy: Capture) -> None
     gpu_device.device()  # or skip
     settings, device = settings_of(), Device()
     device._kernels = {}  # instead of those that other tests have compiled
-    lengths, frames = limit_units(toy, settings.convention), FrameStore(toy, settings.convention, True)
-    gpu = GpuBackend(device, settings, lengths, frames, disturbed(toy, settings))
+    frames = FrameStore(toy, settings.convention, True)
+    gpu = GpuBackend(device, settings, frames, disturbed(toy, settings))
     compiled = set(device._kernels)
     view, target = large(view_of(toy, 1))
     for part in (None, toy.regions["mouth"]):

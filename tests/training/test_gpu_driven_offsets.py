@@ -16,7 +16,6 @@ from stga_addon.raster.gpu.device import Device
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
-from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.state import OffsetState, TrainState, keep_rows, tensors_of
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.loop import train
@@ -52,9 +51,9 @@ def state_of(capture: Capture, settings: TrainingSettings) -> TrainState:
 def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
     """Both implementations with the same splats."""
     gpu_device.device()  # or skip
-    lengths, frames = limit_units(capture, settings.convention), FrameStore(capture, settings.convention, True)
-    cpu = CpuBackend(settings, lengths, frames, state_of(capture, settings))
-    return cpu, GpuBackend(Device(), settings, lengths, frames, state_of(capture, settings))
+    frames = FrameStore(capture, settings.convention, True)
+    cpu = CpuBackend(settings, frames, state_of(capture, settings))
+    return cpu, GpuBackend(Device(), settings, frames, state_of(capture, settings))
 
 
 def position_settings(**changes: Any) -> TrainingSettings:
@@ -181,8 +180,8 @@ def test_an_iteration_is_one_submit_of_compiled_kernels(toy: Capture) -> None:
     gpu_device.device()  # or skip
     capture, settings, device = squeezed(toy), position_settings(), Device()
     device._kernels = {}  # instead of those that other tests have compiled
-    lengths, frames = limit_units(capture, settings.convention), FrameStore(capture, settings.convention, True)
-    gpu = GpuBackend(device, settings, lengths, frames, state_of(capture, settings))
+    frames = FrameStore(capture, settings.convention, True)
+    gpu = GpuBackend(device, settings, frames, state_of(capture, settings))
     compiled = set(device._kernels)
     part = batch_of(capture, settings, selected=capture.regions["mouth"])
     gpu.step(part)

@@ -16,7 +16,6 @@ from stga_addon.training.optimize.backend import Batch
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
-from stga_addon.training.optimize.losses import limit_units
 from stga_addon.training.optimize.state import new_state, tensors_of
 from stga_addon.training.schedule import learning_rates
 
@@ -55,7 +54,7 @@ def cpu_bytes(capture: Capture, count: int, size: tuple[int, int], log_scale: fl
     """Of the state and of the buffers that iterations share; without what a kernel allocates for itself."""
     state = new_state(splats_on(capture, count, log_scale))
     frames = FrameStore(capture, SETTINGS.convention)
-    backend = CpuBackend(SETTINGS, limit_units(capture, SETTINGS.convention), frames, state)
+    backend = CpuBackend(SETTINGS, frames, state)
     backend.step(batch_of(capture, *size))
     buffers = backend._buffers._buffers
     arrays = [tensor.numpy() for tensor in tensors_of(backend.state).values()] + list(buffers.values())
@@ -67,7 +66,7 @@ def gpu_bytes(capture: Capture, count: int, size: tuple[int, int], capacity: int
     rasterize.INITIAL_PAIR_CAPACITY = capacity
     device, frames = Device(), FrameStore(capture, SETTINGS.convention)
     state = new_state(splats_on(capture, count, -9.0))
-    backend = GpuBackend(device, SETTINGS, limit_units(capture, SETTINGS.convention), frames, state)
+    backend = GpuBackend(device, SETTINGS, frames, state)
     backend.step(batch_of(capture, *size))
     assert len(backend.state) == count
     assert backend._rasterizer.capacity == capacity

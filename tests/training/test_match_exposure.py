@@ -11,7 +11,7 @@ from stga_addon.capture.model import View
 from stga_addon.training.evaluate.evaluation_views import EvaluationView
 from stga_addon.training.evaluate.match_exposure import known_exposure, match_exposure
 from stga_addon.training.evaluate.metrics import evaluate
-from stga_addon.training.optimize.exposure import exposure_correction
+from stga_addon.training.optimize.image_preparation import exposure_correction
 from stga_addon.training.settings import TrainingSettings
 
 SIDE = 32

@@ -18,8 +18,8 @@ from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
+from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
-from stga_addon.training.optimize.losses import limit_units, scale_limits
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import STRATEGIES
@@ -278,16 +278,17 @@ def test_render_returns_a_copy(toy: Capture) -> None:
 def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
     """Catches limits in meters applied to GaussianAvatars' triangle units, and an area without its factor two."""
     areas = trimesh.Trimesh(toy.neutral, toy.faces, process=False).area_faces
-    np.testing.assert_allclose(limit_units(toy, "stga"), np.sqrt(2 * areas), rtol=1e-5)
-    np.testing.assert_array_equal(limit_units(toy, "gaussian_avatars"), 1)
+    np.testing.assert_allclose(FrameStore(toy, "stga").units, np.sqrt(2 * areas), rtol=1e-5)
+    np.testing.assert_array_equal(FrameStore(toy, "gaussian_avatars").units, 1)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_scale_limits_in_meters(toy: Capture, convention: str) -> None:
     """Catches bound and unbound limits that are mixed up, and hull points limited in triangles instead of meters."""
     settings = quick_settings(convention=convention, scale_limit=3.0, unbound_scale_limit=2.0)
-    bound, unbound = scale_limits(toy, settings)
-    np.testing.assert_allclose(bound, 3 * limit_units(toy, convention), rtol=1e-6)
+    store = FrameStore(toy, convention)
+    bound, unbound = store.scale_limits(settings)
+    np.testing.assert_allclose(bound, 3 * store.units, rtol=1e-6)
     diagonal = np.linalg.norm(toy.neutral.max(0) - toy.neutral.min(0))
     frames = face_frames(toy.neutral, toy.faces, toy.neutral, convention)
     np.testing.assert_allclose(unbound * frames.scale, 2 * max(0.004, diagonal / 200), rtol=1e-5)

@@ -10,7 +10,7 @@ from ...errors import StgaError
 from ...requests.folder import worker_arguments
 from ...worker.launch import PACKAGES_FOLDER
 from ..engine import training_python
-from ..job import Job, Resources
+from ..job import Job, alike
 from ..plan import Plan
 
 VERSION = "jobtemplate-2023-09"
@@ -25,22 +25,17 @@ def openjd_template(plan: Plan, jobs: Sequence[Job]) -> dict[str, Any]:
     A step is a table's jobs with the same needs; it depends on steps as a whole, so that no job of it begins while one
     of those has failed. Raises StgaError where the batch has more than a template can hold.
     """
-    groups: dict[tuple[str, Resources, int], list[Job]] = {}
-    for job in jobs:
-        number = 0
-        while len(groups.setdefault((job.table, job.resources, number), [])) == MAX_TASKS:
-            number += 1
-        groups[job.table, job.resources, number].append(job)
+    groups = alike(jobs, MAX_TASKS)
     if len(groups) > MAX_STEPS:
         raise StgaError(f"{plan.source}: needs {len(groups)} steps of an OpenJD template, which can have {MAX_STEPS}")
-    names = [f"{number} {group[0].table}"[:MAX_NAME] for number, group in enumerate(groups.values(), 1)]
-    step_of = {job.name: name for name, group in zip(names, groups.values(), strict=True) for job in group}
+    names = [f"{number} {group[0].table}"[:MAX_NAME] for number, group in enumerate(groups, 1)]
+    step_of = {job.name: name for name, group in zip(names, groups, strict=True) for job in group}
     variables = {"PYTHONPATH": str(PACKAGES_FOLDER)}
     return {
         "specificationVersion": VERSION,
         "name": f"stga {plan.out.name}"[:MAX_NAME],
         "jobEnvironments": [{"name": "stga", "variables": variables}],
-        "steps": [_step(name, group, step_of) for name, group in zip(names, groups.values(), strict=True)],
+        "steps": [_step(name, group, step_of) for name, group in zip(names, groups, strict=True)],
     }
 
 

@@ -17,7 +17,7 @@ from ...files import replacing
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, WorkerState, inspect_worker
 from ..engine import Ended, job_command
-from ..job import Job, Resources
+from ..job import Job, alike
 
 TIMEOUT_S = 60.0
 MAX_ARRAY = 1000
@@ -57,13 +57,7 @@ class SlurmEngine:
 
     def submit(self, jobs: Sequence[Job]) -> None:
         """Raises StgaError with sbatch's words where it refuses an array."""
-        groups: dict[tuple[str, Resources, int], list[Job]] = {}
-        for job in jobs:
-            number = 0
-            while len(groups.setdefault((job.table, job.resources, number), [])) == MAX_ARRAY:
-                number += 1
-            groups[job.table, job.resources, number].append(job)
-        for group in _ordered(list(groups.values())):
+        for group in _ordered(alike(jobs, MAX_ARRAY)):
             self._submit_array(group)
 
     def _submit_array(self, jobs: Sequence[Job]) -> None:

@@ -62,9 +62,9 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
     """Train the folder's run in turns and measure its avatar, with fitted exposure of cameras that were not trained."""
     from ...avatar.file import read_avatar
     from ...perform.training import prepare
-    from ...report.preset_timing import seconds_per_iteration
     from ...training.evaluate.metrics import evaluate_avatar
-    from ...training.optimize.flame_refinement import with_refined_tracking
+    from ...training.preset_timing import seconds_per_iteration
+    from ...training.run.tracking_file import with_refined_tracking
 
     turns = Turns(requests, replies)
     try:

@@ -4,14 +4,13 @@ import struct
 
 import numpy as np
 
-from ..names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
+from ..names import ARKIT_SHAPES, COLUMN, COUNT, MAX_WEIGHT, OPTIONAL
 from ..packet import FacePacket
 
 VERSION = 6
 MAX_TEXT_BYTES = 512
 ROTATIONS = 9
 """Yaw, pitch and roll of the head and of both eyes, after the shapes."""
-MAX_WEIGHT = 10.0
 _TIME = struct.Struct(">ifii")
 _EXCHANGED = {"jawRight": "jawLeft", "jawLeft": "jawRight", "mouthRight": "mouthLeft", "mouthLeft": "mouthRight"}
 PACKET_SHAPES = tuple(_EXCHANGED.get(name, name) for name in ARKIT_SHAPES)

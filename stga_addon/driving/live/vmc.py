@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..names import COLUMN, COUNT, arkit_name
+from ..names import COLUMN, COUNT, MAX_WEIGHT, arkit_name
 from ..packet import FacePacket
 from .osc import Message, Value, messages
 
 VALUE, APPLY = "/VMC/Ext/Blend/Val", "/VMC/Ext/Blend/Apply"
 TIME, BONE = "/VMC/Ext/T", "/VMC/Ext/Bone/Pos"
 HEAD_BONE = "head"
-MAX_WEIGHT = 10.0
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,8 @@
 const REST_RATE: u32 = 6u; // of the harmonics above the constant one
 
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let n = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let n = thread_number(thread);
   let stride = splat_stride(view);
   let i = n / stride;
   if i >= view.splats || wanted[i] == 0u {

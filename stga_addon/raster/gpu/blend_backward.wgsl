@@ -31,12 +31,9 @@ var<workgroup> nearest_wanted: atomic<u32>;
 var<workgroup> walk: vec2u; // first pair, and one past the last, that matter
 
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let tile = workgroup.y * workgroups.x + workgroup.x;
+fn main(thread: Thread) {
+  let local = thread.local;
+  let tile = workgroup_number(thread);
   if tile >= view.tiles_x * view.tiles_y || touched[tile] == 0u {
     return;
   }

@@ -15,12 +15,9 @@ var<workgroup> open_pixels: atomic<u32>; // that something behind can still be s
 var<workgroup> is_open: u32;
 
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let tile = workgroup.y * workgroups.x + workgroup.x;
+fn main(thread: Thread) {
+  let local = thread.local;
+  let tile = workgroup_number(thread);
   if tile >= view.tiles_x * view.tiles_y || rendered[tile] == 0u {
     return;
   }

@@ -49,12 +49,9 @@ fn sum_until(value: u32, local: u32) -> u32 {
 
 // A thread a splat.
 @compute @workgroup_size(WORKGROUP)
-fn count(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let n = thread_number(workgroup, workgroups, local);
+fn count(thread: Thread) {
+  let local = thread.local;
+  let n = thread_number(thread);
   var found = 0u;
   if n < view.splats {
     let i = order[n];

@@ -11,12 +11,8 @@ override SIGNALS: u32; // S
 
 // Move a triangle's origin by Σ signal · coefficients, in the triangle's axes and unit.
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let f = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let f = thread_number(thread);
   if f >= pose.triangles {
     return;
   }

@@ -21,12 +21,8 @@ override SIGNALS: u32; // S
 override RATE_SHARE: f32; // learning rate, as a share of that of the splats' positions
 
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let f = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let f = thread_number(thread);
   if f >= step.triangles {
     return;
   }

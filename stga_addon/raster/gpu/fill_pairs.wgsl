@@ -14,12 +14,8 @@
 
 // A thread a splat.
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let n = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let n = thread_number(thread);
   if n >= view.splats {
     return;
   }
@@ -27,7 +23,7 @@ fn main(
   var found = 0u;
   if counts[OVERFLOWED] == 0u {
     found = pairs_until[n];
-    if local > 0u {
+    if thread.local > 0u {
       found -= pairs_until[n - 1u];
     }
   }

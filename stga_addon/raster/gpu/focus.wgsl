@@ -6,12 +6,8 @@
 @group(0) @binding(3) var<storage, read_write> focus: array<u32>; // (N,) 0 or 1
 
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let i = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let i = thread_number(thread);
   if i < view.splats {
     focus[i] = (selected[face[i] / 4u] >> (8u * (face[i] & 3u))) & 1u;
   }

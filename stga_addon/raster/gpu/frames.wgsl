@@ -69,12 +69,8 @@ fn perpendicular(first: vec3f, raw_normal: vec3f, longest: f32) -> vec3f {
 
 // Write a triangle's origin and matrix: camera point = matrix · local + origin. And its strain, where it is wanted.
 @compute @workgroup_size(WORKGROUP)
-fn compose(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let f = thread_number(workgroup, workgroups, local);
+fn compose(thread: Thread) {
+  let f = thread_number(thread);
   if f >= pose.triangles {
     return;
   }
@@ -139,12 +135,8 @@ fn write_tensor(f: u32, e: Edges) {
 
 // Strain in the triangle's own directions: of the mean over its corners of the mean over the triangles touching each.
 @compute @workgroup_size(WORKGROUP)
-fn average_strain(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let f = thread_number(workgroup, workgroups, local);
+fn average_strain(thread: Thread) {
+  let f = thread_number(thread);
   if f >= pose.triangles {
     return;
   }

@@ -56,12 +56,9 @@ fn excess_of(i: u32) -> vec4f {
 }
 
 @compute @workgroup_size(WORKGROUP)
-fn measure(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let i = thread_number(workgroup, workgroups, local);
+fn measure(thread: Thread) {
+  let local = thread.local;
+  let i = thread_number(thread);
   var value = vec4f(0.0);
   if i < view.splats && wanted[i] != 0u {
     value = excess_of(i);

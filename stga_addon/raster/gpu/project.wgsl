@@ -12,12 +12,8 @@ const NOTHING = vec4i(0); // the tile bounds of a splat that is not visible
 const BROKEN = vec4i(-1); // and of one that is not finite
 
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let i = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let i = thread_number(thread);
   if i >= view.splats {
     return;
   }

@@ -18,12 +18,8 @@
 @group(0) @binding(11) var<storage, read_write> corrections: array<vec4u>;
 
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let i = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let i = thread_number(thread);
   if i >= view.splats || wanted[i] == 0u {
     return;
   }

@@ -10,12 +10,8 @@
 
 // The mean of a triangle's strain and of those that share an edge with it, component by component.
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let f = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let f = thread_number(thread);
   if f >= pose.triangles {
     return;
   }

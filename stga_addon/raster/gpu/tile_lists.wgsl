@@ -6,12 +6,8 @@
 
 // A thread a pair.
 @compute @workgroup_size(WORKGROUP)
-fn main(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let j = thread_number(workgroup, workgroups, local);
+fn main(thread: Thread) {
+  let j = thread_number(thread);
   if j >= counts[PAIRS] {
     return;
   }

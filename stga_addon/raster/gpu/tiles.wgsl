@@ -9,12 +9,8 @@
 
 // A thread a splat; `touched` is zero before.
 @compute @workgroup_size(WORKGROUP)
-fn mark(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let i = thread_number(workgroup, workgroups, local);
+fn mark(thread: Thread) {
+  let i = thread_number(thread);
   if i >= view.splats || focus[i] == 0u {
     return;
   }
@@ -28,12 +24,8 @@ fn mark(
 
 // A thread a tile: render the touched tiles and those at most view.ring tiles away, or all without a focus.
 @compute @workgroup_size(WORKGROUP)
-fn choose(
-  @builtin(workgroup_id) workgroup: vec3u,
-  @builtin(num_workgroups) workgroups: vec3u,
-  @builtin(local_invocation_index) local: u32,
-) {
-  let tile = thread_number(workgroup, workgroups, local);
+fn choose(thread: Thread) {
+  let tile = thread_number(thread);
   if tile >= view.tiles_x * view.tiles_y {
     return;
   }

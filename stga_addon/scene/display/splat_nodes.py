@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import bpy
 
+from ...capture.region import SELECTED_WEIGHT
 from .. import tags
 from ..layers import FROZEN_COLOR
 from .color_nodes import SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
@@ -198,7 +199,7 @@ def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
     name = nodes.out("FunctionNodeReplaceString", {"String": f"{tags.GROUP_PREFIX}#", "Find": "#", "Replace": frame})
     group = nodes.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
     weight, exists = (socket for socket in group.outputs if socket.enabled)
-    selected = nodes.compare("GREATER_EQUAL", weight, tags.SELECTED_WEIGHT)
+    selected = nodes.compare("GREATER_EQUAL", weight, SELECTED_WEIGHT)
     # Compared on the points: a boolean interpolated to a face is true where it is true at all the face's points.
     frozen = nodes.logic("NIMPLY", exists, nodes.on_domain(selected, "BOOLEAN", "POINT"))
     return nodes.sample(mesh, frozen, nodes.attribute(FACE, "INT"), "BOOLEAN")

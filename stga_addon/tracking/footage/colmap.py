@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import StgaError, shorten
+from ...files import read_bytes
 from ...flame.quaternions import to_matrices
 from .lens import Lens
-from .reading import numbers, pinhole, read_bytes, read_text
+from .reading import numbers, pinhole, read_text
 from .shots import Shot
 from .sources import natural_order
 

@@ -9,23 +9,11 @@ import numpy as np
 
 from ...capture.camera import MAX_FOCAL_PIXELS, Camera, is_image_size
 from ...errors import StgaError, shorten
-from ...files import file_size
+from ...files import read_bytes
 
-MAX_FILE_BYTES = 1 << 30
 ROTATION_TOLERANCE = 1e-3  # some exports round rotations to a few decimals
 MAX_POSITION = 1e12
 """Of a camera, in the calibration's unit: millimeters from the center of the earth are 1e10."""
-
-
-def read_bytes(path: Path) -> bytes:
-    """The whole file. Raises StgaError where it is missing, no regular file, or above 1 GiB."""
-    size = file_size(path)
-    if size > MAX_FILE_BYTES:
-        raise StgaError(f"{path}: has {size} bytes, more than the {MAX_FILE_BYTES} allowed")
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def read_text(path: Path) -> str:

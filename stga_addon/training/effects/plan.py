@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...avatar.offsets.table import OFFSETS
 from ...capture.model import Capture
@@ -14,46 +14,19 @@ from ..settings import TrainingSettings
 from .facts import CaptureFacts
 from .rules import RULES, Verdict
 
-if TYPE_CHECKING:
-    from ..run.folder import Run
+Plan = tuple[EffectDecision, ...]
 
 
-def with_effect_plan(run: "Run", capture: Capture, device: str = "cpu") -> "Run":
-    """The run with its effects decided; unchanged where it has a plan already or its settings ask for none.
+def plan_effects(capture: Capture, settings: TrainingSettings, device: str = "cpu") -> tuple[TrainingSettings, Plan]:
+    """The settings that suit a capture, and the reasons; takes a few seconds. The same settings and no reasons where
+    they ask for none, or the capture has no training views.
 
     device: of the training, as `choose_device` returns it.
-    Raises StgaError for a choice that cannot work on this capture.
-    """
-    if run.settings.effects is None or run.effect_plan or not capture.views.get("train"):
-        return run
-    settings, plan = plan_effects(capture, run.settings, device)
-    return replace(run, settings=settings, effect_plan=plan)
-
-
-def with_effects_of_takes(run: "Run", capture: Capture) -> "Run":
-    """The run with the effects that may be `added_later` where all its takes together call for them and the run it
-    continues went without. A user's choice stays. capture: of all takes.
-    """
-    facts, settings = CaptureFacts(capture, run.settings), run.settings
-    plan = {decision.effect: decision for decision in run.effect_plan}
-    for effect in EFFECTS.values():
-        before = plan.get(effect.name)
-        if effect.added_later and before is not None and not before.on and before.choice == "auto":
-            verdict = RULES[effect.name](facts)
-            assert verdict is not None
-            plan[effect.name] = replace(before, on=verdict.on, reason=verdict.reason)
-            settings = switched(settings, effect, verdict.on)
-    return replace(run, settings=settings, effect_plan=tuple(plan.values()))
-
-
-def plan_effects(
-    capture: Capture, settings: TrainingSettings, device: str = "cpu"
-) -> tuple[TrainingSettings, tuple[EffectDecision, ...]]:
-    """The settings that suit a capture with training views, and the reasons; takes a few seconds.
-
     Raises StgaError where an image cannot be read, or for a choice in `settings.effects` that cannot work.
     """
-    facts, choices = CaptureFacts(capture, settings, device), settings.effects or {}
+    if settings.effects is None or not capture.views.get("train"):
+        return settings, ()
+    facts, choices = CaptureFacts(capture, settings, device), settings.effects
     decided, plan = settings, []
     for effect in EFFECTS.values():
         choice, verdict = choices.get(effect.name, "auto"), RULES[effect.name](facts)
@@ -65,6 +38,20 @@ def plan_effects(
         decided = switched(decided, effect, on, verdict.changes)
         plan.append(EffectDecision(effect.name, choice, on, verdict.reason, effect.cost))
     return decided, tuple(plan)
+
+
+def add_effects(capture: Capture, settings: TrainingSettings, before: Plan) -> tuple[TrainingSettings, Plan]:
+    """Settings and plan with the effects that may be `added_later` where the capture, of all takes, calls for them and
+    the run that is continued went without. A user's choice stays."""
+    facts, plan = CaptureFacts(capture, settings), {decision.effect: decision for decision in before}
+    for effect in EFFECTS.values():
+        decision = plan.get(effect.name)
+        if effect.added_later and decision is not None and not decision.on and decision.choice == "auto":
+            verdict = RULES[effect.name](facts)
+            assert verdict is not None
+            plan[effect.name] = replace(decision, on=verdict.on, reason=verdict.reason)
+            settings = switched(settings, effect, verdict.on)
+    return settings, tuple(plan.values())
 
 
 def switched(

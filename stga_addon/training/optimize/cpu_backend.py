@@ -14,20 +14,17 @@ from . import adam, driven_offsets
 from .backend import Batch
 from .flame_refinement import frame_gradient
 from .frames import FrameStore
-from .losses import image_gradient, scale_limits, tile_rectangles, whole_image
+from .losses import image_gradient, tile_rectangles, whole_image
 from .state import TrainState
 
 
 class CpuBackend:
-    """Trains in host memory: `state` is the trained tensors themselves, and every loss is returned at once.
+    """Trains in host memory: `state` is the trained tensors themselves, and every loss is returned at once."""
 
-    units: see `losses.limit_units`.
-    """
-
-    def __init__(self, settings: TrainingSettings, units: np.ndarray, frames: FrameStore, state: TrainState) -> None:
+    def __init__(self, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> None:
         self.state = state
-        self._settings, self._units, self._frames = settings, units, frames
-        self._scale_limits = scale_limits(frames.capture, settings)
+        self._settings, self._frames = settings, frames
+        self._scale_limits = frames.scale_limits(settings)
         self._buffers = BufferPool()
 
     def __len__(self) -> int:
@@ -134,6 +131,6 @@ class CpuBackend:
             weight = settings.unseen_opacity_weight / len(state)
             opacity_weight(rows, state.parameters.opacity, state.unseen_share, weight, state.gradients.opacity)
         if settings.distance_weight:
-            limit = np.float32(settings.distance_limit) * self._units
+            limit = np.float32(settings.distance_limit) * self._frames.units
             weight, gradient = settings.distance_weight, state.gradients.xyz
             distance_limit(rows, state.parameters.xyz, face, unbound, limit, weight, gradient)

@@ -3,21 +3,17 @@
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from ...avatar.embedding import FaceFrames
-from ...capture.flame_capture import with_sequence
 from ...capture.model import Capture
 from ...errors import StgaError
-from ...files import read_npz, write_npz
-from ...flame.forward import FlameFrame
+from ...flame.forward import POSE_SIZE, TRANSLATION_SIZE, FlameFrame, frame_of
 from ...flame.forward_torch import flame_forward, flame_tensors
-from ...flame.sequence import FRAME_FIELDS, FlameSequence, read_motion, sequence_mesh, with_identity
+from ...flame.sequence import FlameSequence, sequence_mesh, with_identity
 from ...raster.cpu.layout import Parameters
-from ..effect_decisions import TRACKING
 
 REFINEMENT_START_SHARE = 0.15
 """Share of the budget before the first step: gradients of untrained splats carry no information."""
@@ -29,8 +25,6 @@ timestep is visited a few dozen times."""
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 DECAY_PER_STEP = 0.03
 """Decay towards the tracked values with each step at full rate, for parameters that no image determines."""
-POSE_SIZE, TRANSLATION_SIZE = 15, 3
-"""The last numbers of a timestep: axis-angles of five joints, and the translation. Expression comes first."""
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
 
@@ -61,7 +55,7 @@ class Tracking:
     def __init__(self, sequence: FlameSequence, timesteps: Collection[int]) -> None:
         """timesteps: which ones to refine."""
         self.sequence = sequence
-        self.tracked = np.stack([parameters_of(sequence.frame(timestep)) for timestep in sequence.timesteps])
+        self.tracked = np.stack([sequence.frame(timestep).parameters for timestep in sequence.timesteps])
         self.trained = np.isin(sequence.timesteps, list(timesteps))
         zero = np.zeros_like(self.tracked)
         self.state = RefinementState(zero, zero.copy(), zero[0].copy(), np.zeros(len(zero), np.int64))
@@ -87,7 +81,7 @@ class Tracking:
         return np.asarray(self.tracked + np.where(self.trained[:, None], self.state.change - mean, 0.0))
 
     def frame(self, timestep: int) -> FlameFrame:
-        return with_parameters(self._source(timestep), self.parameters()[self._row[timestep]])
+        return frame_of(self.parameters()[self._row[timestep]], self._source(timestep).dynamic_offset)
 
     def mesh(self, timestep: int) -> np.ndarray:
         """Refined mesh (V, 3) of the timestep, in meters."""
@@ -111,7 +105,7 @@ class Tracking:
     def gradient(self, timestep: int, vertex_gradient: np.ndarray) -> np.ndarray:
         """(P,) gradient with respect to the timestep's parameters, from that with respect to its vertices (V, 3)."""
         frame = self.frame(timestep)
-        parameters = torch.tensor(parameters_of(frame)[None], dtype=torch.float32, requires_grad=True)
+        parameters = torch.tensor(frame.parameters[None], dtype=torch.float32, requires_grad=True)
         expr, pose, translation = parameters.tensor_split([-POSE_SIZE - TRANSLATION_SIZE, -TRANSLATION_SIZE], dim=1)
         offset = None if frame.dynamic_offset is None else torch.tensor(frame.dynamic_offset, dtype=torch.float32)
         no_shape = parameters.new_zeros(0)
@@ -160,52 +154,3 @@ def frame_gradient(
     on, count = face[rows], len(frames.origin)
     sums = [np.bincount(on, column, count) for column in (fx, fy, fz, *rotation, scale)]
     return np.stack(sums[:3], -1) / frames.scale[:, None], np.stack(sums[3:6], -1), sums[6]
-
-
-def parameters_of(frame: FlameFrame) -> np.ndarray:
-    """(P,) parameters of a frame: expression, joints, translation."""
-    return np.concatenate([frame.expr, frame.pose.ravel(), frame.translation])
-
-
-def with_parameters(frame: FlameFrame, parameters: np.ndarray) -> FlameFrame:
-    """The frame with these parameters, laid out as by `parameters_of`."""
-    expr, pose, translation = np.split(parameters, [-POSE_SIZE - TRANSLATION_SIZE, -TRANSLATION_SIZE])
-    rotation, neck, jaw, eyes = np.split(pose, [3, 6, 9])
-    return replace(
-        frame, expr=expr, rotation=rotation, neck_pose=neck, jaw_pose=jaw, eyes_pose=eyes, translation=translation
-    )
-
-
-def write_tracking(folder: Path, tracking: Tracking) -> None:
-    """Write a run folder's tracking.npz: the refined motion, for `read_motion`, and the tracked parameters."""
-    sequence = tracking.sequence
-    frame = with_parameters(sequence.frame(sequence.timesteps[0]), tracking.parameters().T)
-    arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
-    arrays["shape"] = sequence.shape
-    if sequence.static_offset is not None:
-        arrays["static_offset"] = sequence.static_offset
-    arrays["timesteps"], arrays["tracked"] = np.array(sequence.timesteps), tracking.tracked
-    write_npz(folder / TRACKING, arrays, compressed=True)
-
-
-def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
-    """The capture with the parameters that the run in `folder` refined; unchanged if it refined none.
-
-    A timestep is replaced only if the capture's tracked parameters are those that the run started from, so that
-    another capture stays unchanged. Raises StgaError if the run's file is damaged.
-    """
-    path, sequence = folder / TRACKING, capture.flame
-    if sequence is None or not path.exists():
-        return capture
-    motion, tracked = read_motion(path, sequence.model), read_npz(path).get("tracked", np.zeros(0))
-    if len(tracked) != len(motion.timesteps):
-        raise StgaError(f"{path}: tracked has shape {tracked.shape}, expected {len(motion.timesteps)} timesteps first")
-    before = dict(zip(motion.timesteps, tracked, strict=True))
-
-    def frame(timestep: int) -> FlameFrame:
-        found = sequence.frame(timestep)
-        if timestep not in before or not np.array_equal(parameters_of(found), before[timestep]):
-            return found
-        return replace(motion.frame(timestep), dynamic_offset=found.dynamic_offset)
-
-    return with_sequence(capture, replace(sequence, frame=frame))

@@ -1,4 +1,4 @@
-"""Cache of meshes and face frames by timestep."""
+"""Cache of meshes and face frames by timestep, and the limits on size and position in their units (STGA, training)."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -6,11 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...avatar.embedding import FaceFrames, face_frames
+from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.strain import color_range, strain_basis
 from ...capture.model import Capture
+from ..settings import TrainingSettings
 from .flame_refinement import Tracking
+from .hull_points import voxel_size
 
 CACHED_TIMESTEPS = 12
 """Timesteps kept in memory: about 1 MB each for 10,000 triangles."""
@@ -28,6 +30,7 @@ class FrameStore:
 
     strain    `strain_basis` of the neutral mesh, None if neither colors nor positions depend on strain
     tracking  meshes of its timesteps come from here instead of the capture, None if no tracking is refined
+    units     (F,) float32: per triangle the length that limits are multiples of, in the convention's local units
     """
 
     def __init__(
@@ -42,7 +45,17 @@ class FrameStore:
         self.capture, self.convention, self.tracking = capture, convention, tracking
         limits = color_range(len(capture.faces)) if limits is None else limits
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
+        self.units = np.ones(len(capture.faces), np.float32)
+        if convention != "gaussian_avatars":
+            self.units = np.asarray(np.sqrt(2 * face_areas(capture.neutral, capture.faces)), np.float32)
         self._cached: dict[int, _Timestep] = {}
+
+    def scale_limits(self, settings: TrainingSettings) -> np.ndarray:
+        """Largest scale (2, F) float32 of bound and of unbound splats by triangle, in the convention's local units."""
+        neutral = self.capture.neutral
+        frames = face_frames(neutral, self.capture.faces, neutral, self.convention)
+        unbound = settings.unbound_scale_limit * voxel_size(neutral) / np.maximum(frames.scale, MIN_DIVISOR)
+        return np.asarray(np.stack([settings.scale_limit * self.units, unbound]), np.float32)
 
     def of(self, timestep: int) -> FaceFrames:
         entry, capture = self._latest(timestep), self.capture

@@ -30,7 +30,6 @@ from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, image_epsilon
 from .backend import Batch
 from .frames import FrameStore
-from .losses import scale_limits
 from .state import OffsetState, TrainState
 
 QUEUED_ITERATIONS = 2
@@ -62,10 +61,7 @@ class GpuBackend:
     there on; the host learns it when it reads that iteration's loss, makes room, and queues what was left out again.
     """
 
-    def __init__(
-        self, device: Device, settings: TrainingSettings, units: np.ndarray, frames: FrameStore, state: TrainState
-    ) -> None:
-        """units (F,): see `losses.limit_units`."""
+    def __init__(self, device: Device, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> None:
         capture = frames.capture
         self._settings, self._frames, self.device = settings, frames, device
         self._rasterizer = Rasterizer(device)
@@ -73,7 +69,7 @@ class GpuBackend:
             device, capture.neutral, capture.faces, frames.convention, frames.strain, state.driven_offsets
         )
         self._triangles = len(capture.faces)
-        self._limits = np.column_stack([*scale_limits(capture, settings), settings.distance_limit * units])
+        self._limits = np.column_stack([*frames.scale_limits(settings), settings.distance_limit * frames.units])
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)

@@ -13,7 +13,7 @@ from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask
 from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
 from ...capture.model import Capture, View
-from ...flame.masks import torso_faces
+from ...flame.model import torso_faces
 from ...flame.sequence import below_neck
 from ...tracking.torso_motion import TorsoPoints, read_torso_points
 

@@ -1,4 +1,7 @@
-"""What is done to the captured images before they are trained on or compared with."""
+"""What is done to the captured images before they are trained on or compared with: the backdrop is taken away, and
+exposure and white balance of the training cameras are corrected."""
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -6,7 +9,9 @@ from ...capture.loader import Preparation
 from ...capture.model import Capture, View
 from ..backdrop import without_backdrop
 from ..settings import TrainingSettings
-from .exposure import exposure_correction
+
+Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
+"""(view, image (H, W, 3) uint8, mask (H, W) uint8 or None) -> corrected image (H, W, 3) uint8."""
 
 
 def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparation | None:
@@ -20,3 +25,26 @@ def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparati
         return (image if correct is None else correct(view, image, mask)), mask
 
     return prepare
+
+
+def exposure_correction(settings: TrainingSettings) -> Correction | None:
+    """The correction that inverts the settings' `exposure`; None if there is none.
+
+    It applies to the foreground only, because the background is constant whatever the camera. Images of cameras that
+    the settings do not list stay unchanged.
+    """
+    if not settings.exposure:
+        return None
+    rows = {int(row[0]): np.array(row[1:], np.float32).reshape(2, 3) for row in settings.exposure}
+    background = 255 * np.array(settings.background, np.float32)
+
+    def correct(view: View, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+        if view.camera_index not in rows:
+            return image
+        gain, offset = rows[view.camera_index]
+        cover = np.float32(1) if mask is None else mask[..., None].astype(np.float32) / 255
+        background_part = (1 - cover) * background
+        corrected = (image - background_part - cover * offset) / gain + background_part
+        return np.asarray(np.clip(corrected, 0, 255) + 0.5).astype(np.uint8)
+
+    return correct

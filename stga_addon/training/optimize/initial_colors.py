@@ -4,11 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import binary_erosion
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ...capture.images import read_view
+from ...capture.mesh_geometry import connected_parts
 from ...capture.mesh_raster import rasterize
 from ...capture.model import Capture, View, evenly_spread
 
@@ -99,15 +98,8 @@ def _nearest_shown(capture: Capture, shown: np.ndarray, others: np.ndarray) -> n
     """
     centers = capture.neutral[capture.faces].mean(1)
     nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
-    part = _connected_parts(capture.faces, len(capture.neutral))
+    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
     for number in np.unique(part[shown]):
         members, known = np.flatnonzero(part == number), np.flatnonzero((part == number) & shown)
         nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
     return np.asarray(nearest)
-
-
-def _connected_parts(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """(F,) number of the connected part of the mesh that a triangle belongs to."""
-    ends = np.concatenate([faces[:, :2], faces[:, 1:]]).T
-    part = connected_components(coo_matrix((np.ones(ends.shape[1]), ends), (vertices, vertices)), directed=False)[1]
-    return np.asarray(part[faces[:, 0]])

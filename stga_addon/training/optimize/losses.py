@@ -1,4 +1,4 @@
-"""Image loss of the CPU backend, and the unit of the limits on size and position (STGA, training)."""
+"""Image loss of the CPU backend (STGA, training)."""
 
 from functools import cache
 from itertools import pairwise
@@ -6,13 +6,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from ...avatar.embedding import MIN_DIVISOR, face_areas, face_frames
-from ...capture.model import Capture
 from ...raster.cpu.image_loss import LOSS_REACH_PX, image_loss
 from ...raster.cpu.layout import TILE
 from ...raster.cpu.threads import threads
-from ..settings import TrainingSettings
-from .hull_points import voxel_size
 
 BAND_TILES = 12
 """Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
@@ -78,18 +74,3 @@ def mean_ssim(image: np.ndarray, target: np.ndarray) -> float:
     unused = np.empty_like(image)
     _, height, width = image.shape
     return image_gradient(image, target, whole_image(height, width), 1.0, unused)[1]
-
-
-def scale_limits(capture: Capture, settings: TrainingSettings) -> np.ndarray:
-    """Largest scale (2, F) float32 of bound and of unbound splats by triangle, in the convention's local units."""
-    bound = settings.scale_limit * limit_units(capture, settings.convention)
-    frames = face_frames(capture.neutral, capture.faces, capture.neutral, settings.convention)
-    unbound = settings.unbound_scale_limit * voxel_size(capture.neutral) / np.maximum(frames.scale, MIN_DIVISOR)
-    return np.asarray(np.stack([bound, unbound]), np.float32)
-
-
-def limit_units(capture: Capture, convention: str) -> np.ndarray:
-    """Per triangle the length (F,) that limits are multiples of, in the convention's local units."""
-    if convention == "gaussian_avatars":
-        return np.ones(len(capture.faces), np.float32)
-    return np.asarray(np.sqrt(2 * face_areas(capture.neutral, capture.faces)), np.float32)

@@ -5,14 +5,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...capture.model import Capture, View
+from ...errors import StgaError
+from ...render.device import adapter_name
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
-from .backend import Batch
-from .backends import make_backend
+from .backend import Backend, Batch
+from .cpu_backend import CpuBackend
 from .flame_refinement import RefinementState, refinable_tracking, refinement_rate
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .losses import limit_units
 from .state import TrainState, new_state, with_offsets
 from .strategies import DensityControl, PostStep, StrayReset, make_strategy
 
@@ -45,12 +46,11 @@ class Trainer:
         self.iteration, self.visit = 0, -1
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)
-        self._limit_units = limit_units(capture, settings.convention)
         if state is None:
             splats = initial_splats(capture, settings)
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
             state = with_offsets(state, settings.driven_offsets, len(capture.faces))
-        self._backend = make_backend(device, settings, self._limit_units, self.frames, state)
+        self._backend = make_backend(device, settings, self.frames, state)
         self.initial_count = len(self)
 
     def __len__(self) -> int:
@@ -132,7 +132,7 @@ class Trainer:
 
     def _post_step(self, progress: float) -> None:
         steps: tuple[PostStep, ...] = (
-            StrayReset(self.settings, self._limit_units, self.strategy.region),
+            StrayReset(self.settings, self.frames.units, self.strategy.region),
             DensityControl(self.settings, self.initial_count, self.strategy.region),
         )
         due = [step for step in steps if step.is_due(self.iteration, progress)]
@@ -141,3 +141,19 @@ class Trainer:
             for step in due:
                 state = step.apply(state, self.iteration)
             self.state = state
+
+
+def make_backend(device: str, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> Backend:
+    """The backend of a device of `choose_device`. Raises StgaError if the device does not support the settings."""
+    if device == "cpu":
+        return CpuBackend(settings, frames, state)
+    if settings.tracking:
+        raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
+    from ...raster.gpu.device import Device  # needs wgpu, which training on the CPU does without
+    from ...raster.gpu.driven_offsets import SIGNALS
+    from .gpu_backend import GpuBackend
+
+    for name in state.driven_offsets:
+        if name not in SIGNALS:
+            raise StgaError(f"driven offset {name}: is trained on the CPU only, not on {device}")
+    return GpuBackend(Device(adapter_name(device)), settings, frames, state)

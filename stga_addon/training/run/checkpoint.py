@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ...avatar.file import check_array
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import ARRAYS
 from ...errors import StgaError, shorten
@@ -165,7 +166,7 @@ def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | 
         raise StgaError(f"{path}: {REFINEMENT}change has shape {whole}, expected (timesteps, numbers)")
     shapes = {"change": whole, "first": whole, "second": whole[1:], "steps": whole[:1]}
     for name, array in taken.items():
-        _check_array(path, REFINEMENT + name, array, "int64" if name == "steps" else "float64", shapes[name])
+        check_array(path, REFINEMENT + name, array, "int64" if name == "steps" else "float64", shapes[name])
     return found
 
 
@@ -179,17 +180,10 @@ def _offset(path: Path, arrays: dict[str, np.ndarray], name: str) -> OffsetState
     triangles = found.steps.shape[:1]
     for part, array in taken.items():
         tail = () if part == "steps" else (OFFSETS[name].signals, 3)
-        _check_array(path, f"{name}/{part}", array, "float32" if tail else "int32", (*triangles, *tail))
+        check_array(path, f"{name}/{part}", array, "float32" if tail else "int32", (*triangles, *tail))
     return found
 
 
 def _taken(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """The arrays whose names begin with the prefix, under the rest of their names; removed from `arrays`."""
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
-
-
-def _check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:
-    if array.dtype != dtype or array.shape != shape:
-        raise StgaError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} {shape}")
-    if not np.isfinite(array).all():
-        raise StgaError(f"{path}: {name} holds a value that is not finite")

@@ -10,6 +10,7 @@ from ...errors import StgaError
 from ...render.device import GPU, adapter_names, choose_device
 from .folder import Run, Take, has_run, read_run
 from .identity import RunIdentity, difference, identity_of, version_4_identity
+from .tracking_file import with_refined_tracking
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,15 @@ def open_run(
     opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
-        from ..optimize.flame_refinement import with_refined_tracking  # imports torch, which Blender's own Python lacks
-
         opened = with_refined_tracking(opened, folder)
     return OpenedRun(run, opened, takes)
+
+
+def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
+    """The capture of a run, with the FLAME parameters that the run refined. Errors as of `open_run`."""
+    if not folder.is_dir():
+        raise StgaError(f"{folder}: is not a folder; expected that of a run")
+    return with_refined_tracking(open_run(folder, capture, flame).capture, folder)
 
 
 def _open_take(folder: Path, run: Run, take: Take) -> Capture:

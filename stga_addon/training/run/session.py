@@ -18,12 +18,10 @@ from ...errors import StgaError
 from ...files import replacing
 from ...schema import to_json
 from ...selection import select_capture
-from ..effect_decisions import TRACKING
 from ..evaluate.evaluation_views import EvaluationView, choose_evaluation_views, read_evaluation_view
 from ..evaluate.evaluator import Evaluation, Evaluator, Spent
 from ..evaluate.match_exposure import known_exposure
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
-from ..optimize.flame_refinement import with_refined_tracking, write_tracking
 from ..optimize.image_preparation import image_preparation
 from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
@@ -37,6 +35,7 @@ from .progress import Progress, Report
 from .replay import continued_order
 from .residual_file import write_residuals
 from .strain_range import STRAIN_RANGE, require_color_range, strain_range_of, trained_strain_range
+from .tracking_file import TRACKING, with_refined_tracking, write_tracking
 
 RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
@@ -146,8 +145,9 @@ class Session:
 
     def write_avatar(self) -> None:
         write_avatar(self.folder / AVATAR, self.avatar())
-        if self.trainer.tracking is not None:
-            write_tracking(self.folder, self.trainer.tracking)
+        refined = self.trainer.tracking
+        if refined is not None:
+            write_tracking(self.folder, refined.sequence, refined.parameters(), refined.tracked)
 
     def write_checkpoint(self, evaluator: Evaluator) -> None:
         trainer = self.trainer

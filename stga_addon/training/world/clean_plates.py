@@ -8,7 +8,7 @@ import numpy as np
 from ...capture.camera import Camera
 from ...capture.images import read_image, read_mask
 from ...capture.model import Capture, View, evenly_spread
-from ..optimize.exposure import Correction
+from ..optimize.image_preparation import Correction
 
 MAX_PLATE_VIEWS = 24
 """Views of a camera that its plate is the median of."""

@@ -12,7 +12,7 @@ from ...capture.camera import Camera
 from ...capture.model import Capture, View
 from ...flame.quaternions import from_matrices
 from ...progress import Progress, Report, counted, ignore
-from ..optimize.exposure import exposure_correction
+from ..optimize.image_preparation import exposure_correction
 from ..optimize.state import new_state
 from ..optimize.trainer import Trainer
 from ..settings import Rates, TrainingSettings

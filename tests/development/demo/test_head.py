@@ -13,8 +13,7 @@ from stga_addon.development.demo.head_mesh import PARTS
 from stga_addon.development.demo.paint import paint
 from stga_addon.development.demo.skin import EYE, EYE_RADIUS, hair_offset
 from stga_addon.flame.forward import FlameFrame, flame_forward, neutral_frame
-from stga_addon.flame.masks import key_regions
-from stga_addon.flame.model import FlameModel, read_flame
+from stga_addon.flame.model import FlameModel, key_regions, read_flame
 
 
 @pytest.fixture(scope="module")

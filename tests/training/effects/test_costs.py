@@ -15,7 +15,7 @@ from stga_addon.raster import reference
 from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
-from stga_addon.training.optimize.exposure import exposure_correction
+from stga_addon.training.optimize.image_preparation import exposure_correction
 from stga_addon.training.run import loop, session
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run

@@ -17,7 +17,7 @@ from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 from stga_addon.export.ply import read_ply
 from stga_addon.training.effect_catalog import EFFECTS, Effect
-from stga_addon.training.effects.plan import describe_effects, with_effect_plan, with_effects_of_takes
+from stga_addon.training.effects.plan import add_effects, describe_effects, plan_effects
 from stga_addon.training.effects.rules import RULES, Verdict
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -56,7 +56,7 @@ def planned(capture: Capture) -> Run:
     choices = dict.fromkeys(("strain-color", "strain-position", "view-color", "exposure"), "off")
     settings = quick_settings("global", lattice=1, iterations=30, effects={**choices, "tracking": "auto"})
     settings = replace(settings, density_interval=10, density_span=(0.0, 1.0))
-    return with_effect_plan(Run(capture.root, None, "vhap", settings), capture)
+    return Run(capture.root, None, "vhap", *plan_effects(capture, settings))
 
 
 def made(seed: int = 0) -> tuple[Avatar, np.ndarray]:
@@ -96,10 +96,9 @@ def test_a_continuation_adds_it(capture: Capture) -> None:
     """Catches an effect that only runs which began with it can have."""
     run = planned(capture)
     (decision,) = (each for each in run.effect_plan if each.effect == "toy-growth")
-    without = replace(
-        run, settings=replace(run.settings, driven_offsets=()), effect_plan=(replace(decision, on=False),)
-    )
-    assert with_effects_of_takes(without, capture).settings.driven_offsets == (NAME,)
+    without = replace(run.settings, driven_offsets=())
+    settings, _ = add_effects(capture, without, (replace(decision, on=False),))
+    assert settings.driven_offsets == (NAME,)
 
 
 def test_a_device_without_its_kernels_says_so(capture: Capture) -> None:

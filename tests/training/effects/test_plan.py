@@ -11,7 +11,7 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects import plan as planning
-from stga_addon.training.effects.plan import with_effect_plan, with_effects_of_takes
+from stga_addon.training.effects.plan import add_effects, plan_effects
 from stga_addon.training.effects.rules import Verdict
 from stga_addon.training.run.folder import Run, read_run, write_run
 from stga_addon.training.settings import make_settings
@@ -46,20 +46,20 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
     """Catches an extended run that cannot hold its takes' expressions, and a user's choice that is overruled."""
     capture = open_capture(root)
     settings = make_settings(iterations=1, effects={} if choice == "auto" else {effect: choice})
-    run = with_effect_plan(Run(capture.root, None, "vhap", settings), capture)
+    settings, plan = plan_effects(capture, settings)
     on = EFFECTS[effect].on or {"driven_offsets": (EFFECTS[effect].offset,)}
-    assert not on.items() <= vars(run.settings).items()
+    assert not on.items() <= vars(settings).items()
     monkeypatch.setitem(planning.RULES, effect, lambda facts: Verdict(True, "two takes say so"))
-    extended = with_effects_of_takes(run, capture)
-    assert (on.items() <= vars(extended.settings).items()) == expected
-    changed = [now for now, then in zip(extended.effect_plan, run.effect_plan, strict=True) if now != then]
+    extended, later = add_effects(capture, settings, plan)
+    assert (on.items() <= vars(extended).items()) == expected
+    changed = [now for now, then in zip(later, plan, strict=True) if now != then]
     assert [(each.effect, each.on, each.reason) for each in changed] == expected * [(effect, True, "two takes say so")]
-    assert with_effects_of_takes(extended, capture) == extended
+    assert add_effects(capture, extended, later) == (extended, later)
 
 
 def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     """Catches a run that goes on with other effects than it began with."""
-    monkeypatch.setattr(planning, "plan_effects", None)
+    monkeypatch.setattr("stga_addon.perform.training.plan_effects", None)
     before = read_run(trained)
     train = ["train", str(root), "--out", str(trained), "--resume"]
     assert main([*train, "--effect", "strain-color=on"]) == 0
@@ -110,8 +110,8 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
 
 def test_settings_that_ask_for_nothing(root):
     """Catches `make_settings` whose settings are not final: benchmarks and tests rely on them."""
-    run = Run(root, None, "vhap", make_settings(iterations=5))
-    assert with_effect_plan(run, open_capture(root)) is run
+    settings = make_settings(iterations=5)
+    assert plan_effects(open_capture(root), settings) == (settings, ())
 
 
 def test_a_damaged_plan(tmp_path):

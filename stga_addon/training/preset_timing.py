@@ -1,6 +1,5 @@
 """Preset timing: how long each preset would train on this machine, measured on the capture itself."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import cycle, islice
 from time import perf_counter
@@ -12,12 +11,12 @@ from ..capture.loader import LoadedView
 from ..capture.model import Capture, View
 from ..errors import StgaError
 from ..selection import select_capture
-from ..training.effects.plan import plan_effects
-from ..training.optimize.image_preparation import image_preparation
-from ..training.optimize.precompile import precompile_kernels
-from ..training.optimize.trainer import Trainer
-from ..training.schedule import image_scale, view_order
-from ..training.settings import PRESETS, TrainingSettings, make_settings
+from .effects.plan import plan_effects
+from .optimize.image_preparation import image_preparation
+from .optimize.precompile import precompile_kernels
+from .optimize.trainer import Trainer
+from .schedule import image_scale, view_order
+from .settings import PRESETS, TrainingSettings, make_settings
 
 CALIBRATION_S = 2.0
 """Training time that is measured per preset."""
@@ -38,26 +37,30 @@ class PresetTiming:
     iterations: int
     seconds: float
 
-    def as_json(self) -> dict[str, str | int | float]:
-        return dict(vars(self))
+
+def time_presets(capture: Capture, seconds: float = CALIBRATION_S, device: str = "cpu") -> list[PresetTiming]:
+    """Measure each preset with the effects that suit the capture. Arguments and errors as for `time_preset`."""
+    timings = []
+    for name in PRESETS:
+        settings = make_settings(preset=name, iterations=1, effects={})
+        settings, _ = plan_effects(capture, settings, device)
+        timings.append(time_preset(capture, settings, seconds, device))
+    return timings
 
 
-def time_presets(
-    capture: Capture, names: Iterable[str] = tuple(PRESETS), seconds: float = CALIBRATION_S, device: str = "cpu"
-) -> list[PresetTiming]:
-    """Measure each preset for `seconds` on a device of `choose_device`.
+def time_preset(
+    capture: Capture, settings: TrainingSettings, seconds: float = CALIBRATION_S, device: str = "cpu"
+) -> PresetTiming:
+    """Measure settings with a preset, whatever their budget, for `seconds` on a device of `choose_device`.
 
     Raises StgaError if the capture has no training views.
     """
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
-    timings = []
-    for name in names:
-        iterations = PRESETS[name].iterations_for(len(capture.views["train"]))
-        settings, _ = plan_effects(capture, make_settings(preset=name, iterations=iterations, effects={}), device)
-        pace = seconds_per_iteration(capture, settings, seconds, device)
-        timings.append(PresetTiming(name, PRESETS[name].purpose, iterations, iterations * pace))
-    return timings
+    name = str(settings.preset)
+    iterations = PRESETS[name].iterations_for(len(capture.views["train"]))
+    pace = seconds_per_iteration(capture, settings, seconds, device)
+    return PresetTiming(name, PRESETS[name].purpose, iterations, iterations * pace)
 
 
 def seconds_per_iteration(
