@@ -204,7 +204,7 @@ def take(work, count):
 
 
 def measure_latency(repeats: int) -> Latency:
-    """Measured on two threads; of the repeats the fastest tenth, because on a loaded machine a thread may lack a core."""
+    """Measured on two threads, of the repeats the fastest tenth: on a loaded machine a thread may lack a core."""
     pieces = 100_000
 
     def meet_ms(units: int, awake: bool) -> float:

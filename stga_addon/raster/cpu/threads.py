@@ -68,8 +68,8 @@ def set_threads(count: int) -> None:
 
 
 def start_threads() -> None:
-    """Start the threads that kernels run on, so that none waits for what they run to be compiled."""
-    _team.start(_threads - 1)
+    """Start the threads that kernels run on, one at least, so that no kernel waits until what they run is compiled."""
+    _team.start(max(1, _threads - 1))
 
 
 def parallel(units: Callable[..., int], piece: int = 1) -> Callable[[Any], Callable[..., None]]:
@@ -180,11 +180,12 @@ class Team:
 
 def spins_of(seconds: float) -> int:
     """How many turns of a waiting loop take so long."""
-    few = 200
-    _spin(few)
-    begin = perf_counter()
-    _spin(few)
-    return max(1, int(few * seconds / max(perf_counter() - begin, 1e-9)))
+    turns, times = 200, []
+    for _ in range(5):  # the first compiles; others may be interrupted
+        begin = perf_counter()
+        _spin(turns)
+        times.append(perf_counter() - begin)
+    return max(1, int(turns * seconds / max(min(times), 1e-9)))
 
 
 @jit
