@@ -207,14 +207,14 @@ def measure_latency(repeats: int) -> Latency:
     """Measured on two threads, of the repeats the fastest tenth: on a loaded machine a thread may lack a core."""
     pieces = 100_000
 
-    def meet_ms(units: int, awake: bool) -> float:
-        """A kernel in which so many threads meet, after a rest; awake: right after another one."""
+    def meet_ms(awake: bool) -> float:
+        """A whole kernel in which the two meet, right after another one or after a rest."""
         times = []
         for _ in range(repeats):
-            sleep(10 * kernel_threads.SPIN_S)
-            if awake:
-                meet(np.zeros(units + 1, np.int64), 1_000_000)
-            met = np.zeros(units + 1, np.int64)
+            take(10 * pieces)  # long enough for the system to give each thread a core
+            met = np.zeros(3, np.int64)
+            if not awake:
+                sleep(10 * kernel_threads.SPIN_S)
             begin = perf_counter()
             meet(met, 1_000_000)
             times.append(1e3 * (perf_counter() - begin))
@@ -223,11 +223,11 @@ def measure_latency(repeats: int) -> Latency:
     before = threads()
     set_threads(2)
     try:
-        alone, awake, asleep = meet_ms(1, True), meet_ms(2, True), meet_ms(2, False)
+        awake, asleep = meet_ms(True), meet_ms(False)
         further = median_ms(lambda: take(pieces), 5) / pieces
     finally:
         set_threads(before)
-    return Latency(awake - alone, further, asleep - alone)
+    return Latency(awake, further, asleep)
 
 
 def model(splats: int, repeats: int) -> None:

@@ -38,7 +38,7 @@ from .entry import (
 
 UNITS, PIECE = 1, 2
 """Where a kernel's `work` (3,) int64 holds the number of units and those of a piece; first is the next unit."""
-SPIN_S = 1e-4
+SPIN_S = 2e-4
 """For how long a thread looks for work or waits for others before it sleeps: longer than most of the time between two
 kernels of an iteration, and little of what a busy machine's other programs would get."""
 
