@@ -33,7 +33,7 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 from stga_addon.development.demo.head import synthetic_head
-from stga_addon.raster.cpu import jit
+from stga_addon.raster.cpu import kernel_jit
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
 from stga_addon.raster.cpu.layout import PROJECTED, Parameters
 from stga_addon.raster.cpu.project import project_backward, project_forward
@@ -133,7 +133,7 @@ MULTIPLY_ADDS = 16
 
 
 @parallel(lambda rows: len(rows), piece=16)
-@jit
+@kernel_jit
 def multiply_add_rows(work, rows):
     """Sixteen multiply-adds of each value of rows (R, 256) float32, 100 times over."""
     first, past = next_piece(work)

@@ -8,9 +8,10 @@ on an idle machine. Prints every figure, with the (splat, tile) pairs of the vie
 
 --model: instead, what more threads than this machine has would bring. The pieces that an iteration is cut into are
 timed one after the other (time of the thread, median of repeats; many short ones a few at a time) and given to N
-threads as `threads.py` does: one at a time holds Python's lock to call the kernel, and each takes the next piece when
-it is free. Added are what lies between the kernels, and for each kernel the measured time to wake N − 1 threads and to
-hear of the last one's end.
+threads as `threads.py` does: the calling thread unpacks the arguments and begins, each of the others joins later by as
+much as two threads measurably need to meet in a kernel, one after the other, and each takes the next piece when it is
+free. Where the pause before a kernel is longer than threads look for work, they are woken: the caller wakes two, and
+each of these two more, each time as late as measured. Added is what lies between the kernels.
 Cores are taken to be alike and memory to keep up: the last column is the bandwidth that this needs.
 """
 
@@ -20,9 +21,7 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from queue import SimpleQueue
-from threading import Thread
-from time import thread_time
+from time import perf_counter, sleep, thread_time
 from typing import Any
 from unittest.mock import patch
 
@@ -31,10 +30,12 @@ import numpy as np
 from iteration import demo_head, device_step, front_camera, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
+from stga_addon.raster.cpu import kernel_jit
 from stga_addon.raster.cpu import threads as kernel_threads
+from stga_addon.raster.cpu.elementary import fetch_add, load
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
-from stga_addon.raster.cpu.threads import parallel, set_threads, threads
+from stga_addon.raster.cpu.threads import next_piece, parallel, set_threads, threads
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -102,11 +103,12 @@ def series(repeats: int) -> dict[str, list[Point]]:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel, in milliseconds: its pieces, and for how long each thread holds Python's lock to call it."""
+    """A kernel, in milliseconds: its pieces, what it takes to call it, and the time since the kernel before."""
 
     name: str
     pieces: list[float]
     call: float
+    pause: float
 
 
 def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
@@ -114,80 +116,118 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
     lies between them, in milliseconds of this thread.
     """
     found: list[Kernel] = []
-    aside = 0.0
+    words = np.zeros(kernel_threads.FIRST_HELPER, np.int64)
+    last = aside = 0.0
 
-    def one_by_one(kernel: Any, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
-        nonlocal aside
+    def one_by_one(kernel: kernel_threads.TeamKernel, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
+        nonlocal aside, last
         begin = thread_time()
         together = piece * -(-units // (piece * TIMED_PIECES))
         spans = [(first, min(first + together, units)) for first in range(0, units, together)]
         times = []
         for first, past in spans:
             before = thread_time()
-            kernel(np.array([first, past, piece]), *arguments)
+            kernel.call(words, 0, (np.array([first, past, piece]), *arguments))
             times.append(1e3 * (thread_time() - before))
         before = thread_time()
         for _ in range(3):
-            kernel(np.array([0, 0, piece]), *arguments)
+            kernel.call(words, 0, (np.array([0, 0, piece]), *arguments))
         call = 1e3 * (thread_time() - before) / 3
         pieces = [-(-(past - first) // piece) for first, past in spans]
         each = [max(0.0, ms - call) / count for ms, count in zip(times, pieces, strict=True) for _ in range(count)]
-        found.append(Kernel(kernel.__name__, each, call))
-        aside += 1e3 * (thread_time() - begin)
+        found.append(Kernel(kernel.kernel.__name__, each, call, 1e3 * (begin - last)))
+        last = thread_time()
+        aside += 1e3 * (last - begin)
 
     with patch.object(kernel_threads, "_run", one_by_one):
-        before = thread_time()
+        last = before = thread_time()
         step()
         whole = 1e3 * (thread_time() - before)
     return found, whole - aside
 
 
-def span_ms(kernel: Kernel, count: int, two_threads: float, waking: float) -> float:
-    """How long a kernel takes `count` threads. Each calls the kernel once, one at a time, and then takes the next piece
-    as soon as it is free; the calling thread first wakes the others, one after the other, and at the end hears of each.
-
-    two_threads: what a kernel without work costs on two threads; waking: what it takes to wake one.
+@dataclass(frozen=True)
+class Latency:
+    """Milliseconds that a thread joins a kernel later than its caller begins it: if it looks for work, what every
+    further one takes on top, and if it sleeps and is woken by a thread that joins then.
     """
-    helpers = min(count, len(kernel.pieces)) - 1
-    latency = two_threads - waking if helpers else 0.0
-    free, lock = [], 0.0
-    for ready in sorted([helpers * waking, *(latency + n * waking for n in range(1, helpers + 1))]):
-        lock = max(ready, lock) + kernel.call
-        free.append(lock)
-    heapq.heapify(free)
-    for ms in kernel.pieces:
-        heapq.heapreplace(free, free[0] + ms)
-    return max(free)
+
+    awake: float
+    further: float
+    asleep: float
+
+    def of(self, helpers: int, asleep: bool) -> list[float]:
+        if asleep:
+            return [self.asleep * int(np.log2(n + 2)) for n in range(helpers)]
+        return [self.awake + n * self.further for n in range(helpers)]
 
 
-def waking_ms(repeats: int = 200) -> float:
-    """What it takes a thread to give work to one that waits for it."""
-    queue: SimpleQueue[int] = SimpleQueue()
-    Thread(target=lambda: [None for _ in iter(queue.get, -1)], daemon=True).start()
-    times = []
-    for n in range(repeats):
-        before = thread_time()
-        queue.put(n)
-        times.append(1e3 * (thread_time() - before))
-        while not queue.empty():
-            pass
-    queue.put(-1)
-    return statistics.median(times)
+def spans_ms(kernels: list[Kernel], count: int, latency: Latency) -> list[float]:
+    """How long each kernel of an iteration takes `count` threads, of which each takes the next piece when it is free;
+    who has waited longer than SPIN_S since its last piece sleeps.
+    """
+    spans, waited = [], np.inf
+    for kernel in kernels:
+        helpers, waited = min(count, len(kernel.pieces)) - 1, waited + kernel.pause
+        late = latency.of(helpers, waited > 1e3 * kernel_threads.SPIN_S)
+        free = [kernel.call, *(kernel.call + ms for ms in late)]
+        heapq.heapify(free)
+        end = kernel.call
+        for ms in kernel.pieces:
+            end = max(end, free[0] + ms)
+            heapq.heapreplace(free, free[0] + ms)
+        waited = end - min(end, free[0])
+        spans.append(end)
+    return spans
 
 
-def dispatch_ms(repeats: int) -> float:
-    """What a kernel without work costs on two threads."""
+@parallel(lambda met, *_: len(met) - 1)
+@kernel_jit
+def meet(work, met, patience):
+    """Each thread takes one unit and waits until met[0], how many have, is all of them: together, if that many came."""
+    begin, end = next_piece(work)
+    while begin < end:
+        fetch_add(met, 0, 1)
+        for _ in range(patience):
+            if load(met, 0) == len(met) - 1:
+                break
+        begin, end = next_piece(work)
 
-    @parallel(lambda: 16)
-    def nothing(work: np.ndarray) -> None:
-        pass
+
+@parallel(lambda count: count)
+@kernel_jit
+def take(work, count):
+    """Takes all pieces and does nothing with them."""
+    begin, end = next_piece(work)
+    while begin < end:
+        begin, end = next_piece(work)
+
+
+def measure_latency(repeats: int) -> Latency:
+    """Measured on two threads, of the repeats the fastest tenth: on a loaded machine a thread may lack a core."""
+    pieces = 100_000
+
+    def meet_ms(awake: bool) -> float:
+        """A whole kernel in which the two meet, right after another one or after a rest."""
+        times = []
+        for _ in range(repeats):
+            take(10 * pieces)  # long enough for the system to give each thread a core
+            met = np.zeros(3, np.int64)
+            if not awake:
+                sleep(10 * kernel_threads.SPIN_S)
+            begin = perf_counter()
+            meet(met, 1_000_000)
+            times.append(1e3 * (perf_counter() - begin))
+        return statistics.quantiles(times, n=10)[0]
 
     before = threads()
     set_threads(2)
     try:
-        return median_ms(nothing, 10 * repeats)
+        awake, asleep = meet_ms(True), meet_ms(False)
+        further = median_ms(lambda: take(pieces), 5) / pieces
     finally:
         set_threads(before)
+    return Latency(awake, further, asleep)
 
 
 def model(splats: int, repeats: int) -> None:
@@ -202,8 +242,11 @@ def model(splats: int, repeats: int) -> None:
         render_forward(arrays, head.face, frames_in_camera(face_frames(mesh, faces, mesh), camera), 3).lists.pair_splat
     )
     moved = splats * BYTES_PER_SPLAT + pairs * BYTES_PER_PAIR + WIDTH * HEIGHT * BYTES_PER_PIXEL
-    two, waking = dispatch_ms(repeats), waking_ms()
-    print(f"a kernel without work on two threads {1e3 * two:.0f} µs, to wake each further one {1e3 * waking:.1f} µs")
+    latency = measure_latency(20 * repeats)
+    print(
+        f"a thread joins after {1e3 * latency.awake:.1f} µs, each further one {1e3 * latency.further:.2f} µs later, "
+        f"one that sleeps after {1e3 * latency.asleep:.0f} µs"
+    )
     runs: dict[int, list[tuple[list[Kernel], float]]] = {count: [] for count in MODELLED_THREADS}
     for _ in range(repeats + 2):
         for count in runs:  # in turn, because the machine's speed changes
@@ -214,7 +257,7 @@ def model(splats: int, repeats: int) -> None:
     for count, measured in runs.items():
         kernels = [median_kernel(calls) for calls in zip(*(run[0] for run in measured[2:]), strict=True)]
         between = statistics.median(run[1] for run in measured[2:])
-        spans = [span_ms(kernel, count, two, waking) for kernel in kernels]
+        spans = spans_ms(kernels, count, latency)
         work, ms = sum(sum(kernel.pieces) for kernel in kernels), sum(spans) + between
         single = single or ms
         print(f"{count:>7}{work:>8.2f}{between:>9.2f}{ms:>8.2f}{single / ms / count:>12.2f}{moved / ms / 1e6:>7.0f}")
@@ -226,7 +269,8 @@ def model(splats: int, repeats: int) -> None:
 def median_kernel(calls: tuple[Kernel, ...]) -> Kernel:
     """Several runs of the same call as one."""
     pieces = [statistics.median(times) for times in zip(*(call.pieces for call in calls), strict=True)]
-    return Kernel(calls[0].name, pieces, statistics.median(call.call for call in calls))
+    call, pause = (statistics.median(getattr(kernel, name) for kernel in calls) for name in ("call", "pause"))
+    return Kernel(calls[0].name, pieces, call, pause)
 
 
 def draw(found: dict[str, list[Point]], path: Path) -> None:

@@ -40,8 +40,11 @@ def _cached(**options: Any) -> Any:
     return decorate
 
 
-jit = _cached(nogil=True)
+jit = _cached(nogil=True, no_cfunc_wrapper=True)
+# For kernels that `threads.parallel` calls by their address, never Python: what would unpack Python's arguments is not
+# compiled.
+kernel_jit = _cached(nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)
 # For functions that kernels call. Unless LLVM inlines them, a process that compiles the kernel calls the function as
 # compiled alone, and one that loads it from the cache calls the copy in there, whose last bits differ.
-part_jit = _cached(forceinline=True)
+part_jit = _cached(forceinline=True, no_cfunc_wrapper=True)
 inline_jit = numba.njit(fastmath=FASTMATH, error_model="numpy", inline="always")

@@ -14,7 +14,7 @@ would emit masked stores or no vectors at all. Both sides of a choice are comput
 
 import numpy as np
 
-from . import inline_jit, jit, part_jit
+from . import inline_jit, kernel_jit, part_jit
 from .elementary import prefetch
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PIXELS, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, TILE
 from .outline import outline, rows_within
@@ -255,7 +255,7 @@ def _store_tile(s, left, top, background, blended):
 
 
 @parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
-@jit
+@kernel_jit
 def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background, blended):
     """Render the listed tiles to `blended`; the tuples are those of `layout.py`.
 
@@ -404,7 +404,7 @@ def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
 
 
 @parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
-@jit
+@kernel_jit
 def blend_backward(
     work, tiles, tiles_x, lists, blended, wanted, projected, background, v_image, v_transmittance,
     pair_gradients,

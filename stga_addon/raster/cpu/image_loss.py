@@ -7,7 +7,7 @@ maps never reach main memory.
 
 import numpy as np
 
-from . import inline_jit, jit, part_jit
+from . import inline_jit, kernel_jit, part_jit
 from .threads import next_piece, parallel
 
 WINDOW_RADIUS_PX = 5
@@ -124,7 +124,7 @@ def _gradient_row(image, target_row, keep, blurred, stride, left, first, past, s
 
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
-@jit
+@kernel_jit
 def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, sums):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
 
@@ -211,7 +211,7 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
 
 
 @parallel(lambda image, *_: len(image), piece=16)
-@jit
+@kernel_jit
 def change_background(work, image, mask, before, after, out):
     """Write image (H, W, 3) uint8, composited over the color `before`, as it looks over `after`.
 

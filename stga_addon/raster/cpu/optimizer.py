@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from . import jit, part_jit
+from . import jit, kernel_jit, part_jit
 from .elementary import exponential
 from .threads import next_piece, parallel
 
@@ -43,7 +43,7 @@ class AdamOptions(NamedTuple):
 
 
 @parallel(lambda rows, *_: len(rows), piece=ROWS_PER_BLOCK)
-@jit
+@kernel_jit
 def adam_rows(work, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
@@ -99,7 +99,7 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
 
 
 @parallel(lambda rows, *_: len(rows), piece=16_384)
-@jit
+@kernel_jit
 def add_screen_gradients(work, rows, screen_gradient, total, count):
     """Add screen_gradient (N,) of the listed rows (M,) to total (N,), and 1 to their count (N,)."""
     first_row, past_row = next_piece(work)
@@ -145,7 +145,7 @@ def scale_limit(
 
 
 @parallel(lambda sums, *_: len(sums), piece=4)
-@jit
+@kernel_jit
 def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
     """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see `scale_limit`."""
     scales = np.empty(3 * ROWS_PER_SUM, np.float32)
@@ -171,7 +171,7 @@ def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
 
 
 @parallel(lambda rows, *_: len(rows), piece=1024)
-@jit
+@kernel_jit
 def add_excess_scale(work, rows, log_scale, face, unbound, limits, factor, gradient):
     """Add factor · ReLU(scale − limit) · scale to gradient (N, 3); see `scale_limit`."""
     first_row, past_row = next_piece(work)
@@ -186,7 +186,7 @@ def add_excess_scale(work, rows, log_scale, face, unbound, limits, factor, gradi
 
 
 @parallel(lambda rows, *_: len(rows), piece=16_384)
-@jit
+@kernel_jit
 def opacity_weight(work, rows, opacity, share, weight, gradient):
     """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient (N,).
 

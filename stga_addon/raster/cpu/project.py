@@ -7,7 +7,7 @@ world's origin loses nothing to float32, and embedded and world-space splats tak
 
 import numpy as np
 
-from . import jit, part_jit
+from . import kernel_jit, part_jit
 from . import splat_block as block
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
 from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
@@ -19,7 +19,7 @@ SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
 
 
 @parallel(lambda origin, *_: len(origin), piece=4096)
-@jit
+@kernel_jit
 def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
     """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin = turn @ origin +
     shift.
@@ -112,7 +112,7 @@ def _mark_seen(rows, rendered, rect, b):
 
 
 @parallel(lambda rows, *_: len(rows), piece=SPLATS_PER_PIECE)
-@jit
+@kernel_jit
 def project_forward(
     work, rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection
 ):  # fmt: skip
@@ -229,7 +229,7 @@ def _store_gradient(rows, b, gradients, screen_gradient):
 
 
 @parallel(lambda visible, *_: len(visible), piece=SPLATS_PER_PIECE)
-@jit
+@kernel_jit
 def project_backward(
     work, visible, splats, face, frames, degree, depth_as_color, antialiased,
     projected, lists, pair_gradients, gradients, screen_gradient,

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from . import jit, part_jit
+from . import kernel_jit, part_jit
 from .threads import next_piece, parallel
 
 ZERO, EIGHTH, HALF, ONE, TWO, PI = (np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi))
@@ -35,7 +35,7 @@ def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
 
 
 @parallel(lambda points, *_: len(points), piece=256)
-@jit
+@kernel_jit
 def add_lights(work, points, normals, eye, roughness, reflectance, lights, lit, irradiance, highlight):
     """Add what lights (L, COLUMNS) give to irradiance and highlight (N, 3) float32 of points with normals (N, 3).
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from . import jit
+from . import jit, kernel_jit
 from .threads import next_piece, parallel
 
 ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
@@ -44,7 +44,7 @@ def add_depths(points, faces, depth):
 
 
 @parallel(lambda depth, points, *_: len(points), piece=256)
-@jit
+@kernel_jit
 def lit_shares(work, depth, points, bias, step, lit):
     """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not block it.
 

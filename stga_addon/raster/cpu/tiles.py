@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from . import inline_jit, jit, part_jit
+from . import inline_jit, jit, kernel_jit, part_jit
 from .elementary import prefetch
 from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
 from .threads import next_piece, parallel
@@ -64,7 +64,7 @@ def _digit(key, least, shift):
 
 
 @parallel(lambda counts, *_: len(counts), piece=16)
-@jit
+@kernel_jit
 def count_digits(work, counts, keys, least, shift):
     """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit occurs.
 
@@ -92,7 +92,7 @@ def sum_digits(counts):
 
 
 @parallel(lambda counts, *_: len(counts))
-@jit
+@kernel_jit
 def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
     """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_digits` and is advanced."""
     part, past_part = next_piece(work)
@@ -134,7 +134,7 @@ def _next_tile(tile, column, width, tiles_x):
 
 
 @parallel(lambda *_: SORT_PARTS)
-@jit
+@kernel_jit
 def count_pairs(work, rect, order, tiles_x, counts, pairs):
     """Count the (splat, tile) pairs of each part of order (M,) int32: the splats, near to far.
 
@@ -182,7 +182,7 @@ def compute_offsets(visible, pairs, counts, first_pair):
 
 
 @parallel(lambda *_: SORT_PARTS)
-@jit
+@kernel_jit
 def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
     """Write every tile's pairs front to back; `place` holds the offsets of `compute_offsets` and is advanced.
 

@@ -15,6 +15,7 @@ from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.precompile import rasterizer_helper
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
+from ...raster.cpu.threads import start_threads
 from ...render.device import adapter_name
 from ...worker.cache import is_preparing
 from . import adam, driven_offsets
@@ -52,6 +53,7 @@ def _await_preparation() -> None:
 def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
     helper = rasterizer_helper()
+    start_threads()
     _limit()
     _optimize()
     if helper is not None:
