@@ -6,12 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...capture.camera import Camera
-from ...capture.images import read_image, read_mask
+from ...capture.images import read_view
 from ...capture.model import Capture, View, evenly_spread
 from ..optimize.image_preparation import Correction
 
 MAX_PLATE_VIEWS = 24
 """Views of a camera that its plate is the median of."""
+MAX_PLATE_PIXELS = 500_000
+"""Larger images are read smaller."""
 MATTE_MARGIN_SHARE = 0.008
 """Around the person nothing is taken from a view, where a matte is uncertain; share of the image's height."""
 PERSON = 256
@@ -44,9 +46,11 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
 
 
 def _plate(views: Sequence[View], correct: Correction | None) -> CleanPlate:
+    camera = views[0].camera
+    scale = min(1.0, (MAX_PLATE_PIXELS / (camera.width * camera.height)) ** 0.5)
     stack = []
-    for view in views:
-        image, mask = read_image(view), read_mask(view)
+    for full_size in views:
+        view, image, mask = read_view(full_size, scale)
         if correct is not None:
             image = correct(view, image, None)
         assert mask is not None
@@ -56,7 +60,7 @@ def _plate(views: Sequence[View], correct: Correction | None) -> CleanPlate:
     middle = np.maximum(count - 1, 0)[..., None, None] // 2
     image = np.take_along_axis(levels, np.broadcast_to(middle, (*count.shape, 3, 1)), axis=-1)[..., 0]
     seen = count > 0
-    return CleanPlate(views[0].camera, filled(image.astype(np.float32) / 255, seen), seen)
+    return CleanPlate(view.camera, filled(image.astype(np.float32) / 255, seen), seen)
 
 
 def _grown(person: np.ndarray) -> np.ndarray:
