@@ -1,6 +1,7 @@
 """3D Gaussians as plain arrays: shapes, units and activations, which every file format of this package shares."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -93,6 +94,11 @@ ARRAYS = {
 ADDED = {name: max(array.sizes) for name, array in ARRAYS.items() if 0 in array.sizes}
 """Arrays that an effect adds, which have no coefficients without it -> how many with it. A field of the same name
 switches them in `TrainingSettings`, and one in `Rates` trains them."""
+
+
+def joined(parts: Sequence[Splats]) -> Splats:
+    """All splats of sets with coefficients of the same kinds, in order."""
+    return Splats(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Splats)))
 
 
 def no_strain_color(count: int) -> np.ndarray:

@@ -23,10 +23,11 @@ def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
     views = capture.views.get(split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")
-    quality = evaluate_avatar(read_avatar(folder / AVATAR), capture, split, perceptual=True)
+    avatar = read_avatar(folder / AVATAR)
+    quality = evaluate_avatar(avatar, capture, split, perceptual=True)
     if (folder / WORLD_FILE).is_file():
-        world = read_ply(folder / WORLD_FILE)
-        quality = replace(quality, psnr_recorded=psnr_recorded(read_avatar(folder / AVATAR), world, capture, split))
+        recorded = psnr_recorded(avatar, read_ply(folder / WORLD_FILE), capture, split)
+        quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})
     return Written(path, (f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)))
@@ -39,7 +40,7 @@ def _details(quality: Quality) -> list[str]:
         if region in quality.regions
     ]
     if quality.psnr_recorded is not None:
-        lines.append(f"  before its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB")
+        lines.append(f"  in front of its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB")
     if quality.psnr_unmatched is not None:
         lines.append(f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB")
     if quality.lpips is None:

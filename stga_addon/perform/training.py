@@ -83,13 +83,13 @@ def perform_training(request: Train | Resume | Refine | Extend, report: Report, 
         is_stopped = report(latest)
         return is_stopped
 
-    def report_light(progress: Progress) -> bool:
+    def report_afterwards(progress: Progress) -> bool:
         return report(replace(latest, stage=progress.stage, preview=None))  # with the figures of the training
 
     avatar = prepared.train(report_training)
     # Whoever stops a training does not wait for the light; `stga relight` finds it out later.
-    light = () if is_stopped else _light_of(prepared, avatar, report_light)
-    world = () if is_stopped else _world_of(prepared, report_light)
+    light = () if is_stopped else _light_of(prepared, avatar, report_afterwards)
+    world = () if is_stopped else _world_of(prepared, report_afterwards)
     lines = [*report_run(prepared.folder), *light, *world, f"avatar: {avatar}"]
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {prepared.folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")

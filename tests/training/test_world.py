@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.render.render import render
+from stga_addon.training.world import world_splats
 from stga_addon.training.world.clean_plates import CleanPlate, clean_plates
-from stga_addon.training.world.world_splats import shell_radius, trained_on
+from stga_addon.training.world.world_splats import first_splats, shell_radius, trained_on
 
 WALL_M = 1.0
 """Behind the person, who is at the origin."""
@@ -104,7 +106,7 @@ def test_plates_without_the_person(walled: Path) -> None:
 def test_measured_with_the_world(walled: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches figures of matted images that are called those of whole ones: the same from `stga render --world`."""
     assert main(["eval", str(run), "--split", "train"]) == 0
-    assert "before its world, against whole images as recorded" in capsys.readouterr().out
+    assert "in front of its world, against whole images as recorded" in capsys.readouterr().out
     found = json.loads((run / "quality_train.json").read_text())["psnr_recorded"]
     cameras = walled / "transforms_train.json"
     assert main(["render", str(run), "--world", "--cameras", str(cameras), "--out", str(run / "pictures")]) == 0
@@ -130,3 +132,11 @@ def test_no_world(walled: Path, run: Path, tmp_path: Path, capsys: pytest.Captur
     plain = factory.write_mesh_capture(tmp_path / "plain", (0, 1), range(3))
     told = refused(capsys, "train", plain, "--out", tmp_path / "run", "--iterations", "1", *EFFECTS)
     assert "world=on: is not possible, because what lies behind the person is of one color" in told
+
+
+def test_many_cameras_before_a_busy_wall() -> None:
+    """Catches a search for larger blocks that never ends, because they are as large as they may be."""
+    noise = np.random.default_rng(0).random((512, 512, 3))
+    plates = plates_of(noise)[:1] * 3
+    with patch.object(world_splats, "MAX_FIRST_SPLATS", 10):
+        assert 10 < len(first_splats(plates, np.zeros(3))) < 500

@@ -18,7 +18,7 @@ from ..optimize.losses import mean_ssim
 from . import lpips
 from .detail_difference import detail_difference
 from .evaluation_views import EvaluationView, read_evaluation_view
-from .match_exposure import exposed_rendering, known_exposure
+from .match_exposure import NO_CORRECTION, exposed_rendering, known_exposure, with_exposure
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Quality:
     detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
                        None for a region
     psnr_unmatched     PSNR without fitting the exposure of views; None where none was fitted
-    psnr_recorded      of the avatar before its world, against whole images as recorded; None where it has no world
+    psnr_recorded      of the avatar in front of its world, against whole images as recorded; None where it has no world
     """
 
     psnr: float
@@ -107,14 +107,17 @@ def evaluate_avatar(
 
 
 def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -> float:
-    """Mean PSNR in dB of the avatar before its world, in all views of a split, against images as recorded."""
+    """Mean PSNR in dB of the avatar in front of its world, in all views of a split, against images as recorded.
+
+    Renderings are given the exposure of their camera where the run knows one; none is fitted.
+    """
     known = known_exposure(avatar.settings.get("exposure") or (), capture.views.get("train", ()))
     found = []
     for view in capture.views[split]:
         mesh = np.asarray(capture.mesh(view.timestep))
         image = render_avatar(avatar, mesh, view.camera, avatar.background, behind=world)
-        target = read_image(view)
-        found.append(psnr(exposed_rendering(image, target, known.get(view.camera_index))[0], target))
+        exposure = known.get(view.camera_index, NO_CORRECTION)
+        found.append(psnr(with_exposure(image, exposure), read_image(view)))
     return float(np.mean(found))
 
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_frames, to_local
 from ...avatar.lattice import lattice_weights
-from ...avatar.splats import Splats
+from ...avatar.splats import Splats, joined
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask
 from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
@@ -81,7 +81,7 @@ def _torso_surface(
 
 
 def _joined(*parts: Splats) -> Splats:
-    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+    return joined(parts)
 
 
 def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, torso: bool = False) -> Splats:
@@ -153,7 +153,7 @@ def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], vo
     for view in views:
         mask, beside = _foreground(view), ~_silhouette(mesh, faces, view.camera)
         remaining = np.flatnonzero(inside)
-        x, y, seen = _pixels(grid[remaining], view.camera)
+        x, y, seen = pixels_of(grid[remaining], view.camera)
         remaining, x, y = remaining[seen], x[seen], y[seen]
         visible[remaining] += 1
         exposed[remaining] += beside[y, x]
@@ -179,10 +179,10 @@ def _foreground(view: View) -> np.ndarray:
 
 def in_image(points: np.ndarray, camera: Camera) -> np.ndarray:
     """(N,) bool: whether world points (N, 3) lie in the camera's image."""
-    return _pixels(points, camera)[2]
+    return pixels_of(points, camera)[2]
 
 
-def _pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixel columns (N,) and rows (N,) of world points (N, 3), and (N,) bool whether they lie in the image."""
     pixels, depth = camera.project(points)
     x, y = np.floor(pixels).T

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...avatar.embedding import face_frames, to_world
 from ...avatar.lattice import lattice_splats
-from ...avatar.splats import ADDED, SH_C0, Splats
+from ...avatar.splats import ADDED, SH_C0, Splats, joined
 from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .hull_points import flat_points, hull_points, in_image
@@ -30,7 +30,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
             parts.append(flat_points(capture, views[0], settings.convention, settings.sh_degree, settings.torso))
         else:
             parts.append(hull_points(capture, views, settings.convention, settings.sh_degree, settings.torso))
-    splats = Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(lattice)))
+    splats = joined(parts)
     added = {name: np.zeros((len(splats), ADDED[name], 3), np.float32) for name in settings.added}
     return replace(splats, **added)
 

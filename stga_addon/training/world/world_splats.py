@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from ...avatar.embedding import face_frames, to_local, to_world
-from ...avatar.splats import SH_C0, Splats
+from ...avatar.splats import SH_C0, Splats, joined
 from ...capture.camera import Camera
 from ...capture.model import Capture, View
 from ...flame.quaternions import from_matrices
 from ...progress import Progress, Report, counted, ignore
+from ..optimize.hull_points import pixels_of
 from ..optimize.image_preparation import exposure_correction
 from ..optimize.state import new_state
 from ..optimize.trainer import Trainer
@@ -62,9 +63,7 @@ def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Sp
 
 def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report = ignore) -> Splats:
     """Splats in world space, meters, that show the plates from their cameras; center: (3,) of the person."""
-    radius, levels = shell_radius(plates, center), FLAT_LEVELS
-    while len(start := _first_splats(plates, center, radius, levels)) > MAX_FIRST_SPLATS:
-        levels *= 2
+    start = first_splats(plates, center)
     capture = _still_capture(plates, center)
     frames = face_frames(capture.neutral, capture.faces, capture.neutral)
     local = to_local(start, frames, np.zeros(len(start), np.int32))
@@ -125,7 +124,7 @@ def _likeness(plates: Sequence[CleanPlate], details: Sequence[np.ndarray], cente
         points = on_shell(plate.camera, np.stack([columns, rows], 1) + 0.5, center, radius)
         for other, detail_there in zip(plates, details, strict=True):
             if other is not plate:
-                inside, y, x = _pixels(other, points)
+                x, y, inside = pixels_of(points, other.camera)
                 inside &= other.seen[y, x]
                 mine.append(detail[rows[inside], columns[inside]].ravel())
                 theirs.append(detail_there[y[inside], x[inside]].ravel())
@@ -147,18 +146,29 @@ def on_shell(camera: Camera, pixels: np.ndarray, center: np.ndarray, radius: flo
     return np.asarray(origin + (np.maximum(nearest, 0) + beyond)[:, None] * toward)
 
 
-def _first_splats(plates: Sequence[CleanPlate], center: np.ndarray, radius: float, levels: float) -> Splats:
+def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
+    """A splat in world space for each block of the plates; of many plates more than MAX_FIRST_SPLATS, where blocks are
+    as large as they may be."""
+    radius, levels = shell_radius(plates, center), FLAT_LEVELS
+    splats = _splats_of_blocks(plates, center, radius, levels)
+    while len(splats) > MAX_FIRST_SPLATS and levels < 255:
+        levels *= 2
+        splats = _splats_of_blocks(plates, center, radius, levels)
+    return splats
+
+
+def _splats_of_blocks(plates: Sequence[CleanPlate], center: np.ndarray, radius: float, levels: float) -> Splats:
     parts = []
     for number, plate in enumerate(plates):
         middles, sides, colors = blocks(plate.image, levels)
         points = on_shell(plate.camera, middles, center, radius)
         new = np.ones(len(points), bool)
         for other in plates[:number]:
-            inside, y, x = _pixels(other, points)
+            x, y, inside = pixels_of(points, other.camera)
             alike = abs(other.image[y, x] - colors).max(axis=1) < SAME_LEVELS / 255
             new &= ~(inside & alike)
         parts.append(_block_splats(plate.camera, points[new], sides[new], colors[new]))
-    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+    return joined(parts)
 
 
 def blocks(image: np.ndarray, levels: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -193,12 +203,3 @@ def _block_splats(camera: Camera, points: np.ndarray, sides: np.ndarray, colors:
         points.astype(np.float32), rotation.astype(np.float32), log_scale.astype(np.float32),
         np.full(count, START_OPACITY, np.float32), sh, np.zeros(count, np.int32), np.ones(count, bool),
     )  # fmt: skip
-
-
-def _pixels(plate: CleanPlate, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether a plate's image shows points (N, 3), and at which row and column; 0 where it does not."""
-    at, depth = plate.camera.project(points)
-    height, width = plate.seen.shape
-    inside = (depth > 0) & (at >= 0).all(axis=1) & (at < [width, height]).all(axis=1)
-    x, y = np.where(inside[:, None], at, 0).astype(int).T
-    return inside, y, x
