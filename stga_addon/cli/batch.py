@@ -102,7 +102,7 @@ def _plan_of_captures(options: Namespace) -> Plan:
 
 def _shared_threads(plan: Plan, options: Namespace) -> int:
     """This machine's processors, shared among the jobs; 1 on every other engine."""
-    from ..batch.engines.local import processors
+    from ..worker.helpers import processors
 
     is_here = options.engine == "local" and options.emit is None
     return max(1, processors() // len(plan.jobs)) if is_here else 1
@@ -119,10 +119,10 @@ def with_threads(plan: Plan, threads: int) -> Plan:
 
 def print_plan(plan: Plan) -> None:
     """Print the jobs, and how long they are expected to take."""
-    from ..batch.engines.local import processors
     from ..batch.forecast import forecast_seconds
     from ..batch.run import Batch
     from ..batch.table import plan_lines
+    from ..worker.helpers import processors
 
     batch = Batch(plan)
     batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))

@@ -14,6 +14,8 @@ from ..errors import StgaError, one_line
 from ..requests.open_head import FOLDER, OpenHead, read_head
 from .streams import safe_streams
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Before NumPy is imported: BLAS divides even matrices of nine rows among threads, and takes longer for it.
 COMMANDS = (
     ".avatar",
     ".track",

@@ -86,19 +86,17 @@ def pyramid(camera: Camera, image: np.ndarray, center: np.ndarray) -> list[Level
     return levels
 
 
-def sampled(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Values (N, K) of an image (H, W, K) float32, K ≤ 4, at pixels (N, 2), or (N,) of one (H, W); those of the border
-    outside."""
+def sampled(images: Sequence[np.ndarray], pixels: np.ndarray) -> list[np.ndarray]:
+    """Values (N, K) of images (H, W, K) float32 of one size, K ≤ 4, at pixels (N, 2), or (N,) of images (H, W); those
+    of the border outside."""
     import cv2
 
     if not len(pixels):
-        return np.zeros((0, *image.shape[2:]), np.float32)
-    at = np.clip(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, image.shape[1::-1]).astype(np.float32)
-    parts: list[Any] = [
-        cv2.remap(image, part[None, :, 0], part[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
-        for part in np.array_split(at, max(1, -(-len(at) // MAX_SAMPLES)))
-    ]
-    return np.concatenate(parts)
+        return [np.zeros((0, *image.shape[2:]), np.float32) for image in images]
+    at = np.clip(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, images[0].shape[1::-1]).astype(np.float32)
+    parts = [(part[None, :, 0], part[None, :, 1]) for part in np.array_split(at, max(1, -(-len(at) // MAX_SAMPLES)))]
+    border: dict[str, Any] = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
+    return [np.concatenate([cv2.remap(image, *part, **border)[0] for part in parts]) for image in images]
 
 
 def light_basis(normals: np.ndarray) -> np.ndarray:

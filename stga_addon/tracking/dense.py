@@ -5,19 +5,20 @@ averaged over cameras and timesteps of the fit so far, and every timestep is mov
 under that view's lighting, looks like the images.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE
-from .appearance import Texture, average_texture, pyramid, robust
+from ..worker.helpers import Helpers, Step
+from .appearance import Sample, Texture, average_texture, pyramid, robust
 from .dense_head import HELD_OUT_LEVEL, REGIONS, DenseHead
 from .dense_terms import Misfit, PyramidView, flow_start, misfit, photo_term, samples
 from .fit import HeadFit, TimestepLandmarks, by_visibility, observed_landmarks, triangulated
 from .landmarks import Report
-from .seen_surface import RecordedTake
+from .seen_surface import RecordedTake, excerpt, parts_of
 from .solve import Observation, acceleration_precision, normal_equations, smooth_take
 
 MIN_TIMESTEPS = 6
@@ -26,6 +27,8 @@ SETTLED_WEIGHT = 0.1
 """Least weight of a timestep in the texture of a settled take."""
 TEXTURE_TIMESTEPS, MAX_CAMERAS = 32, 8
 """Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are compared."""
+TEXTURE_PART_TIMESTEPS, PART_TIMESTEPS = 12, 24
+"""At most, of the parts in which a texture's timesteps, and then the whole take, are worked on."""
 LANDMARK_SHARE, INNER_SHARE = 0.01, 0.3
 """Weight of landmarks beside the images; of those on eyeballs, whose reflections no texture shows."""
 REGION_SCALE_M = 0.004
@@ -42,7 +45,7 @@ OPENINGS_M = 0.008, 0.016
 """By which the chin is moved for further starts."""
 USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this factor, than it is at
-this share of the timesteps so far."""
+this share of the texture's timesteps."""
 DAMPING = 1e-3
 CONVERGED_STEP_M = 5e-5
 """Root mean square of the points' motion in a step, after which a level is done."""
@@ -96,6 +99,7 @@ class _Solved:
 def fit_dense(
     fit: HeadFit,
     take: RecordedTake,
+    helpers: Helpers,
     settled: bool = False,
     report: Report = lambda stage, done, total: None,
 ) -> DenseFit | None:
@@ -103,36 +107,75 @@ def fit_dense(
 
     Each timestep starts where the fit is, and where that explains the images badly, where optical flow carries its
     neighbor and with the mouth opened wider. It keeps what it had unless points are explained better that were not
-    fitted.
+    fitted. Parts of the take are solved at once, by helping processes; no timestep has a neighbor in another part.
     settled: the fit is one of images already; every timestep counts in the texture, not only those at rest, and the
     take is followed backwards.
     """
     timesteps = sorted(take.landmarks)
     if len(timesteps) < MIN_TIMESTEPS:
         return None
-    solver = _Solver(fit, take, SETTLED_GAIN if settled else 0.0)
-    texture = solver.texture(evenly_spread(timesteps, TEXTURE_TIMESTEPS), settled)
-    solved: dict[int, _Solved] = {}
-    before: tuple[_Shot, _Solved] | None = None
-    for number, timestep in enumerate(reversed(timesteps) if settled else timesteps):
-        report("Refinement" if settled else "Dense tracking", number, len(timesteps))
-        known = [own.coarse for own in solved.values()] or [np.zeros(len(REGIONS))]
-        usual = np.quantile(known, USUAL_QUANTILE, axis=0)
+    chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
+    head, total = DenseHead(fit.head, take.places, take.reliable), 2 * len(chosen) + len(timesteps)
+
+    def in_parts(work: Callable[..., list], parts: Sequence[tuple], before: int) -> list:
+        every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
+        stage = "Refinement" if settled else "Dense tracking"
+        results = helpers.map(work, every, lambda steps: report(stage, before + steps, total))
+        return [one for result in results for one in result]
+
+    weights = np.maximum(head.rest([head.reduced(fit.parameters[t]) for t in chosen]), SETTLED_WEIGHT if settled else 0)
+    some = parts_of(chosen, TEXTURE_PART_TIMESTEPS)
+    rows = np.split(weights, np.cumsum([len(part) for part in some])[:-1])
+    texture = average_texture(in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0))
+    coarse = in_parts(_started_part, [(part, texture) for part in some], len(chosen))
+    usual = np.quantile(coarse, USUAL_QUANTILE, axis=0)
+    parts = [(part, texture, usual, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
+    solved = dict(zip(timesteps, in_parts(_solved_part, parts, 2 * len(chosen)), strict=True))
+    values, terms = np.stack([own.values for own in solved.values()]), [own.terms for own in solved.values()]
+    smooth = smooth_take(head.head, values, terms, fit.ordered)
+    moved = replace(fit, parameters={t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)})
+    return DenseFit(moved, _agreeing(head, moved, take, solved), {t: own.misfit for t, own in solved.items()})
+
+
+def _sampled_part(fit: HeadFit, take: RecordedTake, weights: np.ndarray, step: Step) -> list[Sample]:
+    """What the views of a part's timesteps show; weights (T, N) of the points at each."""
+    solver, found = _Solver(fit, take), []
+    for timestep, weight in zip(sorted(take.landmarks), weights, strict=True):
         shot = solver.shot(timestep)
-        solved[timestep] = solver.solve(shot, texture, before, usual)
-        before = shot, solved[timestep]
-    ordered = [solved[timestep] for timestep in timesteps]
-    values, terms = np.stack([own.values for own in ordered]), [own.terms for own in ordered]
-    smooth = smooth_take(solver.head.head, values, terms, fit.ordered)
-    parameters = {t: solver.head.complete(values) for t, values in zip(timesteps, smooth, strict=True)}
-    moved = replace(fit, parameters=parameters)
-    return DenseFit(moved, solver.agreeing(moved, solved), {t: solved[t].misfit for t in timesteps})
+        found += samples(solver.head, shot.views, shot.start, weight * solver.visible(shot, shot.start))
+        step()
+    return found
+
+
+def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> list[np.ndarray]:
+    """For each timestep of a part, how badly its regions (R,) are explained in coarse images from where the fit is."""
+    solver, found = _Solver(fit, take), []
+    for timestep in sorted(take.landmarks):
+        shot = solver.shot(timestep)
+        found.append(solver.started(shot, texture, shot.start, solver.visible(shot, shot.start))[1].regions)
+        step()
+    return found
+
+
+def _solved_part(
+    fit: HeadFit, take: RecordedTake, texture: Texture, usual: np.ndarray, settled: bool, step: Step
+) -> list["_Solved"]:
+    """The timesteps of a part, solved one from the other."""
+    solver = _Solver(fit, take, SETTLED_GAIN if settled else 0.0)
+    before: tuple[_Shot, _Solved] | None = None
+    solved: list[_Solved] = []
+    for timestep in sorted(take.landmarks, reverse=settled):
+        shot = solver.shot(timestep)
+        solved.append(solver.solve(shot, texture, before, usual))
+        before = shot, solved[-1]
+        step()
+    return solved[::-1] if settled else solved
 
 
 class _Solver:
     """Gauss–Newton at the timesteps of a take."""
 
-    def __init__(self, fit: HeadFit, take: RecordedTake, min_gain: float) -> None:
+    def __init__(self, fit: HeadFit, take: RecordedTake, min_gain: float = 0.0) -> None:
         self.head, self._min_gain = DenseHead(fit.head, take.places, take.reliable), min_gain
         self._fit, self._take = fit, take
 
@@ -141,7 +184,7 @@ class _Solver:
         parameters, world = self._fit.parameters[timestep], self._fit.to_capture
         start = self.head.reduced(parameters)
         center, views = self.head.positions(start).mean(0), []
-        for camera, image in evenly_spread(self._take.images(timestep), MAX_CAMERAS):
+        for camera, image in self._take.images(timestep, MAX_CAMERAS):
             own = world.camera(camera)
             views.append(PyramidView(camera.world_to_camera.tobytes(), own, pyramid(own, image, center)))
         model, places, reliable = self._fit.head.model, self._take.places, self._take.reliable
@@ -149,28 +192,20 @@ class _Solver:
         found = triangulated(seen, reliable, places.on(model.v_template, model.faces), world.scale)
         return _Shot(views, observed_landmarks(found, world, reliable), start, np.zeros(len(REGIONS), bool))
 
-    def texture(self, timesteps: Sequence[int], settled: bool) -> Texture:
-        """The texture that these timesteps show."""
-        starts = [self.head.reduced(self._fit.parameters[t]) for t in timesteps]
-        weights = np.maximum(self.head.rest(starts), SETTLED_WEIGHT if settled else 0.0)
-        found = []
-        for timestep, start, weight in zip(timesteps, starts, weights, strict=True):
-            views = self.shot(timestep).views
-            visible = self.head.visibility(start, [view.camera for view in views])
-            found += samples(self.head, views, start, weight * visible)
-        return average_texture(found)
+    def visible(self, shot: _Shot, values: np.ndarray) -> np.ndarray:
+        """Visibility (C, N) from the cameras of a timestep, of a head with these parameters."""
+        return self.head.visibility(values, [view.camera for view in shot.views])
 
     def solve(self, shot: _Shot, texture: Texture, before: tuple[_Shot, _Solved] | None, usual: np.ndarray) -> _Solved:
         """The parameters that explain a timestep best; before: another timestep and its result."""
-        cameras = [view.camera for view in shot.views]
-        visible = self.head.visibility(shot.start, cameras)
-        best, error = self._started(shot, texture, shot.start, visible)
+        visible = self.visible(shot, shot.start)
+        best, error = self.started(shot, texture, shot.start, visible)
         if (error.regions > USUAL_FACTOR * usual).any():
             others = [self.head.opened(shot.start, distance) for distance in OPENINGS_M]
             if before is not None:
                 others.append(flow_start(self.head, before[0].views, before[1].visible, before[1].values, shot.views))
             for other in others:
-                values, found = self._started(shot, texture, other, visible)
+                values, found = self.started(shot, texture, other, visible)
                 if found.all < error.all:
                     best, error = values, found
         best, visible = self._refined(shot, texture, best)
@@ -216,17 +251,16 @@ class _Solver:
 
     def _refined(self, shot: _Shot, texture: Texture, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Parameters after the steps in fine images, and the visibility (C, N) of which they are."""
-        cameras = [view.camera for view in shot.views]
-        visible = self.head.visibility(values, cameras)
+        visible = self.visible(shot, values)
         values = self._descended(shot, texture, values, visible, FINE_STEPS)
         for _ in range(LAST_ROUNDS):
-            assumed, visible = visible, self.head.visibility(values, cameras)
+            assumed, visible = visible, self.visible(shot, values)
             if np.array_equal(assumed, visible):
                 break
             values = self._descended(shot, texture, values, visible, LAST_STEPS)
         return values, visible
 
-    def _started(
+    def started(
         self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
     ) -> tuple[np.ndarray, Misfit]:
         """Parameters after the steps in coarse images, and how badly these are explained."""
@@ -290,18 +324,21 @@ class _Solver:
         away = self.head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:]) - landmarks.position
         return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", landmarks.root, away), axis=1))
 
-    def agreeing(self, fit: HeadFit, solved: Mapping[int, _Solved]) -> dict[int, TimestepLandmarks]:
-        """The take's landmarks, moved towards the fit in regions where they miss it by more than they mostly do."""
-        regions = [self.head.landmark_region == number for number in range(len(REGIONS))]
-        used = [own & self._take.reliable for own in regions]
-        missed = {t: [np.median(own.missed[use]) if use.any() else 0.0 for use in used] for t, own in solved.items()}
-        usual = np.median(list(missed.values()), axis=0)
-        moved = {}
-        for timestep, own in self._take.landmarks.items():
-            values = self.head.reduced(fit.parameters[timestep])
-            at = self.head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
-            beyond = np.maximum(np.array(missed[timestep]) - usual, 0) * solved[timestep].better
-            weight = robust(beyond, DISAGREEMENT_M)[self.head.landmark_region][:, None]
-            seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
-            moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)
-        return moved
+
+def _agreeing(
+    head: DenseHead, fit: HeadFit, take: RecordedTake, solved: Mapping[int, _Solved]
+) -> dict[int, TimestepLandmarks]:
+    """The take's landmarks, moved towards the fit in regions where they miss it by more than they mostly do."""
+    regions = [head.landmark_region == number for number in range(len(REGIONS))]
+    used = [own & take.reliable for own in regions]
+    missed = {t: [np.median(own.missed[use]) if use.any() else 0.0 for use in used] for t, own in solved.items()}
+    usual = np.median(list(missed.values()), axis=0)
+    moved = {}
+    for timestep, own in take.landmarks.items():
+        values = head.reduced(fit.parameters[timestep])
+        at = head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+        beyond = np.maximum(np.array(missed[timestep]) - usual, 0) * solved[timestep].better
+        weight = robust(beyond, DISAGREEMENT_M)[head.landmark_region][:, None]
+        seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
+        moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)
+    return moved

@@ -42,8 +42,12 @@ def samples(head: DenseHead, views: Sequence[PyramidView], values: np.ndarray, w
     at, basis = head.positions(values), head.light_basis(values)
     found = []
     for view, own in zip(views, weight, strict=True):
-        levels = [sampled(level.channels, level.camera.project(at)[0]).astype(np.float64) for level in view.levels]
-        found.append(Sample(view.key, levels, basis, own * inside(view.levels[0].camera, at)))
+        projected = [level.camera.project(at) for level in view.levels]
+        levels = [
+            sampled([level.channels], pixels)[0].astype(np.float64)
+            for level, (pixels, _) in zip(view.levels, projected, strict=True)
+        ]
+        found.append(Sample(view.key, levels, basis, own * inside(view.levels[0].camera, *projected[0])))
     return found
 
 
@@ -56,17 +60,24 @@ def photo_term(
     basis, rows = head.light_basis(values, level), head.rows[level]
     for view, seen in zip(views, visible, strict=True):
         own = view.levels[level]
-        weight = seen[rows] * texture.trust[rows] * inside(own.camera, at)
+        pixels, depth = own.camera.project(at)
+        weight = seen[rows] * texture.trust[rows] * inside(own.camera, pixels, depth)
         near = np.flatnonzero(weight)
         if not len(near):
             continue
-        residual, pixels = _residual(view, texture, at[near], basis[near], weight[near], rows[near], level)
+        shown, by_x, by_y = sampled([own.channels, *own.gradient], pixels[near])
+        residual = _residual(view, texture, shown, basis[near], weight[near], rows[near], level)
         used = POINT_SHARE * weight[near] / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
-        gradient = np.stack([sampled(part, pixels) for part in own.gradient], axis=2) / NOISE_LEVELS  # channel, x or y
-        by_position = gradient @ projection_derivative(own.camera, at[near])
-        weighted = (used[:, None] * CHANNEL_WEIGHTS)[..., None] * by_position
-        matrix[near] += weighted.swapaxes(1, 2) @ by_position
-        right[near] -= (weighted * residual[..., None]).sum(1)
+        by_x, by_y = by_x / NOISE_LEVELS, by_y / NOISE_LEVELS
+        # The channels' slopes along x and y, multiplied and summed, before they become those by position.
+        xx, xy, yy, x, y = (
+            (used * ((one * other) @ CHANNEL_WEIGHTS))[:, None]
+            for one, other in ((by_x, by_x), (by_x, by_y), (by_y, by_y), (by_x, residual), (by_y, residual))
+        )
+        of_x, of_y = projection_derivative(own.camera, at[near]).swapaxes(0, 1)
+        along_x, along_y = xx * of_x + xy * of_y, xy * of_x + yy * of_y
+        matrix[near] += of_x[:, :, None] * along_x[:, None] + of_y[:, :, None] * along_y[:, None]
+        right[near] -= x * of_x + y * of_y
     return matrix, right
 
 
@@ -78,10 +89,11 @@ def misfit(
     at, basis, rows = head.level_positions(values, points), head.light_basis(values, points), head.rows[points]
     total, weights = np.zeros(len(REGIONS)), np.zeros(len(REGIONS))
     for view, seen in zip(views, visible, strict=True):
-        weight = seen[rows] * texture.trust[rows]
-        shown = inside(view.levels[level].camera, at)
-        residual, _ = _residual(view, texture, at, basis, weight * shown, rows, level)
-        squared = residual**2 @ CHANNEL_WEIGHTS
+        weight, own = seen[rows] * texture.trust[rows], view.levels[level]
+        pixels, depth = own.camera.project(at)
+        shown = inside(own.camera, pixels, depth)
+        (found,) = sampled([own.channels], pixels)
+        squared = _residual(view, texture, found, basis, weight * shown, rows, level) ** 2 @ CHANNEL_WEIGHTS
         share = np.where(shown, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
         total += np.bincount(head.region[rows], weight * share, len(REGIONS))
         weights += np.bincount(head.region[rows], weight, len(REGIONS))
@@ -89,24 +101,23 @@ def misfit(
 
 
 def _residual(
-    view: PyramidView, texture: Texture, at: np.ndarray, basis: np.ndarray, weight: np.ndarray, rows: np.ndarray,
+    view: PyramidView, texture: Texture, shown: np.ndarray, basis: np.ndarray, weight: np.ndarray, rows: np.ndarray,
     level: int,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Channels (M, 3) of the image minus those of the lit texture, in NOISE_LEVELS, and the pixels (M, 2)."""
-    own = view.levels[level]
-    pixels, _ = own.camera.project(at)
-    values, target = sampled(own.channels, pixels), texture.values[view.key][level][rows]
-    light = fitted_light(values, target, basis, weight, texture.lights[view.key])
-    return (values - target * shading(basis, light)) / NOISE_LEVELS, pixels
+) -> np.ndarray:  # fmt: skip
+    """Channels (M, 3) that the view shows minus those of the lit texture, in NOISE_LEVELS."""
+    target = texture.values[view.key][level][rows]
+    light = fitted_light(shown, target, basis, weight, texture.lights[view.key])
+    return np.asarray((shown - target * shading(basis, light)) / NOISE_LEVELS)
 
 
 def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(N, 2, 3): derivatives of the pixels of points (N, 3) by their positions."""
-    turn = camera.world_to_camera[:3, :3]
-    x, y, z = (points @ turn.T + camera.world_to_camera[:3, 3]).T
-    z, none = np.maximum(z, 1e-6), np.zeros(len(points))
-    rows = [camera.fl_x / z, none, -camera.fl_x * x / z**2], [none, camera.fl_y / z, -camera.fl_y * y / z**2]
-    return np.asarray(np.stack([np.stack(row, axis=1) for row in rows], axis=1) @ turn)
+    turn, at = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    x, y, z = (points @ turn.T + at).T
+    z = np.maximum(z, 1e-6)
+    of_x = (camera.fl_x / z)[:, None] * (turn[0] - (x / z)[:, None] * turn[2])
+    of_y = (camera.fl_y / z)[:, None] * (turn[1] - (y / z)[:, None] * turn[2])
+    return np.stack([of_x, of_y], axis=1)
 
 
 def flow_start(
@@ -144,14 +155,13 @@ def flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[Py
             continue
         pictures = [np.clip(own.channels[..., 0], 0, 255).astype(np.uint8) for own in (old, level)]
         pixels, _ = old.camera.project(at)
-        yield view.key, level.camera, pixels + sampled(flow.calc(*pictures, None), pixels)
+        yield view.key, level.camera, pixels + sampled([flow.calc(*pictures, None)], pixels)[0]
 
 
 MIN_FLOW_SIDE_PX = 32
 """Smaller images are too small for the patches of DIS."""
 
 
-def inside(camera: Camera, at: np.ndarray) -> np.ndarray:
-    """(N,) bool: points whose pixels lie in the image, a pixel from its border."""
-    pixels, depth = camera.project(at)
+def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """(N,) bool: pixels (N, 2) in the image, a pixel from its border, at a depth (N,) before the camera."""
     return np.asarray((pixels > 1).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1) & (depth > 0))

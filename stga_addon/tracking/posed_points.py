@@ -46,6 +46,7 @@ class PosedPoints:
         self.joint_dirs = np.einsum("jv,vak->jak", model.j_regressor, model.shapedirs)
         self._below = _below(self.parents)
         self._corner_weights = (self.weights * self.barycentric.reshape(-1, 1)).T.reshape(len(self.parents), -1, 3)
+        self._last: tuple[bytes, _Posed] | None = None
 
     def positions(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
         """(N, 3) meters; rigid (18,): pose, then translation."""
@@ -73,6 +74,13 @@ class PosedPoints:
         return posed.positions, found
 
     def _posed(self, coefficients: np.ndarray, rigid: np.ndarray) -> "_Posed":
+        """The last one is kept: positions, normals and derivatives are mostly asked for together."""
+        key = np.concatenate([coefficients, rigid]).tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._posed_now(coefficients, rigid)
+        return self._last[1]
+
+    def _posed_now(self, coefficients: np.ndarray, rigid: np.ndarray) -> "_Posed":
         local = axis_angle_matrices(rigid[:POSE_SIZE].reshape(-1, 3))
         rotations = local.copy()
         for joint, parent in enumerate(self.parents):

@@ -1,7 +1,8 @@
 """Where images and masks show the surface of a fitted head."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -28,14 +29,19 @@ MIN_OUTLINE_POINTS = 100
 OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
 
-Images = Callable[[int], Sequence[tuple[Camera, np.ndarray]]]
-"""Timestep -> cameras, in the footage's world, and their images (H, W, 3) or masks (H, W), uint8."""
+
+class Images(Protocol):
+    """Gives, of a timestep, cameras in the footage's world and their images (H, W, 3) or masks (H, W), uint8; at most
+    so many, spread over the rig."""
+
+    def __call__(self, timestep: int, most: int | None = None) -> Sequence[tuple[Camera, np.ndarray]]: ...
+
 
 VisiblePoints = dict[tuple[int, ...], np.ndarray]
 """Direction from the head, rounded -> (N,) bool: points that are not hidden from there."""
 
 
-def no_masks(timestep: int) -> Sequence[tuple[Camera, np.ndarray]]:
+def no_masks(timestep: int, most: int | None = None) -> Sequence[tuple[Camera, np.ndarray]]:
     """The masks of footage without any."""
     return ()
 
@@ -60,6 +66,17 @@ class RecordedTake:
     images: Images
     masks: Images = no_masks
     metric: bool = False
+
+
+def parts_of(timesteps: Sequence[int], most: int) -> list[list[int]]:
+    """Parts of a take of at most so many timesteps, the same on every machine."""
+    return [part.tolist() for part in np.array_split(np.array(timesteps), -(-len(timesteps) // most))]
+
+
+def excerpt(fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]) -> tuple[HeadFit, RecordedTake]:
+    """The fit and the take at some timesteps."""
+    own = replace(fit, parameters={t: fit.parameters[t] for t in timesteps})
+    return own, replace(take, landmarks={t: take.landmarks[t] for t in timesteps})
 
 
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:

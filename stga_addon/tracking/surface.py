@@ -8,6 +8,7 @@ import numpy as np
 from ..capture.mesh_geometry import vertex_normals
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE
+from ..worker.helpers import Helpers, Step
 from .fit import HeadFit, by_visibility, observed_landmarks, rigid_start, triangulated
 from .head_model import HeadModel
 from .landmarks import Report
@@ -17,9 +18,11 @@ from .seen_surface import (
     RecordedTake,
     SeenSurface,
     VisiblePoints,
+    excerpt,
     near_landmarks,
     no_masks,
     outlines_agree,
+    parts_of,
     seen_surface,
     surface_points,
     with_outlines,
@@ -47,19 +50,25 @@ MIN_SEEN_POINTS = 150
 MIN_SEEN_SHARE = 0.5
 """Share of the timesteps in which a point must be found to be looked for at every timestep."""
 
+PART_TIMESTEPS = 24
+"""At most, of the parts of a take that are searched at once."""
 MAX_OUTLINE_CAMERAS = 8
 """Cameras whose masks are compared at every timestep."""
 
 
 def fit_surface(
-    head: HeadModel, fit: HeadFit, take: RecordedTake, report: Report = lambda stage, done, total: None
+    head: HeadModel,
+    fit: HeadFit,
+    take: RecordedTake,
+    helpers: Helpers,
+    report: Report = lambda stage, done, total: None,
 ) -> HeadFit:
     """The fit moved onto the surface that several cameras see; unchanged where no timestep has landmarks of several
     cameras, or where the images do not show enough of it.
 
     Rounds of finding the surface along the normals, and of solving scale, identity, expression and pose from it, then
     the person's smooth offsets; at last expression and pose of every timestep. Landmarks stay in at a small weight.
-    `fit` is what `fit_head` returns for `head`.
+    Timesteps are searched at once, by helping processes. `fit` is what `fit_head` returns for `head`.
     """
     timesteps = sorted(take.landmarks)
     several = [t for t in timesteps if len(take.landmarks[t].cameras) > 1]
@@ -76,19 +85,21 @@ def fit_surface(
     points = surface_points(head, SURFACE_POINTS)
     near = near_landmarks(head, points, take)
     start, without = replace(fit, parameters={t: fit.parameters[t] for t in chosen}), replace(take, masks=no_masks)
-    solved = _identity(head, start, without, points, near, IDENTITY_SWEEPS, lambda n: report("Surface", n, steps))
+
+    def search(work: Callable[..., list], parts: Sequence[tuple], before: int) -> list:
+        results = helpers.map(work, parts, lambda done: report("Surface", before + done, steps))
+        return [one for result in results for one in result]
+
+    solved = _identity(head, start, without, points, near, IDENTITY_SWEEPS, search, 0)
     if solved is None:
         return fit
     if outlines_agree(solved[0], take, points, near, OUTLINE_SWEEPS[0].reach):
         start, begin = replace(solved[0], static_offset=None), len(IDENTITY_SWEEPS) * len(chosen)
-        again = _identity(
-            head, start, take, points, near, OUTLINE_SWEEPS, lambda n: report("Surface", begin + n, steps)
-        )
-        solved = again or solved
+        solved = _identity(head, start, take, points, near, OUTLINE_SWEEPS, search, begin) or solved
     else:
         take = without
     often = [_often_seen(points, solved[1], count) for _, count in TAKE_SWEEPS]
-    return _whole_take(solved[0], fit, take, often, lambda left: report("Surface", steps - left, steps))
+    return _whole_take(solved[0], fit, take, often, lambda work, parts: search(work, parts, early))
 
 
 def _identity(
@@ -98,18 +109,19 @@ def _identity(
     points: SurfacePoints,
     near: np.ndarray,
     sweeps: Sequence[Sweep],
-    report: Callable[[int], None],
+    search: Callable[..., list],
+    before: int,
 ) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
     """Identity, scale and offsets from the timesteps of `found`, and the surfaces that they were solved from.
 
-    near: as of `with_outlines`. None where the images do not show enough of the surface.
+    near: as of `with_outlines`. search(work, parts, steps before it): results of the helping processes. None where the
+    images do not show enough of the surface.
     """
     offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
     for number, sweep in enumerate(sweeps):
-        for row, t in enumerate(found.parameters):
-            report(number * len(found.parameters) + row)
-            surface = seen_surface(found, t, points, take.images(t), sweep, {})
-            seen[t] = with_outlines(surface, found, t, points, take.masks(t), near, sweep.reach)
+        parts = [(*excerpt(found, take, [t]), points, near, sweep) for t in found.parameters]
+        surfaces = search(_seen_part, parts, before + number * len(parts))
+        seen = dict(zip(found.parameters, surfaces, strict=True))
         if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
             return None
         found, seen = _solved(with_offset(head, offset), found, take, points, seen)
@@ -117,6 +129,18 @@ def _identity(
             offset = offset + _offsets(found, points, seen)
             found = replace(found, head=person(with_offset(head, offset), found.shape), static_offset=offset)
     return found, seen
+
+
+def _seen_part(
+    fit: HeadFit, take: RecordedTake, points: SurfacePoints, near: np.ndarray, sweep: Sweep, step: Step
+) -> list[SeenSurface]:
+    """The surface at each of the fit's timesteps, from images and masks."""
+    seen = []
+    for t in fit.parameters:
+        surface = seen_surface(fit, t, points, take.images(t), sweep, {})
+        seen.append(with_outlines(surface, fit, t, points, take.masks(t), near, sweep.reach))
+        step()
+    return seen
 
 
 def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
@@ -163,12 +187,12 @@ def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface], count: i
 
 
 def _whole_take(
-    fit: HeadFit, first: HeadFit, take: RecordedTake, points: Sequence[SurfacePoints], report: Callable[[int], None]
+    fit: HeadFit, first: HeadFit, take: RecordedTake, points: Sequence[SurfacePoints], search: Callable[..., list]
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
 
-    points: for each of TAKE_SWEEPS. What a landmark misses at the timesteps of `fit`, it misses in all: it is taken
-    off.
+    points: for each of TAKE_SWEEPS; search(work, parts): results of the helping processes. What a landmark misses at
+    the timesteps of `fit`, it misses in all: it is taken off.
     """
     timesteps, model = sorted(take.landmarks), fit.head.model
     bias = _landmark_bias(fit, take)
@@ -179,22 +203,40 @@ def _whole_take(
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
-    together, near = [], [near_landmarks(fit.head, on, take) for on in points]
+    rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
+    near = [near_landmarks(fit.head, on, take) for on in points]
+    observed = dict(zip(timesteps, landmarks, strict=True))
+    parts = [
+        (*excerpt(rough, take, part), [observed[t] for t in part], points, near)
+        for part in parts_of(timesteps, PART_TIMESTEPS)
+    ]
+    found, together = zip(*search(_found_part, parts), strict=True)
+    solved = solve_take(fit.head, _both(take.places, points[-1]), together, np.stack(found), fit.ordered)
+    return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
+
+
+def _found_part(
+    fit: HeadFit,
+    take: RecordedTake,
+    landmarks: Sequence[Observation],
+    points: Sequence[SurfacePoints],
+    near: Sequence[np.ndarray],
+    step: Step,
+) -> list[tuple[np.ndarray, Observation]]:
+    """Parameters (E + 18,) of each of the fit's timesteps, and landmarks and surface that they were solved from."""
+    results = []
     visible_points: list[VisiblePoints] = [{} for _ in points]
-    for number, (t, own) in enumerate(zip(timesteps, landmarks, strict=True)):
-        report(len(timesteps) - number)
-        images, masks = take.images(t), evenly_spread(take.masks(t), MAX_OUTLINE_CAMERAS)
+    for (t, here), own in zip(fit.parameters.items(), landmarks, strict=True):
+        images, masks = take.images(t), take.masks(t, MAX_OUTLINE_CAMERAS)
         for stage, ((sweep, _), on) in enumerate(zip(TAKE_SWEEPS, points, strict=True)):
-            rough = replace(fit, parameters={t: start[number]})
+            rough = replace(fit, parameters={t: here})
             seen = seen_surface(rough, t, on, images, sweep, visible_points[stage])
             seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
             joined = _joined(own, TAKE_LANDMARK_SHARE, seen)
-            here = start[number : number + 1]
-            start[number] = solve_take(fit.head, _both(take.places, on), [joined], here, ordered=False)[0]
-        together.append(joined)
-    solved = solve_take(fit.head, _both(take.places, points[-1]), together, start, fit.ordered)
-    report(0)
-    return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
+            here = solve_take(fit.head, _both(take.places, on), [joined], here[None], ordered=False)[0]
+        results.append((here, joined))
+        step()
+    return results
 
 
 def _landmark_bias(fit: HeadFit, take: RecordedTake) -> np.ndarray:

@@ -227,7 +227,7 @@ class _Follower:
                     own = shot.views[number].levels[level]
                     residual = self._seen.residual(shot, number, rows, at[rows], level)
                     pixels, _ = own.camera.project(at[rows])
-                    slope = np.stack([sampled(part, pixels) for part in own.gradient], axis=2) / NOISE_LEVELS
+                    slope = np.stack(sampled(list(own.gradient), pixels), axis=2) / NOISE_LEVELS
                     rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
                     used = POINT_SHARE / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
                     weight = used[:, None] * CHANNEL_WEIGHTS

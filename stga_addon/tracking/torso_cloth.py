@@ -212,15 +212,16 @@ class _Cloth:
         """(P,) bool: points that lie in the mask and are not hidden by the head."""
         mask, view = self._take.cameras[number].mask(timestep), shot.views[number]
         assert mask is not None
-        share = sampled(mask.astype(np.float32), view.camera.project(at)[0])
-        return np.asarray(shot.shows(number, at) & inside(view.levels[0].camera, at) & (share > 127))
+        share = sampled([mask.astype(np.float32)], view.camera.project(at)[0])[0]
+        finest = view.levels[0].camera
+        return np.asarray(shot.shows(number, at) & inside(finest, *finest.project(at)) & (share > 127))
 
     def _returned(self, timestep: int, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
         reference = self._references[number]
         at = np.einsum("pk,pki->pi", reference.barycentric, self._positions(timestep, bend)[reference.corners])
         source, _ = shot.views[number].levels[0].camera.project(at)
         luma = reference.luma.copy()
-        values = sampled(_luma(shot, number).astype(np.float32), source)
+        values = sampled([_luma(shot, number).astype(np.float32)], source)[0]
         luma[reference.pixels] = values.astype(np.uint8)
         return _Returned(luma, at, source, self._visible(timestep, shot, number, at))
 
@@ -255,7 +256,7 @@ def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarr
     places = np.stack([columns, rows], axis=1) + 0.5 + flow[rows, columns]
     shown = np.full((*reference.shown.shape, 3), np.nan, np.float32)
     shown[rows, columns] = np.concatenate([now.source, now.luma[rows, columns][:, None]], axis=1)
-    found = sampled(shown, places)
+    found = sampled([shown], places)[0]
     weight = now.visible & reference.fitted & np.isfinite(found).all(1)
     found = np.where(weight[:, None], found, 0)
     miss = np.where(weight[:, None], found[:, :2] - now.source, 0)

@@ -75,7 +75,7 @@ class SeenPoints:
     def residual(self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int) -> np.ndarray:
         """Channels (M, 3) of a camera's image at points, minus those of the reference, in NOISE_LEVELS."""
         own = shot.views[number].levels[level]
-        values = sampled(own.channels, own.camera.project(at)[0])
+        values = sampled([own.channels], own.camera.project(at)[0])[0]
         return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
 
 
@@ -98,7 +98,8 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
     reference = []
     for level in range(len(OUTLIER_SQUARED)):
         images = {number: shot.views[number].levels[level] for number in rows}
-        values = [sampled(own.channels, own.camera.project(every[rows[number]])[0]) for number, own in images.items()]
+        pixels = {number: own.camera.project(every[rows[number]])[0] for number, own in images.items()}
+        values = [sampled([own.channels], pixels[number])[0] for number, own in images.items()]
         reference.append(np.concatenate(values) if values else np.zeros((0, 3)))
     ray = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     return SeenPoints(timestep, rows, every, ray, np.concatenate(fitted), reference)

@@ -59,7 +59,7 @@ class TorsoShot:
         """(N,) bool: points (N, 3) that lie in the camera's image, and not behind or before the head."""
         camera, head = self.views[number].levels[EVIDENCE_LEVEL].camera, self.heads[number]
         x, y = np.clip(camera.project(at)[0].astype(int), 0, [camera.width - 1, camera.height - 1]).T
-        return np.asarray(inside(camera, at) & ~head[y, x])
+        return np.asarray(inside(camera, *camera.project(at)) & ~head[y, x])
 
 
 class TorsoTake:

@@ -1,6 +1,6 @@
 """Tracking of a head: footage and a head model to a capture."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -12,10 +12,12 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.mesh_raster import silhouette
+from ..capture.model import evenly_spread
 from ..errors import StgaError
 from ..files import read_json, write_json
 from ..flame.forward import RIGID_SIZE
 from ..schema import to_json
+from ..worker.helpers import Helpers
 from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
@@ -141,7 +143,8 @@ def track(
     fit = fit_head(head, places, reliable, take, report, metric)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
     recorded = RecordedTake(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
-    fit, misfits = _by_images(head, fit, recorded, report)
+    with Helpers() as helpers:
+        fit, misfits = _by_images(head, fit, recorded, helpers, report)
     fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)
@@ -185,14 +188,15 @@ def track(
 
 
 def _by_images(
-    head: HeadModel, fit: HeadFit, take: RecordedTake, report: Report
+    head: HeadModel, fit: HeadFit, take: RecordedTake, helpers: Helpers, report: Report
 ) -> tuple[HeadFit, dict[str, dict[int, float]]]:
     """The fit moved onto what the images show, and region -> timestep -> how badly they are explained (`Misfit`)."""
-    dense = fit_dense(fit, take, report=report)
+    dense = fit_dense(fit, take, helpers, report=report)
     if dense is None:
-        return fit_surface(head, fit, take, report), {}
+        return fit_surface(head, fit, take, helpers, report), {}
     take = replace(take, landmarks=dense.landmarks)
-    dense = fit_dense(fit_surface(head, dense.fit, take, report), take, True, report)
+    fit = fit_surface(head, dense.fit, take, helpers, report)
+    dense = fit_dense(fit, take, helpers, True, report)
     assert dense is not None
     regions = {t: own.regions.tolist() for t, own in dense.misfit.items()}
     return dense.fit, {name: {t: own[row] for t, own in regions.items()} for row, name in enumerate(REGIONS)}
@@ -284,17 +288,22 @@ def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, c
     )
 
 
-def _images(footage: Footage, timestep: int) -> list[tuple[Camera, np.ndarray]]:
-    seen = [camera for camera in footage.cameras if timestep in camera.timesteps]
+def _images(footage: Footage, timestep: int, most: int | None = None) -> list[tuple[Camera, np.ndarray]]:
+    cameras = _recording_at(footage, timestep, most)
     with ThreadPoolExecutor() as pool:  # decoding of a camera's images needs no lock of Python's
-        images = list(pool.map(lambda camera: camera.image(timestep), seen))
-    return [(camera.camera, image) for camera, image in zip(seen, images, strict=True)]
+        images = list(pool.map(lambda camera: camera.image(timestep), cameras))
+    return [(camera.camera, image) for camera, image in zip(cameras, images, strict=True)]
 
 
-def _masks(footage: Footage, timestep: int) -> list[tuple[Camera, np.ndarray]]:
-    seen = [camera for camera in footage.cameras if timestep in camera.timesteps]
-    found = [(camera.camera, camera.mask(timestep)) for camera in seen]
+def _masks(footage: Footage, timestep: int, most: int | None = None) -> list[tuple[Camera, np.ndarray]]:
+    cameras = _recording_at(footage, timestep, most)
+    found = [(camera.camera, camera.mask(timestep)) for camera in cameras]
     return [(camera, mask) for camera, mask in found if mask is not None]
+
+
+def _recording_at(footage: Footage, timestep: int, most: int | None) -> Sequence[FootageCamera]:
+    seen = [camera for camera in footage.cameras if timestep in camera.timesteps]
+    return seen if most is None else evenly_spread(seen, most)
 
 
 def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]) -> None:

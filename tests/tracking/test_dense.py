@@ -20,6 +20,7 @@ from stga_addon.tracking.posed_points import PosedPoints
 from stga_addon.tracking.seen_surface import RecordedTake
 from stga_addon.tracking.solve import Observation, normal_equations, person, smooth_take, solve_take
 from stga_addon.tracking.write_capture import posed_mesh
+from stga_addon.worker.helpers import Helpers
 
 from .test_fit import places_on, seen
 
@@ -78,7 +79,11 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
         meshes.append(mesh)
         landmarks[t] = seen(cameras, points, noise=0.4, seed=t)
         pictures[t] = [(c, shaded_image(dense, pictured.model.faces, c, colors)) for c in cameras]
-    return Scene(head, meshes, RecordedTake(places, np.ones(300, bool), landmarks, pictures.__getitem__, metric=True))
+
+    def images(timestep, most=None):
+        return pictures[timestep]
+
+    return Scene(head, meshes, RecordedTake(places, np.ones(300, bool), landmarks, images, metric=True))
 
 
 def jaw_errors(take, fit):
@@ -153,7 +158,7 @@ def test_smoothing_stays_at_the_solution_of_its_own_terms():
 def test_a_short_take_is_left_to_landmarks_and_surface():
     """Catches a texture averaged over the very frames that it judges."""
     take = RecordedTake(None, None, dict.fromkeys(range(5)), lambda t: pytest.fail("no image is needed"))
-    assert fit_dense(None, take) is None
+    assert fit_dense(None, take, Helpers(1)) is None
 
 
 @pytest.mark.slow
@@ -162,8 +167,8 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
     degrees apart."""
     take = scene(np.radians([-60, 0, 60]))
     first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
-    found = fit_dense(first, take.take)
-    settled = fit_dense(found.fit, replace(take.take, landmarks=found.landmarks), settled=True)
+    found = fit_dense(first, take.take, Helpers(1))
+    settled = fit_dense(found.fit, replace(take.take, landmarks=found.landmarks), Helpers(1), settled=True)
     wide = np.argsort(OPENINGS)[-3:]
     before, after = jaw_errors(take, first), jaw_errors(take, settled.fit)
     assert before[wide].min() > 8
@@ -178,11 +183,11 @@ def test_raised_brows_are_not_lowered_by_images_that_prove_little():
     eyes, still = np.radians([-50, 0, 50]), [0.0] * 8
     take, lowered = (scene(eyes, still, brows=brows) for brows in (1.5, -1.5))
 
-    def images(timestep):
+    def images(timestep, most=None):
         pairs = zip(take.take.images(timestep), lowered.take.images(timestep), strict=True)
         return [(camera, (0.4 * raised + 0.6 * low).astype(np.uint8)) for (camera, raised), (_, low) in pairs]
 
     first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
-    found = fit_dense(first, replace(take.take, images=images))
+    found = fit_dense(first, replace(take.take, images=images), Helpers(1))
     assert brow_errors(take, first).max() < 1
     assert brow_errors(take, found.fit).max() < 3

@@ -14,6 +14,7 @@ from stga_addon.tracking.seen_surface import RecordedTake, surface_points
 from stga_addon.tracking.smooth_offsets import smooth_offsets
 from stga_addon.tracking.surface import fit_surface
 from stga_addon.tracking.write_capture import posed_mesh
+from stga_addon.worker.helpers import Helpers
 
 from .test_fit import frame_at, places_on, seen
 
@@ -144,7 +145,9 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     pictures = [[(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes]
     reliable = np.ones(150, bool)
     first = fit_head(head, places, reliable, landmarks)
-    fit = fit_surface(head, first, RecordedTake(places, reliable, landmarks, lambda t: pictures[t]))
+    fit = fit_surface(
+        head, first, RecordedTake(places, reliable, landmarks, lambda t, most=None: pictures[t]), Helpers(1)
+    )
     errors = [
         [np.median(distances(one, posed_mesh(one, one.parameters[t]), meshes[t], head, front)) for t in (0, 1)]
         for one in (first, fit)
@@ -154,7 +157,10 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     assert np.abs(fit.static_offset).max() > 0.001
 
     blank = [[(c, np.full_like(image, 90)) for c, image in own] for own in pictures]
-    assert fit_surface(head, first, RecordedTake(places, reliable, landmarks, lambda t: blank[t])) is first
+    assert (
+        fit_surface(head, first, RecordedTake(places, reliable, landmarks, lambda t, most=None: blank[t]), Helpers(1))
+        is first
+    )
 
 
 def distances(fit, found, true, head, front):
@@ -172,4 +178,4 @@ def test_one_camera_leaves_the_fit_as_it_is(head):
     landmarks = {0: seen(rig(1), places.on(mesh, head.model.faces))}
     fit = fit_head(head, places, np.ones(100, bool), landmarks)
     take = RecordedTake(places, np.ones(100, bool), landmarks, lambda t: pytest.fail("no image is needed"))
-    assert fit_surface(head, fit, take) is fit
+    assert fit_surface(head, fit, take, Helpers(1)) is fit

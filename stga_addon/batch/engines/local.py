@@ -1,7 +1,6 @@
 """Engine of this machine: as many workers at once as its processors and memory allow."""
 
 import math
-import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -9,6 +8,7 @@ from pathlib import Path
 
 from ...errors import StgaError
 from ...requests.folder import worker_arguments
+from ...worker.helpers import processors
 from ...worker.launch import start_worker
 from ...worker.status import inspect_worker
 from ..engine import Ended, training_python
@@ -78,11 +78,6 @@ def make_local(address: str) -> LocalEngine:
     if address:
         raise StgaError("--address: has no effect with --engine local")
     return LocalEngine()
-
-
-def processors() -> int:
-    """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def free_memory_gb() -> float:

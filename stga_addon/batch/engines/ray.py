@@ -13,11 +13,11 @@ from typing import Any
 
 from ...errors import StgaError
 from ...worker.environment import PYTHON_VARIABLE
+from ...worker.helpers import processors
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, inspect_worker, read_status
 from ..engine import Ended, job_command
 from ..job import Job
-from .local import processors
 
 MAX_WAITING = 1000
 """Tasks that are submitted at once: more wait here, not in Ray's memory."""

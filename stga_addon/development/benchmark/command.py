@@ -6,7 +6,6 @@ Each seed is a job of a batch (docs/batch.md): one after another on this machine
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from ...batch.engines.local import processors
 from ...batch.plan import make_plan
 from ...cli.arguments import add_capture, duration, usable_path, whole_number
 from ...cli.batch import add_engine, carry_out_plan, print_plan, with_threads
@@ -14,6 +13,7 @@ from ...cli.inputs import open_named_capture, principal_point_of
 from ...errors import StgaError
 from ...requests.open_head import OpenHead
 from ...requests.values import Benchmark
+from ...worker.helpers import processors
 
 NAME, HELP = "benchmark", "compare accuracy and training time of strategies and presets on the CPU"
 SLICES = "benchmark"

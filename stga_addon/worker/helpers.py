@@ -1,0 +1,176 @@
+"""Helping processes: the parts of a task are worked on by several at once, with one thread of linear algebra each.
+
+For work that is many small steps of NumPy, which threads do not share: each step holds Python's lock, and BLAS divides
+matrices among threads that are too small for it.
+"""
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from queue import Empty, SimpleQueue
+from threading import Lock, Thread
+from traceback import format_exc
+from types import TracebackType
+from typing import IO, Any
+
+from ..errors import StgaError
+from .launch import end_with_this_process, start_python
+from .own_python import own_python
+from .stdout import claim_stdout
+
+MAX_HELPERS = 8
+"""Each takes some 300 MB."""
+THREADS_VARIABLE = "OMP_NUM_THREADS"
+SINGLE = dict.fromkeys((THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+"""Environment variables of a helper."""
+REPORT_INTERVAL_S = 0.2
+STEP, RESULT, ERROR = "step", "result", "error"
+"""What a helper's messages are: a pair of this and a value."""
+
+Step = Callable[[], None]
+"""Called by work after each of its steps."""
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Helpers:
+    """Processes that are started when there is work for two, and end with the `with` block.
+
+    count: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to MAX_HELPERS. With one, all work
+    is done in this process.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        limit = os.environ.get(THREADS_VARIABLE, "")
+        usual = min(int(limit) if limit.isdecimal() else processors(), MAX_HELPERS)
+        self._count = usual if count is None else count
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def __enter__(self) -> "Helpers":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                assert pipe is not None
+                pipe.close()
+        self._processes = []
+
+    def map(self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None]) -> list[Any]:
+        """The results of work(*part, step) of every part, in order.
+
+        work: a function of a module, which calls `step` after each of its steps; parts and results can be pickled.
+        done: is told how many steps there were, of all parts together; what it raises ends the work.
+        Raises what work raises, and StgaError where a helper ends before its work does.
+        """
+        count = min(self._count, len(parts))
+        if count < 2:
+            steps = _Counter()
+            return [work(*part, lambda: done(steps.add())) for part in parts]
+        while len(self._processes) < count:
+            self._processes.append(_start())
+        task = _Task(work, parts)
+        threads = [Thread(target=task.feed, args=(process,), daemon=True) for process in self._processes[:count]]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            while thread.is_alive() and not task.errors:
+                thread.join(REPORT_INTERVAL_S)
+                done(task.steps.value)
+        if task.errors:
+            raise task.errors[0]
+        return task.results
+
+
+class _Counter:
+    """A number that threads add to."""
+
+    def __init__(self) -> None:
+        self.value, self._lock = 0, Lock()
+
+    def add(self) -> int:
+        with self._lock:
+            self.value += 1
+            return self.value
+
+
+class _Task:
+    """What `Helpers.map` does at a time: parts that are left, and results and errors of the others."""
+
+    def __init__(self, work: Callable[..., Any], parts: Sequence[tuple]) -> None:
+        self.results: list[Any] = [None] * len(parts)
+        self.errors: list[BaseException] = []
+        self.steps, self._work = _Counter(), work
+        self._left: SimpleQueue[tuple[int, tuple]] = SimpleQueue()
+        for numbered in enumerate(parts):
+            self._left.put(numbered)
+
+    def feed(self, process: "subprocess.Popen[bytes]") -> None:
+        """Hand parts to a process until none is left."""
+        try:
+            while not self.errors:
+                number, part = self._left.get_nowait()
+                self.results[number] = self._answer(process, part)
+        except Empty:
+            return
+        except (EOFError, OSError, pickle.UnpicklingError):
+            code = process.poll()
+            self.errors.append(StgaError(f"a helping process ended before its work did (exit status {code})"))
+        except BaseException as error:  # raised again by the thread that waits
+            self.errors.append(error)
+
+    def _answer(self, process: "subprocess.Popen[bytes]", part: tuple) -> Any:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        _send(process.stdin, (self._work, part))
+        while True:
+            kind, value = pickle.load(process.stdout)
+            if kind == STEP:
+                self.steps.add()
+            elif kind == ERROR:
+                raise value
+            else:
+                return value
+
+
+def _start() -> "subprocess.Popen[bytes]":
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    quiet = {"creationflags": 0x08000000} if os.name == "nt" else {"preexec_fn": end_with_this_process()}
+    return start_python(own_python(), ["stga_addon.worker.helpers"], SINGLE, **pipes, **quiet)
+
+
+def _send(stream: IO[bytes], message: Any) -> None:
+    pickle.dump(message, stream, pickle.HIGHEST_PROTOCOL)
+    stream.flush()
+
+
+def help_until_closed() -> None:
+    """Work on what comes from standard input, and answer on standard output, until the process that asks has gone."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks
+    answers = claim_stdout()
+    while True:
+        try:
+            work, part = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        try:
+            answer = RESULT, work(*part, lambda: _send(answers, (STEP, None)))
+        except StgaError as error:
+            answer = ERROR, error
+        except Exception:
+            answer = ERROR, RuntimeError(format_exc())
+        _send(answers, answer)
+
+
+if __name__ == "__main__":
+    help_until_closed()

@@ -1,0 +1,112 @@
+"""Helping processes do what one process would, and end when they should."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.worker.helpers import Helpers
+
+
+def squares(first, last, step):
+    """Work of a helper: each square, and the process that it was found in."""
+    found = []
+    for number in range(first, last):
+        found.append((number**2, os.getpid()))
+        print("libraries print")
+        step()
+    return found
+
+
+def refuses(number, step):
+    raise StgaError(f"part {number}: expected another") if number else ZeroDivisionError
+
+
+def is_killed(number, step):
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def takes_long(seconds, step):
+    step()
+    time.sleep(seconds)
+
+
+PARTS = [(first, first + 3) for first in range(0, 21, 3)]
+
+
+def test_results_are_those_of_one_process_in_order():
+    """Catches parts that are lost, exchanged or done twice, what libraries print in the stream of answers, and helpers
+    that are started anew for every task."""
+    pids = set()
+    with Helpers(3) as helpers:
+        for _ in range(2):
+            told = []
+            found = [pair for part in helpers.map(squares, PARTS, told.append) for pair in part]
+            assert [square for square, _ in found] == [number**2 for number in range(21)]
+            assert (told[-1], told) == (21, sorted(told))
+            pids |= {pid for _, pid in found}
+    assert os.getpid() not in pids
+    assert 1 <= len(pids) <= 3
+    with Helpers(1) as alone:
+        told = []
+        assert {pid for part in alone.map(squares, PARTS, told.append) for _, pid in part} == {os.getpid()}
+        assert told == list(range(1, 22))
+
+
+@pytest.mark.parametrize(
+    ("work", "parts", "error", "says"),
+    [
+        (refuses, [(1,), (2,)], StgaError, "expected another"),
+        (refuses, [(0,), (0,)], RuntimeError, "ZeroDivisionError"),
+        (is_killed, [(1,), (2,)], StgaError, "a helping process ended before its work did"),
+    ],
+)
+def test_failures_reach_who_asked(work, parts, error, says):
+    """Catches a caller that waits forever for a helper that failed or was killed, as for want of memory."""
+    with pytest.raises(error, match=says), Helpers(2) as helpers:
+        helpers.map(work, parts, lambda steps: None)
+
+
+def test_cancelling_does_not_wait_for_what_is_being_done():
+    """Catches a Cancel that takes as long as the work."""
+
+    def cancel(steps):
+        raise KeyboardInterrupt
+
+    since = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), Helpers(2) as helpers:
+        helpers.map(takes_long, [(60,), (60,)], cancel)
+    assert time.monotonic() - since < 30
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere, a helper works to the end of its part")
+def test_helpers_end_with_a_process_that_is_killed():
+    """Catches helpers that go on for nobody."""
+    script = (
+        "from worker.test_helpers import *\n"
+        "helpers = Helpers(2)\n"
+        "helpers.map(takes_long, [(60,), (60,)], lambda steps: "
+        "print(*(process.pid for process in helpers._processes), flush=True))"
+    )
+    variables = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parents[1])])}
+    asking = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=variables)
+    pids = [int(pid) for pid in asking.stdout.readline().split()]
+    asking.kill()
+    asking.communicate()
+    assert len(pids) == 2
+    ended = time.monotonic() + 30
+    while any(Path(f"/proc/{pid}").exists() and "Z" not in _state(pid) for pid in pids):
+        assert time.monotonic() < ended
+        time.sleep(0.05)
+
+
+def _state(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return "Z"
