@@ -47,7 +47,7 @@ USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this factor, than it is at
 this share of the texture's timesteps."""
 DAMPING = 1e-3
-CONVERGED_STEP_M = 5e-5
+CONVERGED_STEP_M = 1e-4
 """Root mean square of the points' motion in a step, after which a level is done."""
 MAX_TURN = 0.3
 """Of a joint in one step, in radians."""

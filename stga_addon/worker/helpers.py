@@ -87,6 +87,7 @@ class Helpers:
                 done(task.steps.value)
         if task.errors:
             raise task.errors[0]
+        done(task.steps.value)
         return task.results
 
 
