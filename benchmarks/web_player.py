@@ -10,17 +10,21 @@ an idle machine.
 """
 
 import argparse
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from export.web.browser import Browser, find_browser
+
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import look_at
-from stga_addon.development.browser import Browser, find_browser
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
 from stga_addon.export.web.page import page
