@@ -21,13 +21,12 @@ from stga_addon.capture.camera import look_at
 from stga_addon.scene.gpu.packing import StaticSplats, View, drawing_order, frame_block, posed_frames, table
 from stga_addon.scene.layers import SceneLayer
 
-TRIANGLES = 9976
-"""Of the FLAME head."""
+GRID = 59, 86
+"""Rings and vertices around, of 9,976 triangles, as the FLAME head has."""
 
 
-def head_mesh() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a closed grid of about TRIANGLES triangles."""
-    rings, around = 59, 86
+def head_mesh(rings: int, around: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) meters and triangles (F, 3) of a closed grid."""
     polar, angle = np.meshgrid(np.linspace(0.1, 3.0, rings), np.arange(around) * 2 * np.pi / around, indexing="ij")
     points = [np.sin(polar) * np.cos(angle), np.cos(polar), np.sin(polar) * np.sin(angle)]
     index = np.arange(rings * around).reshape(rings, around)
@@ -37,7 +36,7 @@ def head_mesh() -> tuple[np.ndarray, np.ndarray]:
 
 
 def head_avatar(count: int, has_strain: bool = False) -> Avatar:
-    vertices, faces = head_mesh()
+    vertices, faces = head_mesh(*GRID)
     rng = np.random.default_rng(0)
     splats = Splats(
         xyz=rng.normal(0, 1e-3, (count, 3)).astype(np.float32),

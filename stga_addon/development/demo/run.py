@@ -60,7 +60,7 @@ def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | Non
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
-    metrics = _measure(capture, avatar)
+    metrics = {split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")}
     write_json(out / "metrics.json", {**metrics, "splats": len(avatar.splats), "blender_position_error_m": error})
     for split, values in metrics.items():
         fitted = f" (exposure fitted; {values['psnr_unmatched']:.2f} without)" if "psnr_unmatched" in values else ""
@@ -165,10 +165,6 @@ def _page(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], pa
 def _save(path: Path, pixels: np.ndarray) -> None:
     with replacing(path) as partial:
         Image.fromarray(pixels).save(partial, format="PNG")
-
-
-def _measure(capture: Capture, avatar: Avatar) -> dict[str, dict[str, float]]:
-    return {split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")}
 
 
 def selection_picture(avatar: Avatar, mesh: np.ndarray, camera: Camera, selected: np.ndarray) -> np.ndarray:
