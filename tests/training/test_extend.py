@@ -69,7 +69,7 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
 
 
 def prepare_extension(parent: Path, takes: tuple[Path, ...], growth: float = 0.0, iterations: int = 1) -> Prepared:
-    request = Extend(parent / "unused", parent, takes, growth, iterations=iterations, device="cpu")
+    request = Extend(parent / "unused", parent, takes, growth=growth, iterations=iterations, device="cpu")
     return prepare(request, ignore, lambda line: None)
 
 

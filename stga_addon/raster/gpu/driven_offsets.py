@@ -14,8 +14,6 @@ from .optimizer import STEP
 POSED, STEPPED = ("pose",), ("numbers", "optimizer")
 """Files that the kernels include."""
 
-INCLUDE = ("pose",)
-
 
 class Signal(Protocol):
     """Computes the signal of a driven offset of one mesh."""
@@ -44,7 +42,7 @@ class SmoothedStrain:
         for n in range(AVERAGING_ROUNDS):
             smoothed, averaged = averaged, self._rounds[n % 2]
             work.dispatch(
-                device.kernel("smoothed_strain", include=INCLUDE), device.groups(self._count), pose=pose,
+                device.kernel("smoothed_strain", include=POSED), device.groups(self._count), pose=pose,
                 neighbors=self._neighbors, smoothed=smoothed, averaged=averaged,
             )  # fmt: skip
         return averaged
@@ -52,7 +50,7 @@ class SmoothedStrain:
     @staticmethod
     def compile_kernels(device: Device) -> None:
         """Compile what `record` dispatches."""
-        device.kernel("smoothed_strain", include=INCLUDE)
+        device.kernel("smoothed_strain", include=POSED)
 
 
 SIGNALS: dict[str, type[Signal]] = {"strain_position": SmoothedStrain}
