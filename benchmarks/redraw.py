@@ -8,11 +8,9 @@ uploading the results takes it another 0.1 to 1 ms, which `tests/gui` shows. Run
 """
 
 import argparse
-import statistics
-from collections.abc import Callable
-from time import perf_counter
 
 import numpy as np
+from iteration import median_ms
 
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
@@ -49,15 +47,6 @@ def head_avatar(count: int, has_strain: bool = False) -> Avatar:
         strain_color=np.zeros((count, STRAIN_COMPONENTS if has_strain else 0, 3), np.float32),
     )
     return Avatar(splats, "stga", vertices.astype(np.float32), faces)
-
-
-def median_ms(work: Callable[[], object], repeats: int) -> float:
-    times = []
-    for _ in range(repeats):
-        begin = perf_counter()
-        work()
-        times.append(1e3 * (perf_counter() - begin))
-    return statistics.median(times)
 
 
 def measure(count: int, view: View, repeats: int) -> None:
