@@ -60,9 +60,9 @@ class Outcome:
 
 def derive(root: Path, folder: Path, keep: Callable[[str, dict[str, Any]], bool]) -> Path:
     """A capture of those frames of another that `keep(split, frame)` chooses; its files are links."""
-    folder.mkdir()
-    for item in root.iterdir():
-        if not item.name.startswith("transforms"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for item in root.resolve().iterdir():
+        if not item.name.startswith("transforms") and not (folder / item.name).exists():
             (folder / item.name).symlink_to(item)
     for split in ("train", "val", "test"):
         path = root / f"transforms_{split}.json"
@@ -109,22 +109,21 @@ def possible(capture: Capture, iterations: int) -> list[str]:
     """The effects that can be on."""
     facts = CaptureFacts(capture, make_settings(iterations=iterations))
     looked = {effect.name: RULES[effect.name](facts) for effect in EFFECTS.values() if effect.name not in LEFT_TO_AUTO}
-    return [name for name, verdict in looked.items() if verdict is not None and (verdict.on or not verdict.only)]
+    return [name for name, verdict in looked.items() if verdict is not None and (verdict.on or not verdict.fixed)]
 
 
 def trained(
-    capture: Capture, flame: Path | None, iterations: int, seed: int, choices: Choices
-) -> tuple[dict[str, float], float, str]:
-    """PSNR by split, milliseconds of an iteration, and the effects that were on."""
+    capture: Capture, flame: Path | None, iterations: int, choices: Choices, seed: int = 0, matched: bool = False
+) -> tuple[Capture, dict[str, float], float, str]:
+    """The capture as it was refined, PSNR by split, milliseconds of an iteration, and the effects that were on."""
     settings, plan = plan_effects(capture, make_settings(iterations=iterations, seed=seed, effects=choices))
     with tempfile.TemporaryDirectory() as folder:
         avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
         shown = with_refined_tracking(capture, Path(folder))
     splits = [split for split in ("val", "test") if shown.views.get(split)]
-    # Exposure matched for all variants, so that those with and without the effect `exposure` compare.
-    psnr = {split: evaluate_avatar(avatar, shown, split, matched=True).psnr for split in splits}
-    return psnr, 1000 * seconds / iterations, ", ".join(decision.effect for decision in plan if decision.on)
+    psnr = {split: evaluate_avatar(avatar, shown, split, matched=matched).psnr for split in splits}
+    return shown, psnr, 1000 * seconds / iterations, ", ".join(decision.effect for decision in plan if decision.on)
 
 
 def compare(
@@ -134,8 +133,9 @@ def compare(
     found: dict[str, list[tuple[dict[str, float], float, str]]] = {name: [] for name in variants}
     for seed in range(seeds):
         for name in random.Random(seed).sample(list(variants), len(variants)):
-            found[name].append(trained(capture, flame, iterations, seed, variants[name]))
-            psnr, pace, on = found[name][-1]
+            # Exposure matched for all variants, so that those with and without the effect `exposure` compare.
+            _, psnr, pace, on = trained(capture, flame, iterations, variants[name], seed, matched=True)
+            found[name].append((psnr, pace, on))
             scores = ", ".join(f"{split} {value:.2f} dB" for split, value in psnr.items())
             print(f"{capture.root.name}, {name}, seed {seed}: {scores}, {pace:.1f} ms: {on}", file=sys.stderr)
     return {name: _outcome(runs) for name, runs in found.items()}

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from effects import derive
 
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import View
@@ -124,26 +125,11 @@ def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Pat
     timesteps = sorted({view.timestep for view in capture.views["train"]})
     selection = select_capture(capture, SelectionOptions())
     ranked = sorted(timesteps, key=lambda timestep: selection[timestep].mean())
-    takes = []
-    for name, members in (("old", ranked[::2]), ("new", ranked[1::2])):
-        take = folder / name
-        take.mkdir(parents=True, exist_ok=True)
-        for path in root.resolve().iterdir():
-            target = take / path.name
-            if path.name.startswith("transforms"):
-                write_split(path, target, members)
-            elif not target.exists():
-                target.symlink_to(path)
-        takes.append(take)
-    return takes[0], takes[1]
-
-
-def write_split(source: Path, target: Path, timesteps: list[int]) -> None:
-    """The frames of these timesteps; a file without any of them is left out."""
-    values = json.loads(source.read_text(encoding="utf-8"))
-    frames = [frame for frame in values.get("frames", []) if frame.get("timestep_index") in timesteps]
-    if frames and source.stem in ("transforms_train", "transforms_val"):
-        target.write_text(json.dumps({**values, "frames": frames}), encoding="utf-8")
+    first, second = ranked[::2], ranked[1::2]
+    return (
+        derive(root, folder / "old", lambda split, frame: split != "test" and frame["timestep_index"] in first),
+        derive(root, folder / "new", lambda split, frame: split != "test" and frame["timestep_index"] in second),
+    )
 
 
 def trained(take: Path, options: argparse.Namespace, seed: int) -> Path:

@@ -20,6 +20,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from stga_addon.capture.camera import look_at
+
 RUN = """
 import sys
 from pathlib import Path
@@ -49,6 +51,9 @@ def write_capture(root: Path, timesteps: int, views: int, width: int, height: in
     for n in range(12):
         moved = vertices + 0.001 * n * (vertices[:, 1:2] < 0) * [0, -1, 0]
         trimesh.Trimesh(moved, faces, process=False).export(root / f"meshes/{n}.obj")
+    angles = [2 * math.pi * camera / views for camera in range(views)]
+    eyes = [(math.sin(angle), 0.0, math.cos(angle)) for angle in angles]
+    poses = [look_at(eye, (0, 0, 0), width, height, 2.43 * width).camera_to_world_gl for eye in eyes]
     entries = []
     for timestep in range(timesteps):
         mesh = f"meshes/{timestep:05d}.obj"
@@ -63,18 +68,12 @@ def write_capture(root: Path, timesteps: int, views: int, width: int, height: in
                     "camera_id": str(camera),
                     "file_path": image,
                     "mesh_path": mesh,
-                    "transform_matrix": _pose(2 * math.pi * camera / views),
+                    "transform_matrix": poses[camera].tolist(),
                 }
             )
     lens = {"fl_x": 2.43 * width, "fl_y": 2.43 * width, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
     shared = {**lens, "canonical_mesh_path": "meshes/0.obj"}
     (root / "transforms_train.json").write_text(json.dumps({**shared, "frames": entries}), encoding="utf-8")
-
-
-def _pose(angle: float) -> list[list[float]]:
-    """Camera to world, OpenGL axes, one meter from the origin and looking at it."""
-    sine, cosine = math.sin(angle), math.cos(angle)
-    return [[cosine, 0, sine, sine], [0, 1, 0, 0], [-sine, 0, cosine, cosine], [0, 0, 0, 1]]
 
 
 def main() -> None:

@@ -8,11 +8,9 @@ uploading the results takes it another 0.1 to 1 ms, which `tests/gui` shows. Run
 """
 
 import argparse
-import statistics
-from collections.abc import Callable
-from time import perf_counter
 
 import numpy as np
+from iteration import median_ms
 
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
@@ -21,13 +19,12 @@ from stga_addon.capture.camera import look_at
 from stga_addon.scene.gpu.packing import StaticSplats, View, drawing_order, frame_block, posed_frames, table
 from stga_addon.scene.layers import SceneLayer
 
-TRIANGLES = 9976
-"""Of the FLAME head."""
+GRID = 59, 86
+"""Rings and vertices around, of 9,976 triangles, as the FLAME head has."""
 
 
-def head_mesh() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a closed grid of about TRIANGLES triangles."""
-    rings, around = 59, 86
+def head_mesh(rings: int, around: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) meters and triangles (F, 3) of a closed grid."""
     polar, angle = np.meshgrid(np.linspace(0.1, 3.0, rings), np.arange(around) * 2 * np.pi / around, indexing="ij")
     points = [np.sin(polar) * np.cos(angle), np.cos(polar), np.sin(polar) * np.sin(angle)]
     index = np.arange(rings * around).reshape(rings, around)
@@ -37,7 +34,7 @@ def head_mesh() -> tuple[np.ndarray, np.ndarray]:
 
 
 def head_avatar(count: int, has_strain: bool = False) -> Avatar:
-    vertices, faces = head_mesh()
+    vertices, faces = head_mesh(*GRID)
     rng = np.random.default_rng(0)
     splats = Splats(
         xyz=rng.normal(0, 1e-3, (count, 3)).astype(np.float32),
@@ -50,15 +47,6 @@ def head_avatar(count: int, has_strain: bool = False) -> Avatar:
         strain_color=np.zeros((count, STRAIN_COMPONENTS if has_strain else 0, 3), np.float32),
     )
     return Avatar(splats, "stga", vertices.astype(np.float32), faces)
-
-
-def median_ms(work: Callable[[], object], repeats: int) -> float:
-    times = []
-    for _ in range(repeats):
-        begin = perf_counter()
-        work()
-        times.append(1e3 * (perf_counter() - begin))
-    return statistics.median(times)
 
 
 def measure(count: int, view: View, repeats: int) -> None:

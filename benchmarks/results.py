@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from stga_addon import __version__
-from stga_addon.batch.engines.local import processors
 from stga_addon.batch.plan import Plan, make_plan
 from stga_addon.cli.arguments import duration
 from stga_addon.cli.batch import add_engine, carry_out_plan, print_plan, with_threads
 from stga_addon.development.benchmark.benchmark import benchmark_table, slices_of, write_report
 from stga_addon.requests.values import Benchmark
+from stga_addon.worker.helpers import processors
 
 HEADER = """# Results
 

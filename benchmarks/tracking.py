@@ -12,27 +12,19 @@ CAPTURE's meshes, on its own, and on its own refined. Distances are then those o
 """
 
 import argparse
-import tempfile
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from effects import trained
 
-from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.flame_capture import with_sequence
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.capture.rigid import Similarity, similarity
 from stga_addon.flame.forward import POSE_SIZE, TRANSLATION_SIZE, FlameFrame, frame_of
 from stga_addon.training.effects.facts import CaptureFacts
-from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.effects.rules import tracking
-from stga_addon.training.evaluate.metrics import evaluate_avatar
-from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import train
-from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.tracking_file import with_refined_tracking
 from stga_addon.training.settings import make_settings
 
 EXPRESSION_ERROR, JOINT_ERROR_RAD, TRANSLATION_ERROR_M = 0.15, 0.0175, 0.002
@@ -98,20 +90,9 @@ def compare_tracked(tracked: Capture, true: Capture, flame: Path, iterations: in
     print("| meshes | mm | val | ms an iteration |")
     print("|" + " --- |" * 4)
     for name, capture, choice in (("true", aim, "off"), ("tracked", tracked, "off"), ("refined", tracked, "on")):
-        shown, psnr, pace = trained(capture, flame, iterations, choice)
+        shown, psnr, pace, _ = trained(capture, flame, iterations, {"tracking": choice})
         error = millimeters(shown, aim, face) / scale
-        print(f"| {name} | {error:.2f} | {psnr['val']:.2f} | {1000 * pace:.1f} |", flush=True)
-
-
-def trained(capture: Capture, flame: Path, iterations: int, choice: str) -> tuple[Capture, Mapping[str, float], float]:
-    """The capture as it was refined, the PSNR by split, and the seconds of an iteration."""
-    settings, plan = plan_effects(capture, make_settings(iterations=iterations, effects={"tracking": choice}))
-    with tempfile.TemporaryDirectory() as folder:
-        avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
-        shown, last = with_refined_tracking(capture, Path(folder)), read_metrics(Path(folder))[-1]
-    splits = [split for split in ("val", "test") if shown.views.get(split)]
-    quality = {split: evaluate_avatar(avatar, shown, split).psnr for split in splits}
-    return shown, quality, last["seconds"] / last["iteration"]
+        print(f"| {name} | {error:.2f} | {psnr['val']:.2f} | {pace:.1f} |", flush=True)
 
 
 def main() -> None:
@@ -134,10 +115,10 @@ def main() -> None:
         decided = tracking(facts)
         auto = "on" if decided is not None and decided.on else "off"
         for choice in ("off", "on"):
-            shown, psnr, pace = trained(capture, options.flame, options.iterations, choice)
+            shown, psnr, pace, _ = trained(capture, options.flame, options.iterations, {"tracking": choice})
             print(
                 f"| {error:g} | {facts.outside:.2%} | {auto} | {choice} | {millimeters(shown, true):.2f} "
-                f"| {psnr['val']:.2f} | {psnr['test']:.2f} | {1000 * pace:.1f} |",
+                f"| {psnr['val']:.2f} | {psnr['test']:.2f} | {pace:.1f} |",
                 flush=True,
             )
 

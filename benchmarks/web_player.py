@@ -10,25 +10,30 @@ an idle machine.
 """
 
 import argparse
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from export.web.browser import Browser, find_browser
+from redraw import head_mesh
+
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import look_at
-from stga_addon.development.browser import Browser, find_browser
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
 from stga_addon.export.web.page import page
 from stga_addon.export.web.rig import WebRig
 from stga_addon.flame.model import JOINTS
 
-RINGS, AROUND = 37, 139
-"""Of a closed grid with FLAME's 5,143 vertices, and 10,008 triangles."""
+GRID = 37, 139
+"""Rings and vertices around, of a closed grid with FLAME's 5,143 vertices, and 10,008 triangles."""
 EXPRESSIONS, FRAMES = 100, 60
 FIRST_FRAME_SPLATS = 30_000
 WINDOW_PX = (900, 700)
@@ -120,16 +125,6 @@ MEASURE = """(async (repeats) => {
 })"""
 
 
-def head_mesh() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) meters and triangles (F, 3) of a closed grid as large as FLAME's mesh."""
-    polar, angle = np.meshgrid(np.linspace(0.1, 3.0, RINGS), np.arange(AROUND) * 2 * np.pi / AROUND, indexing="ij")
-    points = [np.sin(polar) * np.cos(angle), np.cos(polar), np.sin(polar) * np.sin(angle)]
-    index = np.arange(RINGS * AROUND).reshape(RINGS, AROUND)
-    a, b, c, d = (np.roll(index, (-i, -j), (0, 1))[:-1].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
-    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
-    return 0.1 * np.stack([p.ravel() for p in points], 1), faces.astype(np.int32)
-
-
 def head_rig(vertices: np.ndarray) -> WebRig:
     """A rig of FLAME's size in which every coefficient, joint and weight counts."""
     rng = np.random.default_rng(0)
@@ -154,7 +149,7 @@ def head_rig(vertices: np.ndarray) -> WebRig:
 
 def head_page(count: int) -> str:
     """The page of a head of `count` splats."""
-    vertices, faces = head_mesh()
+    vertices, faces = head_mesh(*GRID)
     rng = np.random.default_rng(1)
     unit = face_frames(vertices, faces, vertices).scale.max()
     splats = Splats(

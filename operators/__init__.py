@@ -1,100 +1,28 @@
 """Operators, one module for each step of the panel."""
 
+from importlib import import_module
 from typing import Any
 
 import bpy
 
 from ..stga_addon.requests.environment_job import CAN_MAKE
 from . import drive, ids, monitor, prepare
-from .analyze import AnalyzeCapture
-from .apply_motion import ApplyMotion
-from .arkit_controls import AddArkitControls, RemoveArkitControls
 from .common import register_classes, unregister_classes
-from .continue_run import Extend, Refine
-from .drive import CalibrateLive, DriveLive, FollowLive, MeasureRange, RecordLive, StopLive
-from .drive_video import DriveVideo
-from .drop import AvatarDrop, CaptureDrop, OpenNpz, PerformanceDrop, PlyDrop
-from .environment import TestEnvironment
-from .export import ExportAvatar
-from .export_cameras import ExportCameras
-from .export_head_model import ExportHeadModel
-from .export_performance import ExportPerformance
-from .failure_report import CopyReport
-from .import_capture import ImportCapture
-from .import_meshes import ImportMeshes
-from .import_motion import ImportMotion
-from .import_ply import ImportPly
-from .light import EstimateLight, HeadShadow, RelightFrame
-from .open_demo import OpenDemo
-from .pose import PoseHead
-from .preview_images import PreviewImages
-from .render_video import RenderVideo
-from .request import Cancel, Dismiss
-from .select import CountSelected, HeatMap, Select, ToggleRegion
-from .select_extension import SelectExtension
-from .show import MoreBounces, ShowAvatar, StandardView
-from .track import TrackFootage
-from .track_correct import MarkKey, SolveAgain, ViewFootage
-from .train import Train
 
-MAKE_ENVIRONMENT: tuple[type, ...] = ()
-if CAN_MAKE:
-    from .make_environment import MakeEnvironment
-
-    MAKE_ENVIRONMENT = (MakeEnvironment,)
-
-CLASSES = (
-    TrackFootage,
-    ViewFootage,
-    MarkKey,
-    SolveAgain,
-    ExportHeadModel,
-    OpenDemo,
-    ImportCapture,
-    ImportMotion,
-    ImportMeshes,
-    Select,
-    ToggleRegion,
-    CountSelected,
-    HeatMap,
-    AnalyzeCapture,
-    Train,
-    Refine,
-    Extend,
-    SelectExtension,
-    Cancel,
-    Dismiss,
-    CopyReport,
-    *MAKE_ENVIRONMENT,
-    TestEnvironment,
-    PoseHead,
-    ShowAvatar,
-    StandardView,
-    MoreBounces,
-    EstimateLight,
-    HeadShadow,
-    RelightFrame,
-    PreviewImages,
-    RenderVideo,
-    ApplyMotion,
-    AddArkitControls,
-    RemoveArkitControls,
-    MeasureRange,
-    DriveLive,
-    StopLive,
-    CalibrateLive,
-    RecordLive,
-    FollowLive,
-    DriveVideo,
-    ImportPly,
-    ExportAvatar,
-    ExportCameras,
-    ExportPerformance,
-    OpenNpz,
-    CaptureDrop,
-    PerformanceDrop,
-    AvatarDrop,
-    PlyDrop,
+MODULES = (
+    ".track", ".track_correct", ".export_head_model", ".open_demo", ".import_capture", ".import_motion",
+    ".import_meshes", ".select", ".analyze", ".train", ".continue_run", ".select_extension", ".request",
+    ".failure_report", *([".make_environment"] if CAN_MAKE else []), ".environment", ".pose", ".show", ".light",
+    ".preview_images", ".render_video", ".apply_motion", ".arkit_controls", ".drive", ".drive_video", ".import_ply",
+    ".export", ".export_cameras", ".export_performance", ".drop",
+)  # fmt: skip
+"""Whose operators and file handlers are registered."""
+CLASSES = tuple(
+    thing
+    for module in (import_module(name, __package__) for name in MODULES)
+    for thing in vars(module).values()
+    if isinstance(thing, type) and issubclass(thing, (bpy.types.Operator, bpy.types.FileHandler))
+    if thing.__module__ == module.__name__
 )
 
 

@@ -69,27 +69,29 @@ def is_head(thing: Any) -> bool:
     return thing is not None and thing.get(tags.KIND) == tags.HEAD
 
 
+def polled(operator: Any, is_possible: bool, message: str) -> bool:
+    """Poll: whether an operator can be called; where not, Blender shows the message, which says what to do."""
+    if not is_possible:
+        operator.poll_message_set(message)
+    return is_possible
+
+
 def needs_head(operator: Any, context: Any) -> bool:
-    """Poll: whether a capture was imported; says what to do where not."""
-    if is_head(scene_settings(context).head):
-        return True
-    operator.poll_message_set("Import a capture first")
-    return False
+    """Poll: whether a capture was imported."""
+    return polled(operator, is_head(scene_settings(context).head), "Import a capture first")
 
 
 def needs_own_head(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head that can be changed here; says what to do where not."""
+    """Poll: whether there is a head that can be changed here."""
     if not needs_head(operator, context):
         return False
     head = scene_settings(context).head
-    if head.library is None and head.data.library is None:
-        return True
-    operator.poll_message_set("The head is linked from another file: open that file, or make the head local")
-    return False
+    is_own = head.library is None and head.data.library is None
+    return polled(operator, is_own, "The head is linked from another file: open that file, or make the head local")
 
 
 def needs_rig(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head with a FLAME rig that can be animated; says what to do where not."""
+    """Poll: whether there is a head with a FLAME rig that can be animated."""
     if not needs_own_head(operator, context):
         return False
     try:
@@ -101,7 +103,7 @@ def needs_rig(operator: Any, context: Any) -> bool:
 
 
 def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names; says what to do where not."""
+    """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names."""
     if not needs_own_head(operator, context):
         return False
     return bool(shape_key_names(scene_settings(context).head)) or needs_rig(operator, context)

@@ -74,7 +74,7 @@ class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
         run = next_folder(parent)
         weights = None if self.region else _painted_region(head, self.group)
         frames = None if self.last < 0 else (max(self.first, 0), self.last)
-        request = RefineRequest(run, parent, self.region, weights, frames, self.growth, **_common(self, head))
+        request = RefineRequest(run, parent, self.region, weights, frames, growth=self.growth, **_common(self, head))
         return _start(self, context, request)
 
 

@@ -24,11 +24,12 @@ from .common import (
     needs_rig,
     needs_rig_or_shapes,
     path_property,
+    polled,
     reporting,
     rig_or_none,
     scene_settings,
 )
-from .live_session import Target, live_options
+from .live_session import LiveSession, Target, live_options
 
 MAX_PORT = 65535
 
@@ -144,10 +145,13 @@ class _NeedsSession:
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if live_session.session() is not None:
-            return True
-        cls.poll_message_set("No source is listened to; choose Drive Live first")  # type: ignore[attr-defined]
-        return False
+        return polled(cls, live_session.session() is not None, "No source is listened to; choose Drive Live first")
+
+    @property
+    def running(self) -> LiveSession:
+        found = live_session.session()
+        assert found is not None
+        return found
 
 
 class StopLive(_NeedsSession, bpy.types.Operator):
@@ -158,8 +162,7 @@ class StopLive(_NeedsSession, bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        running = live_session.session()
-        assert running is not None
+        running = self.running
         recording, running.recording = running.recording, None
         running.stop()
         if recording is not None and len(recording) > 1:
@@ -175,9 +178,7 @@ class CalibrateLive(_NeedsSession, bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        running = live_session.session()
-        assert running is not None
-        running.calibrate()
+        self.running.calibrate()
         return {"FINISHED"}
 
 
@@ -190,8 +191,7 @@ class RecordLive(_NeedsSession, bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        running = live_session.session()
-        assert running is not None
+        running = self.running
         if running.recording is None:
             running.start_recording(context.scene.frame_current)
             return {"FINISHED"}
@@ -212,9 +212,7 @@ class FollowLive(_NeedsSession, bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        running = live_session.session()
-        assert running is not None
-        running.stream.follow((self.address, self.subject))
+        self.running.stream.follow((self.address, self.subject))
         return {"FINISHED"}
 
 

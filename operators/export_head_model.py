@@ -10,7 +10,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.shape_keys import has_shape_keys, shape_key_model
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
 from . import ids
-from .common import file_filter, file_path, reporting
+from .common import file_filter, file_path, polled, reporting
 
 
 class ExportHeadModel(bpy.types.Operator, ExportHelper):
@@ -25,10 +25,7 @@ class ExportHeadModel(bpy.types.Operator, ExportHelper):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if has_shape_keys(context.active_object):
-            return True
-        cls.poll_message_set("Select a mesh with shape keys")
-        return False
+        return polled(cls, has_shape_keys(context.active_object), "Select a mesh with shape keys")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

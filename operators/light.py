@@ -1,5 +1,6 @@
 """The light of avatars: estimated from the capture, and their shadows onto the scene."""
 
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import bpy
@@ -12,20 +13,16 @@ from ..stga_addon.scene.display.splat_object import get_input
 from ..stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow
 from ..stga_addon.scene.render.frame_colors import forget_frame, relight_frame
 from . import ids
-from .common import file_path, flame_model_path, path_property, reporting, scene_settings
+from .common import file_path, flame_model_path, path_property, polled, reporting, scene_settings
 from .request import needs_idle, start
 from .training_python import training_python
 
 
 def _needs_splats(operator: Any, context: Any) -> bool:
-    splats = scene_settings(context).splats
-    try:
-        if splats is not None and get_input(splats, splat_nodes.HEAD) is not None:
-            return True
-    except StgaError:
-        pass
-    operator.poll_message_set("Show an avatar first")
-    return False
+    splats, head = scene_settings(context).splats, None
+    with suppress(StgaError):
+        head = None if splats is None else get_input(splats, splat_nodes.HEAD)
+    return polled(operator, head is not None, "Show an avatar first")
 
 
 class EstimateLight(bpy.types.Operator):

@@ -9,7 +9,7 @@ import bpy
 from ..stga_addon.errors import StgaError
 from ..stga_addon.training.run.folder import has_run
 from . import ids
-from .common import package, reporting, scene_settings
+from .common import package, polled, reporting, scene_settings
 from .import_capture import bring_in
 
 BUNDLED = Path(__file__).parents[1] / "demo_capture"
@@ -26,10 +26,7 @@ class OpenDemo(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if BUNDLED.is_dir():
-            return True
-        cls.poll_message_set("Only the complete edition of the add-on brings the demo capture")
-        return False
+        return polled(cls, BUNDLED.is_dir(), "Only the complete edition of the add-on brings the demo capture")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -10,7 +10,7 @@ from ..stga_addon.scene.display.splat_nodes import DISPLAY
 from ..stga_addon.scene.display.splat_object import set_input
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from . import ids
-from .common import reporting
+from .common import polled, reporting
 
 
 class PreviewImages(bpy.types.Operator):
@@ -23,10 +23,7 @@ class PreviewImages(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if _own_as_trained(context):
-            return True
-        cls.poll_message_set("No splats are displayed as trained")
-        return False
+        return polled(cls, bool(_own_as_trained(context)), "No splats are displayed as trained")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

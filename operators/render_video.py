@@ -27,7 +27,7 @@ from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.timeline import frames_per_second
 from ..stga_addon.worker.status import status_writer
 from . import ids, monitor
-from .common import file_filter, file_path, is_head, path_property, reporting, scene_settings
+from .common import file_filter, file_path, is_head, path_property, polled, reporting, scene_settings
 from .render_engine import render_device
 from .request import needs_idle, start
 from .training_python import has_training_python, training_python
@@ -81,15 +81,12 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if scene_settings(context).splats is None:
-            cls.poll_message_set("Show an avatar first")
+        if not polled(cls, scene_settings(context).splats is not None, "Show an avatar first"):
             return False
         if not needs_idle(cls, context, Kind.VIDEO):
             return False
-        if not (has_training_python(context) or has_gpu_context()):
-            cls.poll_message_set("Needs a GPU, or a Python that trains, which is chosen in the add-on's preferences")
-            return False
-        return True
+        message = "Needs a GPU, or a Python that trains, which is chosen in the add-on's preferences"
+        return polled(cls, has_training_python(context) or has_gpu_context(), message)
 
     def check(self, context: Any) -> bool:
         """Keep the path's extension in step with the format; whether it changed."""

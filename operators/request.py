@@ -17,7 +17,7 @@ from ..stga_addon.worker.environment import missing_packages
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, failure_report, inspect_worker
 from . import ids, monitor
-from .common import reporting
+from .common import polled, reporting
 from .results import KINDS
 from .training_python import training_python
 
@@ -103,11 +103,9 @@ def python_of(operator: Any, context: Any) -> str | None:
 
 
 def needs_idle(operator: Any, context: Any, kind: Kind) -> bool:
-    """Poll: whether no request of the kind is running; says so where one is."""
-    if not monitor.state_of(context.scene, kind).is_running:
-        return True
-    operator.poll_message_set(f"{KINDS[kind].label} is running; wait, or cancel it")
-    return False
+    """Poll: whether no request of the kind is running."""
+    is_idle = not monitor.state_of(context.scene, kind).is_running
+    return polled(operator, is_idle, f"{KINDS[kind].label} is running; wait, or cancel it")
 
 
 def _kind_property(kinds: Any) -> Any:
@@ -133,10 +131,8 @@ class Cancel(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if any(monitor.state_of(context.scene, kind).is_running for kind in Kind):
-            return True
-        cls.poll_message_set("Nothing is running")
-        return False
+        is_running = any(monitor.state_of(context.scene, kind).is_running for kind in Kind)
+        return polled(cls, is_running, "Nothing is running")
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -158,10 +154,8 @@ class Dismiss(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if any(monitor.state_of(context.scene, kind).can_be_dismissed for kind in DISMISSIBLE):
-            return True
-        cls.poll_message_set("Nothing has ended in this scene that could be dismissed")
-        return False
+        has_ended = any(monitor.state_of(context.scene, kind).can_be_dismissed for kind in DISMISSIBLE)
+        return polled(cls, has_ended, "Nothing has ended in this scene that could be dismissed")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

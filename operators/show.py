@@ -10,7 +10,7 @@ from ..stga_addon.scene.display.hints import use_transparent_bounces
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes
 from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
 from . import ids
-from .common import FileImport, file_filter, file_path, head_of, needs_head, reporting, scene_settings
+from .common import FileImport, file_filter, file_path, head_of, needs_head, polled, reporting, scene_settings
 
 
 class ShowAvatar(bpy.types.Operator, FileImport):
@@ -79,10 +79,7 @@ class MoreBounces(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if hasattr(context.scene, "cycles"):
-            return True
-        cls.poll_message_set("Cycles is not enabled")
-        return False
+        return polled(cls, hasattr(context.scene, "cycles"), "Cycles is not enabled")
 
     def execute(self, context: Any) -> set[str]:
         use_transparent_bounces(context.scene)

@@ -16,7 +16,7 @@ from ..stga_addon.scene.rig.flame_rig import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
 from . import ids
-from .common import capture_of, flame_of, head_of, is_head, needs_head, needs_rig, reporting, scene_settings
+from .common import capture_of, flame_of, head_of, is_head, needs_head, needs_rig, polled, reporting, scene_settings
 from .request import needs_idle
 from .track import start_tracking
 from .training_python import training_python
@@ -37,10 +37,8 @@ class ViewFootage(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        if context.space_data is None or context.space_data.type != "VIEW_3D":
-            cls.poll_message_set("Needs a 3D viewport")
-            return False
-        return needs_head(cls, context)
+        in_viewport = context.space_data is not None and context.space_data.type == "VIEW_3D"
+        return polled(cls, in_viewport, "Needs a 3D viewport") and needs_head(cls, context)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -73,10 +71,8 @@ class MarkKey(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         if not needs_rig(cls, context):
             return False
-        if context.scene.frame_current in scene_settings(context).head[tags.TIMESTEPS]:
-            return True
-        cls.poll_message_set("The capture has no timestep at this frame")
-        return False
+        has_timestep = context.scene.frame_current in scene_settings(context).head[tags.TIMESTEPS]
+        return polled(cls, has_timestep, "The capture has no timestep at this frame")
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -102,10 +98,8 @@ class SolveAgain(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         if not needs_rig(cls, context) or not needs_idle(cls, context, Kind.TRACKING):
             return False
-        if scene_settings(context).head.get(tags.TRACKED):
-            return True
-        cls.poll_message_set("This capture was not tracked here")
-        return False
+        is_tracked = bool(scene_settings(context).head.get(tags.TRACKED))
+        return polled(cls, is_tracked, "This capture was not tracked here")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

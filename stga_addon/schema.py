@@ -82,7 +82,7 @@ def _parts(name: str, value: Any) -> list[tuple[str, Any]]:
 
 @cache
 def _hints(kind: Any) -> dict[str, Any]:
-    return get_type_hints(kind)
+    return {name: hint for name, hint in get_type_hints(kind).items() if hint is not dataclasses.KW_ONLY}
 
 
 def _kinds(hint: Any) -> tuple[Any, ...]:

@@ -15,10 +15,11 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
+from ..stga_addon.worker.status import WorkerState
+from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
 from .train_panel import draw_environment_setup, draw_train_button
-from .video import draw_video
 
 
 class NextStepPanel(SidebarPanel, bpy.types.Panel):
@@ -91,3 +92,18 @@ def _draw_selection_toggle(layout: Any, splats: Any) -> None:
     if identifier is not None:
         owner, prop = modifier_input_owner(modifier, identifier)
         layout.prop(owner, prop, text=splat_nodes.SHOW_SELECTION, icon="RESTRICT_SELECT_OFF", toggle=True)
+
+
+def draw_video(layout: Any, context: Any) -> None:
+    """Draw the button Render Video, or what the last video has come to."""
+    if draw_running(layout, context, Kind.VIDEO):
+        return
+    video = monitor.state_of(context.scene, Kind.VIDEO)
+    if video.subject is None:
+        layout.operator(ids.RENDER_VIDEO, text="Render Video…", icon="RENDER_ANIMATION")
+        return
+    box = draw_end(layout, context, video)
+    if video.snapshot.state == WorkerState.FINISHED:
+        opened = box.operator("wm.path_open", text=f"Open {video.subject.name}", icon="PLAY")
+        opened.filepath = str(video.subject)
+        draw_text(box, context, str(video.subject.parent), "FILE_FOLDER")

@@ -39,7 +39,8 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
         if not settings.track.model:
             name = thing.name if has_shape_keys(thing) else "none"
             layout.label(text=f"Shape keys of the active object: {name}", icon="SHAPEKEY_DATA")
-        _draw_button(layout, settings)
+        track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
+        set_options(track, settings.track, TrackOptions)
         draw_missing_environment(layout, context)
 
 
@@ -93,8 +94,3 @@ def _draw_keys(layout: Any, context: Any, head: Any) -> None:
             )
             jump.data_path, jump.value = "scene.frame_current", timestep
     layout.operator(ids.SOLVE_AGAIN, icon="FILE_REFRESH")
-
-
-def _draw_button(layout: Any, settings: Any) -> None:
-    track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
-    set_options(track, settings.track, TrackOptions)

@@ -50,13 +50,9 @@ def _stated(job: Job, paces: dict[str, float | None]) -> float | None:
     if job.table not in paces:
         paces[job.table] = pace(job, request)
     views_pace = paces[job.table]
-    iterations = request.settings.iterations or _preset_iterations(request)
+    # A capture of very many views takes more than its preset's own number.
+    iterations = request.settings.iterations or PRESETS[str(request.settings.preset)].iterations
     return None if views_pace is None else views_pace * iterations
-
-
-def _preset_iterations(request: Train) -> int:
-    """Without the capture's views, which only count for captures of very many: the preset's own number."""
-    return PRESETS[str(request.settings.preset)].iterations
 
 
 def pace(job: Job, request: Train) -> float | None:

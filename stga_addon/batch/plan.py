@@ -103,7 +103,9 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
         if sum(map(len, made.values())) > MAX_JOBS:
             raise StgaError(f"{source}: [job.{name}]: makes more than {MAX_JOBS} jobs")
     jobs = [job for of_table in made.values() for job, _ in of_table]
-    return Plan(source, folder, _sorted(source, list(_with_inputs(source, jobs))))
+    by_name = {job.name: job for job in _with_inputs(source, jobs)}
+    order = _topological(source, {name: job.after for name, job in by_name.items()})
+    return Plan(source, folder, tuple(by_name[name] for name in order))
 
 
 # Tables and their order
@@ -406,9 +408,3 @@ def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
                 elif maker is None and not path.exists():
                     raise StgaError(f"{source}: [job.{job.table}]: {name}: {path} does not exist")
         yield replace(job, after=tuple(dict.fromkeys(after)))
-
-
-def _sorted(source: str, jobs: Sequence[Job]) -> tuple[Job, ...]:
-    """The jobs, each after those that it comes after. Raises StgaError where there is a circle."""
-    by_name = {job.name: job for job in jobs}
-    return tuple(by_name[name] for name in _topological(source, {job.name: job.after for job in jobs}))

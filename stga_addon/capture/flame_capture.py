@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..flame.model import FlameModel, key_regions, read_flame
+from ..flame.model import key_regions
 from ..flame.sequence import (
     FlameSequence,
     expression_mesh,
@@ -19,7 +19,7 @@ from ..flame.sequence import (
     read_motion,
     sequence_mesh,
 )
-from ..flame.teeth import TEMPLATE_VERTICES, with_teeth
+from ..flame.teeth import flame_model
 from .meshes import cached_meshes, check_extent, file_of
 from .model import Capture, View
 from .transforms import Transforms, tracked_files
@@ -106,12 +106,6 @@ def _model_file(root: Path, given: Path | None) -> Path:
             f" preferences of the add-on, or put it into the folder as {OWN_MODELS[0]}"
         )
     return found
-
-
-def flame_model(path: Path) -> FlameModel:
-    """The FLAME model file, with teeth where it has FLAME's 5023 vertices. Raises StgaError."""
-    model = read_flame(path)
-    return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
 
 
 def parameter_files(root: Path, transforms: Transforms) -> dict[int, Path]:

@@ -1,18 +1,18 @@
 """Opening a capture folder of any layout."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from os.path import isdir, isfile  # which are False, not an error, for a path that is too long
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import StgaError, shorten
+from .camera import Camera
 from .flame_capture import CANONICAL_NAME, PARAMETERS, open_flame_capture, open_flame_motion
-from .mesh_capture import mesh_files, open_mesh_capture, open_mesh_folder
-from .model import Capture, View
-from .principal_point import principal_point_warning
-from .release import is_release, open_release
+from .mesh_capture import is_release, mesh_files, open_mesh_capture, open_mesh_folder, open_release
+from .model import Capture, View, evenly_spread
 from .transforms import (
     DEFAULT_PRINCIPAL_POINT,
     PRINCIPAL_POINTS,
@@ -21,10 +21,14 @@ from .transforms import (
     Transforms,
     has_transforms,
     read_splits,
+    with_principal_point,
 )
 
 MIN_HEAD_EXTENT_M, TYPICAL_HEAD_EXTENT_M, MAX_HEAD_EXTENT_M = 0.05, 0.3, 3.0
 """Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
+
+MAX_COMPARED_VIEWS = 4
+MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
 
 
 def open_capture(folder: Path, flame: Path | None = None, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Capture:
@@ -104,3 +108,55 @@ def _files(frame: Frame) -> dict[str, Path | None]:
         "mesh_path": frame.mesh,
         "flame_param_path": frame.flame,
     }
+
+
+def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str) -> str | None:
+    """A warning where another convention puts clearly more of the mesh inside the masks, else None.
+
+    Checks a few views in which the conventions differ. Only vertices outside of a mask count: hair and shoulders lie
+    inside the mask but beside the mesh. Without Pillow, which Blender lacks, nothing is checked.
+    Raises StgaError where a mask cannot be read.
+    """
+    if find_spec("PIL") is None:
+        return None
+    apart = [frame for frame in frames if _conventions_differ(frame)]
+    outside = [_shares_outside(frame, mesh) for frame in evenly_spread(apart, MAX_COMPARED_VIEWS)]
+    known = [shares for shares in outside if shares is not None]
+    if not known:
+        return None
+    share = dict(zip(PRINCIPAL_POINTS, np.mean(known, axis=0).tolist(), strict=True))
+    best = min(share, key=lambda convention: share[convention])
+    if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
+        return None
+    return (
+        f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read as {chosen!r}, "
+        f"but {share[best]:.1%} with {best!r}: the capture was probably written that way"
+    )
+
+
+def _cameras(frame: Frame) -> list[Camera]:
+    return [with_principal_point(frame.view.camera, frame.principal, name) for name in PRINCIPAL_POINTS]
+
+
+def _conventions_differ(frame: Frame) -> bool:
+    points = np.array([(camera.cx, camera.cy) for camera in _cameras(frame)])
+    return bool((np.ptp(points, axis=0) > 0.5).any())
+
+
+def _shares_outside(frame: Frame, mesh: Callable[[int], np.ndarray]) -> list[float] | None:
+    """Share of the vertices outside the mask under each convention, or None without a mask."""
+    from .images import read_mask
+
+    mask = read_mask(frame.view)
+    if mask is None:
+        return None
+    points = mesh(frame.view.timestep)
+    return [_share_outside(points, camera, mask) for camera in _cameras(frame)]
+
+
+def _share_outside(points: np.ndarray, camera: Camera, mask: np.ndarray) -> float:
+    pixels, depth = camera.project(points)
+    column, row = np.floor(np.clip(pixels, -1, [camera.width, camera.height])).astype(int).T
+    visible = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    inside = mask[row[visible], column[visible]] > 127
+    return 1 - float(inside.sum()) / len(points)

@@ -65,8 +65,5 @@ def _flame(capture: Capture) -> list[tuple[str, str]]:
         return []
     dynamic = capture.flame.frame(capture.flame.timesteps[0]).dynamic_offset
     offsets = (("static offset", capture.flame.static_offset), ("dynamic offset", dynamic))
-    return [(name, "none" if offset is None else f"up to {_longest(offset)}") for name, offset in offsets]
-
-
-def _longest(offset: np.ndarray) -> str:
-    return f"{1000 * float(np.linalg.norm(offset, axis=1).max()):.1f} mm"
+    largest = [(name, None if o is None else 1000 * float(np.linalg.norm(o, axis=1).max())) for name, o in offsets]
+    return [(name, "none" if offset is None else f"up to {offset:.1f} mm") for name, offset in largest]

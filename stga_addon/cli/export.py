@@ -27,11 +27,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     parser.add_argument(
         "--frames", type=frame_span, metavar="FIRST:LAST", help="of a format that holds several (default: all)"
     )
-    parser.add_argument(
-        "--fps",
-        type=frame_rate,
-        help=f"frames per second of usd and web (default: {_default_rate(head)})",
-    )
+    rate = f"the capture's, else {DEFAULT_FPS:g}" if head is None else f"{head.fps:g}"
+    parser.add_argument("--fps", type=frame_rate, help=f"frames per second of usd and web (default: {rate})")
     parser.add_argument(
         "--motion-only",
         action="store_true",
@@ -41,10 +38,6 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--albedo", action="store_true", help="leave out the capture's light: colors are the albedo (docs/light.md)"
     )
     parser.add_argument("--out", type=usable_path, required=True)
-
-
-def _default_rate(head: OpenHead | None) -> str:
-    return f"the capture's, else {DEFAULT_FPS:g}" if head is None else f"{head.fps:g}"
 
 
 def run(options: Namespace) -> None:

@@ -123,11 +123,8 @@ def head_map(sequence: FlameSequence, name: str) -> HeadMap:
 
 def person_of(model: FlameModel, neutral: np.ndarray) -> FlameSequence:
     """A sequence without timesteps of the person whose neutral mesh (V, 3) this is."""
-    return FlameSequence(model, np.zeros(model.n_identity), neutral - model.v_template, (), _no_frame)
-
-
-def _no_frame(timestep: int) -> FlameFrame:
-    raise KeyError(timestep)
+    no_frames: dict[int, FlameFrame] = {}
+    return FlameSequence(model, np.zeros(model.n_identity), neutral - model.v_template, (), no_frames.__getitem__)
 
 
 def _fitted(person: FlameModel, places: SurfacePoints, used: np.ndarray) -> HeadMap:

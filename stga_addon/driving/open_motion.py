@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture.flame_capture import flame_model
 from ..capture.open import open_capture
 from ..errors import StgaError
 from ..export.playback import playback_fps
@@ -14,6 +13,7 @@ from ..flame.forward import FlameFrame
 from ..flame.model import FlameModel
 from ..flame.motion import strengthened, transferred_motion
 from ..flame.sequence import FlameSequence
+from ..flame.teeth import flame_model
 from ..schema import setting
 from .head_map import HeadMap, head_map, person_of
 from .names import ARKIT_SHAPES, PARTS

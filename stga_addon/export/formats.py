@@ -1,15 +1,18 @@
-"""The table of export formats, and export of an avatar in one of them."""
+"""The table of export formats, what their writers are given, and export of an avatar in one of them."""
 
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from ..avatar.embedding import to_world
 from ..avatar.file import Avatar
+from ..avatar.splats import Splats
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes
-from .content import Content, Meshes
 from .gaussian_avatars import write_gaussian_avatars
 from .gltf import write_gltf
 from .playback import DEFAULT_FPS, Playback, check_rate
@@ -18,7 +21,35 @@ from .spz import write_spz
 from .usd import usd_bytes, write_usd
 from .web.write import web_bytes, write_web
 
-__all__ = ["FORMATS", "Format", "Meshes", "check_free_space", "check_suffix", "export_avatar", "range_bytes"]
+Meshes = Iterable[tuple[int, np.ndarray]]
+"""Pairs of a number and a posed mesh (V, 3) meters."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """An avatar to be exported; `meshes` and `sequence` as `export_avatar` takes them."""
+
+    avatar: Avatar
+    meshes: Meshes = ()
+    sequence: FlameSequence | None = None
+    playback: Playback = field(default_factory=Playback)
+
+    def frames(self, path: Path) -> Iterator[tuple[int, Splats]]:
+        """The splats in world space on each mesh, with its number.
+
+        Raises StgaError naming `path` where there is no mesh or no splat.
+        """
+        if not len(self.avatar.splats):
+            raise StgaError(f"{path}: the avatar has no splats to export")
+        number = None
+        for number, mesh in self.meshes:
+            yield number, to_world(self.avatar.splats, self.avatar.frames(mesh))
+        if number is None:
+            raise StgaError(f"{path}: there is no posed mesh to export")
+
+    def first_frame(self, path: Path) -> Splats:
+        """The splats in world space on the first mesh. Raises StgaError as `frames`."""
+        return next(self.frames(path))[1]
 
 
 @dataclass(frozen=True)

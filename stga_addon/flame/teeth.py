@@ -7,11 +7,12 @@ teeth are this project's own construction from the mesh.
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from ..errors import StgaError
-from .model import JOINTS, FlameModel
+from .model import JOINTS, FlameModel, read_flame
 
 TEMPLATE_VERTICES = 5023
 TEETH_VERTICES, TEETH_FACES = 120, 168
@@ -53,6 +54,12 @@ class _Mouth:
     @property
     def inside(self) -> np.ndarray:
         return np.concatenate(self.rings)
+
+
+def flame_model(path: Path) -> FlameModel:
+    """The FLAME model file, with teeth where it has FLAME's 5023 vertices. Raises StgaError."""
+    model = read_flame(path)
+    return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
 
 
 def with_teeth(model: FlameModel) -> FlameModel:

@@ -121,11 +121,6 @@ class Lighting:
         if self.mode not in MODES:
             raise ValueError(f"mode of lighting {self.mode!r} is not one of {MODES}")
 
-    @property
-    def relights(self) -> bool:
-        """Whether colors differ from those that were trained."""
-        return self.mode == "scene" or (self.mode == "mix" and self.mix > 0)
-
 
 @dataclass(frozen=True)
 class Caster:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture.flame_capture import flame_model
 from ..capture.open import open_capture
 from ..driving.face_video import watched_performance
 from ..driving.head_map import person_of
@@ -17,6 +16,7 @@ from ..errors import StgaError
 from ..export.playback import playback_fps
 from ..files import write_npz
 from ..flame.sequence import FRAME_FIELDS, FlameSequence
+from ..flame.teeth import flame_model
 from ..progress import Progress, Report, Say
 from ..requests.results import Written
 from ..requests.values import SHAPES_SUFFIX, ConvertMotion

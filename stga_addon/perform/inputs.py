@@ -34,7 +34,8 @@ def open_avatar(request: Render | Export) -> tuple[Avatar, Capture | None]:
             logging.getLogger(__name__).warning("warning: %s: %s", source, what)
     if capture is None:
         return avatar, None
-    check_topology(capture, avatar)
+    if not np.array_equal(capture.faces, avatar.faces):
+        raise StgaError(f"{capture.root}: its mesh has other triangles than the one this avatar was trained on")
     return avatar, capture if request.played is None else _as_played(capture, request.played)
 
 
@@ -65,12 +66,6 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) 
 def avatar_path(source: Path) -> Path:
     """The avatar file that a run folder or an avatar file names."""
     return source / AVATAR if source.is_dir() else source
-
-
-def check_topology(capture: Capture, avatar: Avatar) -> None:
-    """Raise StgaError where the capture's mesh has other triangles than the avatar's."""
-    if not np.array_equal(capture.faces, avatar.faces):
-        raise StgaError(f"{capture.root}: its mesh has other triangles than the one this avatar was trained on")
 
 
 def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:

@@ -223,52 +223,38 @@ class Store:
 
 
 @dataclass(frozen=True)
-class StoreAvatar:
+class _OnPath:
+    """An effect on one file or folder."""
+
+    path: Path
+
+
+class StoreAvatar(_OnPath):
     """Store the path of the trained avatar in the scene."""
 
-    path: Path
 
-
-@dataclass(frozen=True)
-class LoadAvatar:
+class LoadAvatar(_OnPath):
     """Read an avatar file in a thread."""
 
-    path: Path
 
-
-@dataclass(frozen=True)
-class Show:
+class Show(_OnPath):
     """Put what was loaded into the scene, as far as it was read; answered by SliceBuilt, Shown or Failed."""
 
-    path: Path
 
-
-@dataclass(frozen=True)
-class ReadCurve:
+class ReadCurve(_OnPath):
     """Read the evaluations in the run for the panel's curve."""
 
-    run: Path
+
+class StopWorker(_OnPath):
+    """Ask the worker of the request in this folder to stop and to keep what it has."""
 
 
-@dataclass(frozen=True)
-class StopWorker:
-    """Ask the worker to stop and to keep what it has."""
-
-    folder: Path
+class KillWorker(_OnPath):
+    """End the worker of the request in this folder at once."""
 
 
-@dataclass(frozen=True)
-class KillWorker:
-    """End the worker at once."""
-
-    folder: Path
-
-
-@dataclass(frozen=True)
-class RemoveFiles:
+class RemoveFiles(_OnPath):
     """Remove the request's folder; what the request has made stays."""
-
-    folder: Path
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Requests: what can be asked for, as plain values that any process or machine can carry out (`perform`)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -80,63 +80,62 @@ class Resume:
 
 
 @dataclass(frozen=True)
-class Refine:
-    """Train a region of a finished avatar further, in a run of its own.
+class _Continue:
+    """Continue a finished run in a run of its own.
 
     run, parent     folders of the new run, and of the one that it continues
-    region          name of a region, or region file (`find_region`)
-    weights         (F,) weight of each triangle of a painted region, instead of `region`
-    frames          timesteps from first to last whose images show what is wrong; None: all
-    growth          most splats that may be added, as a share of the region's
+    growth          most splats that may be added, as a share of those on the triangles that are trained
     seconds, iterations   the budget, one of the two
     flame           FLAME model file, if it has moved
     """
 
     run: Path
     parent: Path
-    region: str = setting("", is_path=is_region_file)
-    weights: np.ndarray | None = None
-    frames: tuple[int, int] | None = setting(None, 0)
+    _: KW_ONLY
     growth: float = setting(0.0, 0, MAX_GROWTH)
     seconds: float | None = setting(None, above=0)
     iterations: int | None = setting(None, 1, MAX_COUNT)
     seed: int = setting(0, 0)
     flame: Path | None = None
     device: str = device_field()
+
+    def check(self) -> None:
+        """Raise StgaError unless there is one budget."""
+        if (self.seconds is None) == (self.iterations is None):
+            raise StgaError("the budget must be given either in seconds or in iterations")
+
+
+@dataclass(frozen=True)
+class Refine(_Continue):
+    """Train a region of a finished avatar further.
+
+    region          name of a region, or region file (`find_region`)
+    weights         (F,) weight of each triangle of a painted region, instead of `region`
+    frames          timesteps from first to last whose images show what is wrong; None: all
+    """
+
+    region: str = setting("", is_path=is_region_file)
+    weights: np.ndarray | None = None
+    frames: tuple[int, int] | None = setting(None, 0)
 
     def check(self) -> None:
         """Raise StgaError unless there is one region and one budget."""
         if bool(self.region) == (self.weights is not None):
             raise StgaError("region: expected its name, its file or painted weights")
-        _check_budget(self.seconds, self.iterations)
+        super().check()
 
 
 @dataclass(frozen=True)
-class Extend:
-    """Extend a finished avatar by further takes of the same head, in a run of its own.
+class Extend(_Continue):
+    """Extend a finished avatar by further takes of the same head, whose folders are `captures`."""
 
-    run, parent     folders of the new run, and of the one that it continues
-    captures        folders of the takes
-    growth          most splats that may be added, as a share of those on the triangles that the takes need
-    seconds, iterations   the budget, one of the two
-    flame           FLAME model file, if it has moved
-    """
-
-    run: Path
-    parent: Path
     captures: tuple[Path, ...]
-    growth: float = setting(0.0, 0, MAX_GROWTH)
-    seconds: float | None = setting(None, above=0)
-    iterations: int | None = setting(None, 1, MAX_COUNT)
-    seed: int = setting(0, 0)
-    flame: Path | None = None
-    device: str = device_field()
 
     def check(self) -> None:
         """Raise StgaError unless there is a take and one budget."""
         if not self.captures:
             raise StgaError("CAPTURE: is missing; expected one or more takes to extend the run by")
-        _check_budget(self.seconds, self.iterations)
+        super().check()
 
 
 @dataclass(frozen=True)
@@ -495,8 +494,3 @@ Request = (
     Train | Resume | Refine | Extend | Select | SelectForTake | Track | SolveAgain | Render | RenderBlend
     | RenderRecording | Export | ConvertMotion | Analyze | TimePresets | Evaluate | Benchmark | Relight
 )  # fmt: skip
-
-
-def _check_budget(seconds: float | None, iterations: int | None) -> None:
-    if (seconds is None) == (iterations is None):
-        raise StgaError("the budget must be given either in seconds or in iterations")

@@ -5,6 +5,9 @@ from typing import Any
 import bpy
 import numpy as np
 
+Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
+
 
 def read_values(items: Any, field: str, width: int, dtype: Any = np.float32) -> np.ndarray:
     """(N, width) of one property of a collection of N items."""

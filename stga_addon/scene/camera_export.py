@@ -10,9 +10,8 @@ from ..capture.camera import Camera
 from ..errors import StgaError
 from ..files import write_json
 from . import tags
+from .arrays import Z_UP_TO_Y_UP
 from .render.camera import image_size, render_camera
-
-Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:

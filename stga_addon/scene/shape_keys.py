@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from .arrays import read_values
+from .arrays import Z_UP_TO_Y_UP, read_values
 
 
 def has_shape_keys(thing: Any) -> bool:
@@ -22,7 +22,7 @@ def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     """
     if not has_shape_keys(thing):
         raise StgaError(f"{thing.name}: has no shape keys; a head model needs a basis and expressions")
-    turn = _world_to_y_up() @ np.array(thing.matrix_world)
+    turn = Z_UP_TO_Y_UP @ np.array(thing.matrix_world)
     basis = thing.data.shape_keys.reference_key
     mean = _points(basis) @ turn[:3, :3].T + turn[:3, 3]
     others = [block for block in thing.data.shape_keys.key_blocks if block != basis]
@@ -35,8 +35,3 @@ def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
 
 def _points(block: Any) -> np.ndarray:
     return read_values(block.data, "co", 3).astype(np.float64)
-
-
-def _world_to_y_up() -> np.ndarray:
-    """(x, y, z) of Blender is (x, z, -y)."""
-    return np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)

@@ -51,7 +51,8 @@ def correct_capture(
     timesteps, solved = _solved(out, capture.flame)
     rows = _rows(out, timesteps, keys, solved.shape[1])
     seen = _with_landmarks(out, timesteps)
-    footage = _sorted_footage(out)
+    footage = open_footage(out)
+    footage = replace(footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name)))
     found = _landmarks(out, footage, places, used)
     report("Solve", 0, 1)
     person = with_identity(capture.flame).model
@@ -169,12 +170,6 @@ def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
         raise StgaError(f"{out / REPORT_FILE}: interpolated: expected timesteps, got {shorten(interpolated)}")
     without = set(interpolated)
     return np.array([timestep not in without for timestep in timesteps])
-
-
-def _sorted_footage(out: Path) -> Footage:
-    """The capture's own images, its cameras in the order of their names."""
-    footage = open_footage(out)
-    return replace(footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name)))
 
 
 def _landmarks(out: Path, footage: Footage, places: SurfacePoints, used: np.ndarray) -> dict[str, CameraLandmarks]:

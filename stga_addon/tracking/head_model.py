@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.camera import MAX_COORDINATE_M
-from ..capture.flame_capture import flame_model
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from ..flame.model import JOINTS, POSE_FEATURES, FlameModel
+from ..flame.teeth import flame_model
 from .glb import read_glb
 
 IDENTITY_PREFIX = "identity"

@@ -1,11 +1,13 @@
 """Mattes of a take: those of its footage, or found in its frames once the head is tracked."""
 
+import os
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from PIL import Image
@@ -16,7 +18,6 @@ from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 from .matte import find_matte, probability_by_plate
-from .person import PersonSegmenter, make_segmenter
 
 AT_ONCE = 8
 """Frames that are held at a time."""
@@ -25,6 +26,42 @@ MIN_HEAD_PROBABILITY = 0.5
 
 HeadPixels = Callable[[int, FootageCamera], np.ndarray]
 """(timestep, camera) -> (H, W) bool: the pixels of the tracked head."""
+
+
+class PersonSegmenter(Protocol):
+    """Tells people from what is behind them."""
+
+    def probability(self, image: np.ndarray) -> np.ndarray:
+        """(H, W) float32 in 0…1 of an image (H, W, 3) uint8: how likely each pixel shows a person."""
+
+
+class SelfieSegmentation:
+    """MediaPipe's network of 250 kB (versions before 0.10.30), which sees 256×256 pixels: no download."""
+
+    def __init__(self, solutions: Any) -> None:
+        self._network = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
+
+    def probability(self, image: np.ndarray) -> np.ndarray:
+        return np.asarray(self._network.process(np.ascontiguousarray(image)).segmentation_mask, np.float32)
+
+
+def make_segmenter() -> PersonSegmenter:
+    """Raises StgaError, in one sentence, where mediapipe or its network is not available."""
+    os.environ.setdefault("GLOG_minloglevel", "2")  # its C++ part reports its own progress on stderr
+    try:
+        import mediapipe
+    except ImportError as error:
+        raise StgaError(_needs(f"which {sys.executable} lacks")) from error
+    if not hasattr(mediapipe, "solutions"):
+        raise StgaError(_needs(f"and {mediapipe.__version__} has no network in its wheel"))
+    return SelfieSegmentation(mediapipe.solutions)
+
+
+def _needs(what: str) -> str:
+    return (
+        f"mattes need mediapipe==0.10.21 (Python 3.11 or 3.12), {what}: give a folder of mattes with --mattes, a clean "
+        "plate of each camera, or masks beside the images"
+    )
 
 
 @dataclass(frozen=True)

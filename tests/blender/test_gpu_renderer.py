@@ -11,6 +11,7 @@ pytest.importorskip("bpy")
 import torch
 from capture.factory import ball
 from light.scenes import lit_avatar
+from raster import reference
 
 from stga_addon.avatar.embedding import WORLD, to_world
 from stga_addon.avatar.file import Avatar
@@ -20,7 +21,6 @@ from stga_addon.capture.camera import Camera, look_at
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Caster, Light, Lighting
-from stga_addon.raster import reference
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
 from stga_addon.scene.gpu.context import has_gpu_context

@@ -9,8 +9,7 @@ import pytest
 from light.scenes import ball_and_plate
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.bounce import Bounce
-from stga_addon.light.estimate import HARD_RESIDUAL, fit_light, recorded_irradiance
-from stga_addon.light.eyes import wet_roughness
+from stga_addon.light.estimate import HARD_RESIDUAL, fit_light, recorded_irradiance, wet_roughness
 from stga_addon.light.harmonics import LAMBERT, basis, even_directions, project, rotated, uniform
 from stga_addon.light.transfer import transfer_of
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from raster import reference
 from raster.test_kernels import NAMES, Scene, cloud, kernel_gradients, random_cotangents
 
 from stga_addon.capture.camera import Camera
-from stga_addon.raster import reference
 
 IMAGES = "rgb", "alpha", "depth"
 

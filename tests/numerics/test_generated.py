@@ -7,8 +7,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
-from stga_addon.raster import reference
+from raster import reference
 
 from .scenes import NAMES, Scene, assert_close, compare, facing, kernel_gradients, random_cotangents, steady_pixels
 

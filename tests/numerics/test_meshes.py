@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from flame.conftest import model_of, random_arrays, random_frame
+from raster import reference
 from raster.test_kernels import embed
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +15,6 @@ from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.forward_torch import axis_angle_matrices, flame_tensors
 from stga_addon.flame.forward_torch import flame_forward as torch_forward
 from stga_addon.flame.quaternions import from_matrices
-from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 

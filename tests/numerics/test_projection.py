@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from raster import reference
 from raster.test_kernels import embed
 
 from stga_addon.avatar.embedding import WORLD, FaceFrames, face_frames
 from stga_addon.capture.camera import Camera
-from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from raster import gpu_device, test_kernels
+from raster import gpu_device, reference, test_kernels
 from raster.test_kernels import (
     GRADIENT_TOLERANCE,
     IMAGE_TOLERANCE,
@@ -16,7 +16,6 @@ from raster.test_kernels import (
     random_cotangents,
 )
 from stga_addon.avatar.embedding import WORLD
-from stga_addon.raster import reference
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.raster.gpu import trial

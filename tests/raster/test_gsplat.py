@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
+from raster import reference
 from stga_addon.avatar.embedding import WORLD
 from stga_addon.capture.camera import Camera
-from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import MEAN_X, OPACITY, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from raster import reference
 from stga_addon.avatar.embedding import WORLD, face_frames
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
-from stga_addon.raster import reference
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward

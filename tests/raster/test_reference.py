@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.special import factorial, lpmv
 
+from raster import reference
 from stga_addon.capture.camera import Camera
-from stga_addon.raster import reference
 
 
 def camera_on_axis(width: int, height: int, focal: float) -> Camera:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from stga_addon.development.benchmark.chart import benchmark_chart
+from stga_addon.development.benchmark.benchmark import benchmark_chart
 from stga_addon.development.benchmark.statistics import MeanCurve
 from stga_addon.report.charts import run_chart
 

@@ -8,7 +8,7 @@ from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.mesh_raster import silhouette
 from stga_addon.capture.open import open_capture
 from stga_addon.tracking.matte import find_matte, probability_by_plate
-from stga_addon.tracking.person import make_segmenter
+from stga_addon.tracking.mattes import make_segmenter
 
 pytest.importorskip("cv2")
 

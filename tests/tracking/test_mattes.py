@@ -8,7 +8,7 @@ from PIL import Image
 
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
-from stga_addon.tracking import mattes, person
+from stga_addon.tracking import mattes
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.mattes import with_mattes
 
@@ -115,7 +115,7 @@ def test_without_the_network(tmp_path, monkeypatch):
     with pytest.raises(
         StgaError, match="give a folder of mattes with --mattes, a clean plate of each camera, or masks"
     ):
-        person.make_segmenter()
+        mattes.make_segmenter()
     found, warnings = with_mattes(take(tmp_path), head, tmp_path / "out", {}, silent)
     assert found.cameras[0].mask(0) is None
     assert len(warnings) == 1

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from stga_addon.training.evaluate.detail_difference import detail_difference
-from stga_addon.training.evaluate.metrics import psnr
+from stga_addon.training.evaluate.metrics import detail_difference, psnr
 
 
 def expected(image: np.ndarray, target: np.ndarray, where: np.ndarray) -> float:

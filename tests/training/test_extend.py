@@ -1,9 +1,8 @@
 """Extending a finished run by further takes: what is selected, what is remembered, and resumption to the same bits."""
 
-import importlib.util
+import importlib
 import json
 import shutil
-import sys
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -69,7 +68,7 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
 
 
 def prepare_extension(parent: Path, takes: tuple[Path, ...], growth: float = 0.0, iterations: int = 1) -> Prepared:
-    request = Extend(parent / "unused", parent, takes, growth, iterations=iterations, device="cpu")
+    request = Extend(parent / "unused", parent, takes, growth=growth, iterations=iterations, device="cpu")
     return prepare(request, ignore, lambda line: None)
 
 
@@ -238,36 +237,31 @@ def test_takes_that_do_not_fit(
     assert read_run(parent).takes == ()
 
 
-def benchmark() -> Any:
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> Any:
     """benchmarks/extend.py, which is no part of the package."""
-    path = Path(__file__).resolve().parents[2] / "benchmarks" / "extend.py"
-    spec = importlib.util.spec_from_file_location("extend_benchmark", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "benchmarks")
+    return importlib.import_module("extend")
 
 
-def test_the_benchmark_compares_equal_effects(takes: tuple[Path, Path], parent: Path) -> None:
+def test_the_benchmark_compares_equal_effects(benchmark: Any, takes: tuple[Path, Path], parent: Path) -> None:
     """Catches an extension that wins because training anew goes without an effect that began with the take."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
     settings = replace(prepared.run.settings, strain_color=True, driven_offsets=("strain_position",))
-    arms = benchmark().extend_arms(replace(prepared, run=replace(prepared.run, settings=settings)), 0)
+    arms = benchmark.extend_arms(replace(prepared, run=replace(prepared.run, settings=settings)), 0)
     assert (arms["anew"].settings.strain_color, arms["anew"].settings.driven_offsets) == (True, ("strain_position",))
     plain = arms["all-in-turn-plain"].settings
     assert (plain.strain_color, plain.driven_offsets) == (True, ())  # as the parent
 
 
-def test_the_benchmark_shows_what_the_old_take_pays() -> None:
+def test_the_benchmark_shows_what_the_old_take_pays(benchmark: Any) -> None:
     """Catches a summary that praises what the new take gains and is silent about the old one."""
     first = {"psnr_take_1": 40.0, "psnr_moving_take_1": 39.0, "psnr_take_2": 35.0, "psnr_moving_take_2": 30.0}
     last = {"psnr_take_1": 39.5, "psnr_moving_take_1": 37.0, "psnr_take_2": 39.0, "psnr_moving_take_2": 36.0}
     lines = [{**values, "psnr": 37.0, "seconds": 10.0 * n} for n, values in enumerate((first, last))]
     rows = [
         [cell.strip() for cell in row.strip("|").split("|")]
-        for row in benchmark().differences({"extend": [lines], "anew": [[lines[1]]]})
+        for row in benchmark.differences({"extend": [lines], "anew": [[lines[1]]]})
         if row.startswith("|")
     ]
     assert rows[0] == ["over before", "new take", "where it moves", "old take", "where it moves"]

@@ -14,7 +14,7 @@ from stga_addon.capture.model import evenly_spread
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.residuals import Residuals
 from stga_addon.training.optimize.frames import CACHED_TIMESTEPS
-from stga_addon.training.optimize.initial_colors import MAX_LATER_TIMESTEPS
+from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import session
 from stga_addon.training.run.loop import train
 

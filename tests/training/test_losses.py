@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from raster.reference import image_loss
 
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
 from stga_addon.raster.cpu.layout import TILE
-from stga_addon.raster.reference import image_loss
 from stga_addon.training.optimize.losses import image_gradient, mean_ssim, tile_rectangles, whole_image
 
 # float32 variances (differences of blurred squares) over C2 = 9e-4: about 1e-7 / 9e-4, times a few.

@@ -4,7 +4,7 @@ import csv
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,10 +12,10 @@ from ...batch.plan import MAX_JOBS, Plan
 from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
+from ...report.charts import finish_axes, psnr_axes
 from ...report.run_summary import evaluation_share
 from ...requests.values import Benchmark
 from ...schema import to_json
-from .chart import benchmark_chart
 from .statistics import (
     MeanCurve,
     Outcome,
@@ -28,6 +28,9 @@ from .statistics import (
     within_spread,
 )
 from .variants import STANDARD, variants_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MEMORY_GB = 1.0
 """Of a variant's process; all variants of a slice have one at the same time."""
@@ -192,3 +195,19 @@ def _write_csv(path: Path, outcomes: Sequence[Outcome]) -> None:
         writer = csv.DictWriter(stream, names)
         writer.writeheader()
         writer.writerows(rows)
+
+
+def benchmark_chart(curves: Mapping[str, MeanCurve], title: str) -> "Figure":
+    """One curve per variant with the range over its seeds; the Pareto front is bold."""
+    figure, axes = psnr_axes(title)
+    front = pareto_front(curves)
+    for name, curve in curves.items():
+        (line,) = axes.plot(curve.seconds, curve.mean, label=name)
+        color = line.get_color()
+        axes.fill_between(curve.seconds, curve.low, curve.high, color=color, alpha=0.2, linewidth=0)
+        for best, start, end in front:
+            if best == name:
+                shown = (curve.seconds >= start) & (curve.seconds <= end)
+                axes.plot(curve.seconds[shown], curve.mean[shown], color=color, linewidth=4)
+    finish_axes(axes)
+    return figure

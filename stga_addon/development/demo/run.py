@@ -2,6 +2,7 @@
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,6 +13,8 @@ from tqdm import tqdm
 
 from ...avatar.embedding import to_world
 from ...avatar.file import Avatar, read_avatar
+from ...avatar.splats import SH_C0
+from ...capture.camera import Camera
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
@@ -28,7 +31,6 @@ from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import AVATAR, RUN
 from ...training.settings import make_settings
 from .capture import CaptureOptions, make_capture
-from .pictures import selection_picture, side_by_side
 
 SEED = 0
 POSES_PER_SECOND = 1.5
@@ -58,7 +60,7 @@ def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | Non
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
-    metrics = _measure(capture, avatar)
+    metrics = {split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")}
     write_json(out / "metrics.json", {**metrics, "splats": len(avatar.splats), "blender_position_error_m": error})
     for split, values in metrics.items():
         fitted = f" (exposure fitted; {values['psnr_unmatched']:.2f} without)" if "psnr_unmatched" in values else ""
@@ -165,5 +167,21 @@ def _save(path: Path, pixels: np.ndarray) -> None:
         Image.fromarray(pixels).save(partial, format="PNG")
 
 
-def _measure(capture: Capture, avatar: Avatar) -> dict[str, dict[str, float]]:
-    return {split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")}
+def selection_picture(avatar: Avatar, mesh: np.ndarray, camera: Camera, selected: np.ndarray) -> np.ndarray:
+    """The avatar with splats of selected triangles in color and all others gray; (3, H, W) float32 on white.
+
+    mesh (V, 3) drives the avatar; selected (F,) bool.
+    """
+    splats, gray = avatar.splats, ~selected[avatar.splats.face]
+    sh = splats.sh.copy()
+    luminance = 0.5 + SH_C0 * sh[:, 0] @ np.array([0.299, 0.587, 0.114], np.float32)
+    sh[gray] = 0
+    sh[gray, 0] = ((0.25 + 0.4 * luminance[gray]) - 0.5)[:, None] / SH_C0
+    return render_avatar(replace(avatar, splats=replace(splats, sh=sh)), mesh, camera)
+
+
+def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
+    """Pictures (H, W, 3) uint8 of one height in a row, with a white gap of six pixels between them."""
+    gap = np.full((len(pictures[0]), 6, 3), 255, np.uint8)
+    spaced = [part for picture in pictures for part in (picture, gap)]
+    return np.concatenate(spaced[:-1], axis=1)

@@ -7,38 +7,11 @@ from functools import cache
 from pathlib import Path
 
 PLAYER = Path(__file__).parent / "player"
-MODULES = (
-    "vector.js",
-    "strain.js",
-    "signals.js",
-    "data.js",
-    "performance.js",
-    "rotation.js",
-    "shapes.js",
-    "motion.js",
-    "rig.js",
-    "face_frames.js",
-    "depth_sort.js",
-    "harmonics.js",
-    "lighting.js",
-    "bounce.js",
-    "surface.js",
-    "shaders.js",
-    "likeness.js",
-    "light_shaders.js",
-    "gl.js",
-    "camera.js",
-    "lashes.js",
-    "light_pass.js",
-    "renderer.js",
-    "player.js",
-    "controls.js",
-    "stga-avatar.js",
-)
-"""Modules of the custom element, each after those that it imports."""
+ELEMENT = "stga-avatar.js"
+"""Module of the custom element."""
 PAGE_MODULES = "light_controls.js", "page.js"
 """Those of the page around it."""
-IMPORT = re.compile(r"^import\b[^;]*?'\./[\w-]+\.js';\n", re.MULTILINE)
+IMPORT = re.compile(r"^import\b[^;]*?'\./([\w-]+\.js)';\n", re.MULTILINE)
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
 TYPES = re.compile(
     r"^// @ts-check\n|^ */\*\*\n(?: *\* @.*\n)+ *\*/\n|^ */\*\* @.*\*/\n|^ *\* @.*\n|/\*\* @type \{.*?\} \*/ ",
@@ -50,9 +23,16 @@ TYPES = re.compile(
 @cache
 def element_script() -> str:
     """The custom element as one module: the player's files without their imports and exports, under their licence."""
-    sources = [EXPORT.sub("", _source(name)) for name in MODULES]
+    sources = [EXPORT.sub("", _source(name)) for name in modules()]
     licence = (PLAYER / "LICENSE").read_text(encoding="utf-8")
     return "/*!\n" + licence + "*/\n" + "\n".join(sources)
+
+
+@cache
+def modules(name: str = ELEMENT) -> tuple[str, ...]:
+    """A module after all that it imports, each once."""
+    imported = IMPORT.findall((PLAYER / name).read_text(encoding="utf-8"))
+    return tuple(dict.fromkeys([*(each for other in imported for each in modules(other)), name]))
 
 
 def _source(name: str) -> str:

@@ -21,7 +21,7 @@ from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer
 from ..gpu.shaders import MIN_ALPHA
 from ..layers import SceneLayer
-from . import engine_panels, redraw
+from . import redraw
 from .camera import render_camera
 from .composite import combined, scene_background
 from .engine_viewport import EngineViewport
@@ -36,6 +36,9 @@ VIEW_TRANSFORM_UNKNOWN = (
 )
 
 _rasterizer = Rasterizer(lambda: "", lambda: "auto")
+
+# Those that are for some engines only and apply to this one too.
+SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")
 
 
 class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -166,12 +169,35 @@ def register(find_python: Callable[[], str], find_device: Callable[[], str] = la
     _rasterizer = Rasterizer(find_python, find_device)
     bpy.utils.register_class(SplatsEngine)
     bpy.app.handlers.render_pre.append(_before_render)
-    engine_panels.add_engine()
+    add_engine()
 
 
 def unregister() -> None:
-    engine_panels.remove_engine()
+    remove_engine()
     bpy.app.handlers.render_pre.remove(_before_render)
     bpy.utils.unregister_class(SplatsEngine)
     redraw.stop()
     _rasterizer.client.close()
+
+
+def add_engine() -> None:
+    for panel in _shared_panels():
+        panel.COMPAT_ENGINES.add(ENGINE)
+
+
+def remove_engine() -> None:
+    for panel in _panels_by_engine():
+        panel.COMPAT_ENGINES.discard(ENGINE)
+
+
+def _panels_by_engine() -> list[Any]:
+    """The panels that list the engines they are for."""
+    return [panel for panel in bpy.types.Panel.__subclasses__() if hasattr(panel, "COMPAT_ENGINES")]
+
+
+def _shared_panels() -> list[Any]:
+    return [
+        panel
+        for panel in _panels_by_engine()
+        if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in SHARED_PANELS
+    ]

@@ -1,6 +1,6 @@
 """The splats of a scene's visible objects, posed at its frame: what the GPU display and the render engine draw."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import bpy
@@ -19,7 +19,6 @@ from ..display.splat_object import display_settings, get_input, splat_modifier, 
 from ..layers import SceneLayer
 from ..light.scene_light import SceneLight
 from ..vertex_groups import frame_selection
-from ..visible import visible_objects
 
 
 class SplatCache:
@@ -76,12 +75,45 @@ def visible_layers(
     view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects.
     Raises StgaError where the head of an object is gone or has other triangles than its splats.
     """
-    shown = list(visible_objects(depsgraph, view))
+    shown = list(_visible_objects(depsgraph, view))
     return [
         _layer(visible, matrix, depsgraph, cache, shown)
         for visible, matrix in shown
         if visible.get(tags.KIND) == tags.SPLATS and is_wanted(visible)
     ]
+
+
+def _visible_objects(depsgraph: Any, view: Any) -> Iterator[tuple[Any, Matrix]]:
+    """Objects that viewports or final images show, with their world matrices; members of an instanced collection once
+    per instance.
+
+    view: the 3D viewport (a SpaceView3D) that shows them, None for a final image.
+    """
+    if view is None:
+        visible = _rendered_objects(depsgraph.view_layer.layer_collection)
+    else:
+        visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
+    for each in visible:
+        yield from _with_instances(each, depsgraph, Matrix())
+
+
+def _rendered_objects(layer: Any) -> list[Any]:
+    """The objects of a layer collection and its children that final images show, each once."""
+    if layer.exclude or layer.collection.hide_render:
+        return []
+    own = [candidate for candidate in layer.collection.objects if not candidate.hide_render]
+    return list(dict.fromkeys([*own, *(each for child in layer.children for each in _rendered_objects(child))]))
+
+
+def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iterator[tuple[Any, Matrix]]:
+    matrix = parent_matrix @ visible.evaluated_get(depsgraph).matrix_world
+    yield visible, matrix
+    collection = visible.instance_collection if visible.instance_type == "COLLECTION" else None
+    if collection is not None:
+        inside = matrix @ Matrix.Translation(-collection.instance_offset)
+        for member in collection.all_objects:
+            if not member.hide_render:
+                yield from _with_instances(member, depsgraph, inside)
 
 
 def _layer(

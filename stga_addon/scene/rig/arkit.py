@@ -72,8 +72,8 @@ def remove_controls(head: Any, rig: Any) -> None:
     """Remove the controls with their drivers and keyframes: expressions, jaw and eyes play their own again."""
     remove_drivers(head, rig)
     if rig.animation_data is not None and rig.animation_data.action is not None:
-        curves = action_curves(rig)
-        for curve in [curve for curve in curves if is_control_path(curve.data_path)]:
+        curves, controls = action_curves(rig), control_paths().values()
+        for curve in [curve for curve in curves if curve.data_path in controls]:
             curves.remove(curve)
     for name in ARKIT_SHAPES:
         rig.pop(name, None)
@@ -89,11 +89,6 @@ def remove_drivers(head: Any, rig: Any) -> None:
             if driver.data_path == property_path(SUMS) or any(path.startswith(property_path(SUMS)) for path in targets):
                 owner.animation_data.drivers.remove(driver)
     del rig[SUMS]
-
-
-def is_control_path(data_path: str) -> bool:
-    """Whether an f-curve of the rig animates one of the controls."""
-    return any(data_path == property_path(name) for name in ARKIT_SHAPES)
 
 
 def shape_key_names(head: Any) -> dict[int, str]:

@@ -70,7 +70,8 @@ def add_rig(
     model = sequence.model
     basis = shaped_vertices(model, sequence.shape, np.zeros(model.n_expression), sequence.static_offset)
     sliders = slider_components(model)
-    directions = _joint_directions(model, list(sliders.values()))
+    # (5, 3, K): how far each component of the shape moves each joint.
+    directions = np.einsum("jv,vck->jck", model.j_regressor, model.shapedirs[:, :, list(sliders.values())])
     has_offsets = any(frame.dynamic_offset is not None for frame in frames)
     displaced = [has_offsets or any(_significant_terms(direction)) for direction in directions]
     _remove_bone_groups(head, _rigs(head))
@@ -225,11 +226,6 @@ def _add_offset_keys(
         _new_shape_key(head, offset_key(timestep), vertices, 1.0)
     for name in JOINTS:
         rig[offset_property(name)] = [0.0] * 3
-
-
-def _joint_directions(model: FlameModel, components: Sequence[int]) -> np.ndarray:
-    """(5, 3, K): how far each component of the shape moves each joint."""
-    return np.einsum("jv,vck->jck", model.j_regressor, model.shapedirs[:, :, components])
 
 
 def _significant_terms(directions: np.ndarray) -> list[list[int]]:

@@ -1,6 +1,5 @@
 """Which calibration a footage folder has, and its cameras."""
 
-from collections.abc import Callable
 from os.path import isdir, isfile
 from pathlib import Path
 
@@ -37,15 +36,13 @@ def find_calibration(root: Path) -> Path | None:
     return next(iter(xml + tables + folders), None)
 
 
-def read_calibration(
-    path: Path, principal_point: str | None, image_size: ImageSize
-) -> tuple[list[Shot], tuple[str, ...]]:
+def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tuple[str, ...]]:
     """Shots of a calibration file or folder, and a sentence about cameras that it lists without a pose.
 
-    principal_point: as in `read_nerfstudio`. image_size: size of the images of a label, which RealityCapture does not
-    write. Raises StgaError that names file and field.
+    image_size: size of the images of a label, which RealityCapture does not write. Raises StgaError that names file
+    and field.
     """
-    shots, without_pose = _reader(path, principal_point, image_size)()
+    shots, without_pose = _read(path, image_size)
     if not shots:
         raise StgaError(f"{path}: has no camera with a pose")
     if not without_pose:
@@ -55,30 +52,28 @@ def read_calibration(
     return shots, (f"{path}: left out cameras without a pose: {names}{more}",)
 
 
-def _reader(
-    path: Path, principal_point: str | None, image_size: ImageSize
-) -> Callable[[], tuple[list[Shot], list[str]]]:
+def _read(path: Path, image_size: ImageSize) -> tuple[list[Shot], list[str]]:
     suffix = path.suffix.lower()
     if isdir(path):
         splits = [path / name for name in TRANSFORMS if (path / name).is_file()]
         model = find_colmap(path)
         if splits:
-            return lambda: ([shot for name in splits for shot in read_nerfstudio(name, principal_point)], [])
+            return [shot for name in splits for shot in read_nerfstudio(name)], []
         if model is not None:
-            return lambda: (read_colmap(model), [])
-        return lambda: read_realitycapture_xmp(path.glob("*.xmp"), image_size)
+            return read_colmap(model), []
+        return read_realitycapture_xmp(path.glob("*.xmp"), image_size)
     if not isfile(path):
         raise StgaError(f"{path}: does not exist; expected {EXPECTED}")
     if suffix == ".json":
-        return lambda: (read_nerfstudio(path, principal_point), [])
+        return read_nerfstudio(path), []
     if suffix == ".xml":
-        return lambda: read_metashape(path)
+        return read_metashape(path)
     if suffix == ".csv":
-        return lambda: (read_realitycapture_csv(path, image_size), [])
+        return read_realitycapture_csv(path, image_size), []
     if suffix == ".xmp":
-        return lambda: read_realitycapture_xmp([path], image_size)
+        return read_realitycapture_xmp([path], image_size)
     if suffix in (".bin", ".txt") and find_colmap(path.parent) == path.parent:
-        return lambda: (read_colmap(path.parent), [])
+        return read_colmap(path.parent), []
     raise StgaError(f"{path}: is no calibration; expected {EXPECTED}")
 
 

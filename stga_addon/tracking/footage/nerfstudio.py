@@ -16,17 +16,16 @@ PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def read_nerfstudio(path: Path, principal_point: str | None = None) -> list[Shot]:
-    """Entries of a transforms file; `file_path` is the label.
+def read_nerfstudio(path: Path) -> list[Shot]:
+    """Entries of a transforms file; `file_path` is the label. Raises StgaError.
 
-    principal_point: as in `read_transforms`; None: "vhap" where frames have `timestep_index`, else "opencv".
-    Raises StgaError.
+    Their `cy` means what VHAP's does where frames have `timestep_index`, else what OpenCV's does (`read_transforms`).
     """
     values = read_json(path)
     entries = values.get("frames") if isinstance(values, dict) else None
     entries = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
     timed = any("timestep_index" in entry for entry in entries)
-    frames = read_transforms(path, principal_point or ("vhap" if timed else "opencv"))
+    frames = read_transforms(path, "vhap" if timed else "opencv")
     timed = timed or any("keyframe" in entry for entry in entries)
     folder = path.parent.resolve()
     fps, keeps_world = frame_rate(path, values), values.get("world") == "keep"

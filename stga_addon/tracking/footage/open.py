@@ -43,7 +43,6 @@ def open_footage(
     cameras: Path | None = None,
     frames: FrameRange = ALL_FRAMES,
     focal: float | None = None,
-    principal_point: str | None = None,
     mattes: Path | None = None,
 ) -> Footage:
     """Open footage: cameras and file names now, frames when they are asked for.
@@ -51,29 +50,27 @@ def open_footage(
     path     folder with an image, a folder of images or a video for each camera; or one video
     cameras  calibration file or folder; None: the one in `path` (`find_calibration`)
     focal    focal length in pixels of a single camera without a calibration; None: a guess, and not `calibrated`
-    principal_point  what `cy` means in transforms files, as in `read_transforms`; None: by the file's author
     mattes   folder of masks that stand in for the footage's own, named as its images; those of a video's frames by
              camera and number, counted from 0, as in left/00012.png
     Cameras with a folder or video show sequences; where all have one image, it shows one timestep.
     Raises StgaError in one sentence naming file, field and what was expected, also for a missing image.
     """
     sources, root = _sources(path)
-    footage = _open(path, root, sources, cameras, frames, focal, principal_point)
+    footage = _open(path, root, sources, cameras, frames, focal)
     plated = tuple(replace(camera, plate=sources.plates.get(camera.name)) for camera in footage.cameras)
     footage = replace(footage, cameras=plated)
     return footage if mattes is None else with_masks(footage, sources, mattes)
 
 
 def _open(
-    path: Path, root: Path, sources: Sources, cameras: Path | None, frames: FrameRange, focal: float | None,
-    principal_point: str | None,
-) -> Footage:  # fmt: skip
+    path: Path, root: Path, sources: Sources, cameras: Path | None, frames: FrameRange, focal: float | None
+) -> Footage:
     calibration = cameras if cameras is not None else find_calibration(root) if isdir(path) else None
     if calibration is None:
         return _single_camera(root, sources, frames, focal)
     if focal is not None:
         raise StgaError(f"{calibration}: has focal lengths; expected none besides")
-    shots, warnings = read_calibration(calibration, principal_point, partial(_image_size, sources))
+    shots, warnings = read_calibration(calibration, partial(_image_size, sources))
     found = _calibrated(root, sources, calibration, shots, frames)
     warnings = (*warnings, *found.warnings)
     return replace(found, keeps_world=all(shot.keeps_world for shot in shots), warnings=warnings)

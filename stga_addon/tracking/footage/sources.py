@@ -85,7 +85,7 @@ def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
     calibrated with, where no other camera's lies there.
     """
     labels = list(labels)
-    parents = [_parent(label) for label in labels]
+    parents = [_stem(label).rpartition("/")[0] for label in labels]
     found = []
     for label, parent in zip(labels, parents, strict=True):
         names = _tails(label)
@@ -143,10 +143,6 @@ def _stem(label: str) -> str:
     path = PurePosixPath(label.replace("\\", "/"))
     known = path.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
     return (path.with_suffix("") if known else path).as_posix()
-
-
-def _parent(label: str) -> str:
-    return _stem(label).rpartition("/")[0]
 
 
 def _tails(label: str) -> list[str]:

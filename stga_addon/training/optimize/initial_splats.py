@@ -1,16 +1,34 @@
 """The splats that training starts with."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_frames, to_world
 from ...avatar.lattice import lattice_splats
 from ...avatar.splats import ADDED, SH_C0, Splats, joined
-from ...capture.model import Capture
+from ...capture.images import read_view
+from ...capture.mesh_geometry import connected_parts
+from ...capture.mesh_raster import rasterize
+from ...capture.model import Capture, View, evenly_spread
 from ..settings import TrainingSettings
 from .hull_points import flat_points, hull_points, in_image
-from .initial_colors import triangle_colors
+
+SAMPLED_HEIGHT_PIXELS = 400
+"""Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
+MASK_EDGE_PIXELS = 3
+"""Along the mask's edge, colors are mixed with the background."""
+MAX_LATER_TIMESTEPS, MAX_LATER_VIEWS = 6, 2
+"""Further timesteps that are read, and views of each."""
+MIDDLE_GRAY = 0.5
+MIN_ONE_SIDED_SHARE = 0.05
+"""Area of the triangles that no view shows, but whose mirror images are shown, as a share of the mesh: below it, the
+cameras stand on both sides of the head."""
+MAX_ASYMMETRY_SHARE = 0.015
+"""Median distance of the mesh from its mirror image, as a share of its diagonal, beyond which it is not symmetric."""
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
@@ -55,3 +73,83 @@ def teeth_triangles(capture: Capture) -> np.ndarray:
     """(F,) bool: the triangles of the rows of teeth added to FLAME's mesh; none in any other mesh."""
     masks = {} if capture.flame is None else capture.flame.model.masks
     return np.asarray(np.isin(capture.faces, masks.get("teeth", ())).all(axis=1))
+
+
+def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
+    """Mean color (F, 3) from 0 to 1 of each triangle in the first view's timestep or, if hidden there, in later ones.
+
+    Teeth that the lips hide at first have their own color, not that of the lips. Where cameras stand on one side of the
+    head only, a triangle of the other side has the color of its mirror image. Any other that no view shows has the
+    color of the nearest one of the neutral mesh that is connected with it: the back of a head that is seen from the
+    front has the color of its sides. Where all connected ones are hidden too, as a back tooth, it is the nearest of
+    those that only later timesteps show or, without any, of all. Gray if no view shows any.
+    """
+    first = views[0].timestep
+    color, seen = _mean_colors(capture, [view for view in views if view.timestep == first])
+    late_color, late = _mean_colors(capture, _later_views([view for view in views if view.timestep != first]))
+    late &= ~seen
+    color[late] = late_color[late]
+    shown = seen | late
+    if not shown.any():
+        return np.full(color.shape, MIDDLE_GRAY)
+    hidden, mirrored = _other_side(capture, shown)
+    color[hidden], shown[hidden] = color[mirrored], True
+    return np.asarray(color[_nearest_shown(capture, shown, late if late.any() else shown)])
+
+
+def _later_views(views: Sequence[View]) -> list[View]:
+    """A few views of timesteps that are evenly spread, by other cameras in each."""
+    timesteps = sorted({view.timestep for view in views})
+    chosen: list[View] = []
+    for n, timestep in enumerate(evenly_spread(timesteps, MAX_LATER_TIMESTEPS)):
+        at_once = [view for view in views if view.timestep == timestep]
+        step = -(-len(at_once) // MAX_LATER_VIEWS)
+        chosen += at_once[n % step :: step]
+    return chosen
+
+
+def _mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean color (F, 3) from 0 to 1 of each triangle in the views, and (F,) bool whether any shows it."""
+    total, count = np.zeros((len(capture.faces), 3)), np.zeros(len(capture.faces))
+    for view in views:
+        small, image, mask = read_view(view, min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height))
+        triangle, _ = rasterize(capture.mesh(view.timestep), capture.faces, small.camera)
+        shown = triangle >= 0
+        if mask is not None:
+            shown &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
+        pixels, found = image[shown], triangle[shown]
+        count += np.bincount(found, minlength=len(count))
+        for channel in range(3):
+            total[:, channel] += np.bincount(found, pixels[:, channel], len(count))
+    return total / np.maximum(count, 1)[:, None] / 255, count > 0
+
+
+def _other_side(capture: Capture, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles that are not `shown` (F,) bool but whose mirror images are, and these; none where they are few, or the
+    mesh is not symmetric."""
+    none = np.zeros(0, int)
+    corners = capture.neutral[capture.faces]
+    centers, edges = corners.mean(1), corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    across = centers * [-1, 1, 1] + [2 * centers[:, 0].mean(), 0, 0]
+    distance, partner = cKDTree(centers).query(across)
+    hidden = np.flatnonzero(~shown & shown[partner])
+    if np.median(distance) > MAX_ASYMMETRY_SHARE * np.linalg.norm(np.ptp(capture.neutral, axis=0)):
+        return none, none
+    if area[hidden].sum() < MIN_ONE_SIDED_SHARE * area.sum():
+        return none, none
+    return hidden, partner[hidden]
+
+
+def _nearest_shown(capture: Capture, shown: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(F,) the nearest triangle that is `shown` of those connected with each or, if none is, the nearest of `others`.
+
+    shown, others (F,) bool.
+    """
+    centers = capture.neutral[capture.faces].mean(1)
+    nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
+    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
+    for number in np.unique(part[shown]):
+        members, known = np.flatnonzero(part == number), np.flatnonzero((part == number) & shown)
+        nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
+    return np.asarray(nearest)

@@ -3,6 +3,10 @@
 import logging
 import math
 import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -17,7 +21,6 @@ from ..evaluate.metrics import peak_memory_mb
 from ..optimize.precompile import precompile_kernels
 from .checkpoint import read_selection
 from .folder import AVATAR, CHECKPOINT, SELECTION, Run, has_run, locked, read_run
-from .interrupts import interrupt_requests
 from .metrics_log import append_metrics
 from .open_run import check_identity
 from .progress import Progress, Report
@@ -199,3 +202,27 @@ class _Loop:
             session.avatar,
             self.evaluator.psnr_unmatched,
         )
+
+
+@contextmanager
+def interrupt_requests() -> Iterator[list[int]]:
+    """A list that receives the first Ctrl-C; the second one raises KeyboardInterrupt.
+
+    Without effect off the main thread and in Blender, which handles Ctrl-C itself.
+    """
+    requests: list[int] = []
+
+    def request(number: int, _frame: object) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield requests
+        return
+    signal.signal(signal.SIGINT, request)
+    try:
+        yield requests
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

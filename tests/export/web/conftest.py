@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from avatar.conftest import random_splats
 
+from export.web.browser import Browser, find_browser
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
-from stga_addon.development.browser import Browser, find_browser
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.export.playback import Playback, ShapeControls
 from stga_addon.export.web.data_file import data_file

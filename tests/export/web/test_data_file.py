@@ -10,7 +10,7 @@ from stga_addon.errors import StgaError
 from stga_addon.export.playback import Playback
 from stga_addon.export.web import data_file
 from stga_addon.export.web.container import FixedPoint, pack
-from stga_addon.export.web.page import MODULES, PAGE_MODULES, PLAYER, element_script
+from stga_addon.export.web.page import PAGE_MODULES, PLAYER, element_script, modules
 from stga_addon.export.web.rig import BAKE_TOLERANCE_M, baked_rig
 from stga_addon.export.web.write import SCRIPT_NAME, write_web
 
@@ -132,6 +132,6 @@ def test_no_data_without_its_player(head, tmp_path):
 
 def test_every_module_is_in_the_page():
     """Catches a module of the player that is not joined into the page, or an import that is left in it."""
-    assert {path.name for path in PLAYER.glob("*.js")} == {*MODULES, *PAGE_MODULES}
+    assert {path.name for path in PLAYER.glob("*.js")} == {*modules(), *PAGE_MODULES}
     assert "\nimport " not in element_script()
     assert "MIT" in element_script()[:100]

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from export.web.browser import Browser
 from stga_addon.avatar.file import Avatar
 from stga_addon.capture.open import open_capture
-from stga_addon.development.browser import Browser
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
 from stga_addon.export.web.page import page

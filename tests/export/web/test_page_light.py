@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from export.web.browser import Browser
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.light import AvatarLight
 from stga_addon.avatar.splats import Splats
-from stga_addon.development.browser import Browser
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
 from stga_addon.light.bounce import Bounce

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stga_addon.development.browser import Browser
+from export.web.browser import Browser
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT

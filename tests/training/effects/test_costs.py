@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from raster import reference
 
 from stga_addon.capture.images import read_view
 from stga_addon.capture.model import View
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
-from stga_addon.raster import reference
 from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer

@@ -9,9 +9,7 @@ from PIL import Image, ImageDraw
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.training.optimize import initial_colors
-from stga_addon.training.optimize.initial_colors import triangle_colors
-from stga_addon.training.optimize.initial_splats import initial_splats
+from stga_addon.training.optimize.initial_splats import initial_splats, triangle_colors
 from stga_addon.training.settings import make_settings
 
 from .scenes import own_colors
@@ -63,7 +61,7 @@ def test_cameras_on_both_sides_mirror_nothing(painted, monkeypatch):
     """Catches colors of one side on the other where cameras see both."""
     capture = painted()
     colors = triangle_colors(capture, capture.views["train"])
-    monkeypatch.setattr(initial_colors, "MIN_ONE_SIDED_SHARE", 2.0)
+    monkeypatch.setattr("stga_addon.training.optimize.initial_splats.MIN_ONE_SIDED_SHARE", 2.0)
     np.testing.assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
 
 

@@ -1,6 +1,8 @@
 // @ts-check
 // Light that a head reflects onto itself. The rules are those of STGA for Blender's light/bounce.py.
 
+import { box } from './vector.js';
+
 /** @import { Values } from './types.js' */
 
 const CELL_M = 0.02;
@@ -30,12 +32,7 @@ export class Bounce {
 
   /** @param {Values} neutral */
   placeInCells(neutral) {
-    const low = [Infinity, Infinity, Infinity];
-    const high = [-Infinity, -Infinity, -Infinity];
-    for (let k = 0; k < neutral.length; k++) {
-      low[k % 3] = Math.min(low[k % 3], neutral[k]);
-      high[k % 3] = Math.max(high[k % 3], neutral[k]);
-    }
+    const [low, high] = box(neutral);
     const place = (/** @type {number} */ value, /** @type {number} */ axis) =>
       Math.floor((value - low[axis]) / CELL_M) + 1;
     const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);

@@ -3,7 +3,7 @@
 
 /** @import { Camera, Vector, View } from './types.js' */
 
-import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
+import { box, crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
 const MAX_ELEVATION = 1.54; // radians; short of the pole, where "up" has no direction
 const MIN_DISTANCE_M = 0.02;
@@ -63,14 +63,7 @@ export function frontCamera(points, up) {
  * @returns {[Vector, number]}
  */
 export function bounds(points) {
-  /** @type {Vector} */
-  const low = [Infinity, Infinity, Infinity];
-  /** @type {Vector} */
-  const high = [-Infinity, -Infinity, -Infinity];
-  for (let k = 0; k < points.length; k++) {
-    low[k % 3] = Math.min(low[k % 3], points[k]);
-    high[k % 3] = Math.max(high[k % 3], points[k]);
-  }
+  const [low, high] = box(points);
   const diagonal = difference(high, low);
   return [difference(high, scaled(diagonal, 0.5)), Math.hypot(...diagonal) / 2];
 }

@@ -57,7 +57,7 @@ export function tailColor(harmonics, strains, direction = 'uToWorld * center', b
 }
 
 /**
- * The limits and constants are those of the renderer that trained the splats (raster/reference.py).
+ * The limits and constants are those of the kernels that trained the splats (raster/cpu).
  * @param {number} harmonics
  * @param {number} strains
  * @param {boolean} [isLit] whether colors come from the light pass

@@ -46,3 +46,20 @@ export function scaled(v, factor) {
 export function unit(v) {
   return scaled(v, 1 / Math.hypot(v[0], v[1], v[2]));
 }
+
+/**
+ * Least and largest coordinates of points (3·V).
+ * @param {ArrayLike<number>} points
+ * @returns {[Vector, Vector]}
+ */
+export function box(points) {
+  /** @type {Vector} */
+  const low = [Infinity, Infinity, Infinity];
+  /** @type {Vector} */
+  const high = [-Infinity, -Infinity, -Infinity];
+  for (let k = 0; k < points.length; k++) {
+    low[k % 3] = Math.min(low[k % 3], points[k]);
+    high[k % 3] = Math.max(high[k % 3], points[k]);
+  }
+  return [low, high];
+}

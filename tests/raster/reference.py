@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, normalize
 
-from ..avatar.embedding import FaceFrames
-from ..capture.camera import Camera
+from stga_addon.avatar.embedding import FaceFrames
+from stga_addon.capture.camera import Camera
 
 MAX_ALPHA = 0.999
 MIN_ALPHA = 1 / 255
