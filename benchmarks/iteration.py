@@ -42,11 +42,12 @@ from stga_addon.raster.cpu.rasterize import (
     frames_in_camera,
     render_backward,
     render_forward,
+    sort_by_depth,
     tile_grid,
     with_strain_color,
 )
 from stga_addon.raster.cpu.threads import next_piece, parallel, threads
-from stga_addon.raster.cpu.tiles import SORT_PARTS, compute_offsets, count_pairs, depth_order, fill_pairs
+from stga_addon.raster.cpu.tiles import SORT_PARTS, arrange_tiles, count_pairs, fill_pairs, sum_tiles
 from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch
@@ -167,14 +168,15 @@ def stages(
     parameters, face = with_strain_color(state.arrays()), state.face.numpy()
     gradients = with_strain_color(Parameters(*(g.numpy() for g in state.gradients)))
     r = render_forward(parameters, face, frames, 3, background, buffers=buffers)
-    lists, columns, (_, depth, _, rect) = r.lists, r.projection.columns, r.projection
-    first_pair, pairs, rows = lists.first_pair, lists.pairs, lists.visible
-    everything, everywhere = np.arange(n), np.ones((tiles_y, tiles_x), bool)
-    order, count = depth_order(depth, rows), len(lists.pair_splat)
+    lists, columns, rect = r.lists, r.projection.columns, r.projection.rect
+    rows = lists.visible
+    everything, everywhere = np.arange(n), sum_tiles(np.ones((tiles_y, tiles_x), bool))
+    _, order, first_pair, *_ = sort_by_depth(r.projection, BufferPool())
+    count = len(lists.pair_splat)
     counts = np.empty((SORT_PARTS, tiles_x * tiles_y), np.int32)
-    count_pairs(rect, order, tiles_x, counts, pairs)
+    count_pairs(rect, order, tiles_x, counts)
     places = counts.copy()
-    compute_offsets(rows, pairs, places, first_pair)
+    arrange_tiles(places, r.tile_rows)
     v_image, screen_gradient = np.empty_like(r.image), np.empty(n, np.float32)
     bands = whole_image(height, width)
     zero, wanted = np.zeros_like(r.transmittance), np.ones(n, bool)
@@ -184,9 +186,9 @@ def stages(
             lambda: project_forward(everything, everywhere, parameters, face, frames, 3, False, False, r.projection),
             n * (59 + 16) * 4,
         ),
-        "sort by depth": (lambda: depth_order(depth, rows), len(rows) * 6 * 8),
-        "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts, pairs), n * 24),
-        "compute offsets": (lambda: compute_offsets(rows, pairs, counts.copy(), first_pair), counts.nbytes + n * 8),
+        "sort by depth": (lambda: sort_by_depth(r.projection, buffers), n * 36 + len(rows) * 44),
+        "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts), n * 20),
+        "arrange tiles": (lambda: arrange_tiles(counts.copy(), r.tile_rows), 2 * counts.nbytes),
         "fill pairs": (
             lambda: fill_pairs(rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat),
             count * 8 + n * 24,

@@ -18,6 +18,7 @@ from stga_addon.raster.cpu.layout import PRECISION_X, PRECISION_Y, PROJECTED, Ca
 from stga_addon.raster.cpu.project import project_backward as cpu_backward
 from stga_addon.raster.cpu.project import project_forward as cpu_forward
 from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, new_projection, tile_grid
+from stga_addon.raster.cpu.tiles import sum_tiles
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.frames import Embedding
 from stga_addon.raster.gpu.layout import HIDDEN, VIEW, splat_rows, split_rows
@@ -90,7 +91,7 @@ def case_of(scene: Scene, strains: int = STRAIN_COMPONENTS, **options: Any) -> C
 
 def cpu_projection(case: Case):
     projection = new_projection(len(case.face), BufferPool())
-    everywhere = np.ones(tile_grid(case.camera.width, case.camera.height)[::-1], bool)
+    everywhere = sum_tiles(np.ones(tile_grid(case.camera.width, case.camera.height)[::-1], bool))
     cpu_forward(
         np.arange(len(case.face)), everywhere, case.splats, case.face, case.frames, case.degree, case.depth_as_color,
         case.antialiased, projection,

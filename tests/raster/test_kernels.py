@@ -316,6 +316,24 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
         np.testing.assert_array_equal(getattr(gradients, name)[focus], getattr(expected, name)[focus], err_msg=name)
 
 
+def test_bounds_of_frozen_splats_end_at_rendered_tiles():
+    """Catches pairs with tiles that a local iteration does not render, which cost sorting, and a splat that loses one
+    that it does."""
+    scene = cloud(21, count=900, size=(100, 70), log_scale=-2.5)
+    focus = np.linalg.norm(scene.splats["xyz"] - scene.splats["xyz"][3], axis=1) < 0.3
+    full, part = raw_gradients(scene)[0], raw_gradients(scene, focus=focus, reach=10)[0]
+    rendered = np.zeros(part.touched.shape, bool)
+    rendered.flat[part.tiles] = True
+    shrunk = 0
+    for i in np.flatnonzero(~focus):
+        x0, y0, x1, y1 = full.projection.rect[i]
+        y, x = np.nonzero(rendered[y0:y1, x0:x1])
+        expected = [x0 + x.min(), y0 + y.min(), x0 + x.max() + 1, y0 + y.max() + 1] if len(x) else [0] * 4
+        np.testing.assert_array_equal(part.projection.rect[i], expected)
+        shrunk += 0 < len(x) < (x1 - x0) * (y1 - y0)
+    assert shrunk > 10
+
+
 def test_rows_out_of_focus_are_not_written():
     """Catches a backward pass that touches, or zeroes, the gradient rows of frozen splats."""
     scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)

@@ -14,14 +14,13 @@ from .rasterize import (
     BLACK_BACKGROUND,
     BufferPool,
     frames_in_camera,
-    heaviest_first,
     new_image,
     new_projection,
     sort_into_tiles,
     tile_grid,
     with_strain_color,
 )
-from .tiles import whole_tiles
+from .tiles import sum_tiles, whole_tiles
 
 
 def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
@@ -29,7 +28,7 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
     buffers, begin = BufferPool(), 0
     tiles_x, tiles_y = tile_grid(camera.width, camera.height)
     projection = new_projection(sum(len(layer.splats) for layer in layers), buffers)
-    everywhere = np.ones((tiles_y, tiles_x), bool)
+    everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
     for layer in layers:
         splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
         parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
@@ -38,8 +37,8 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
             camera), splats.sh_degree, False, layer.antialiased, Projection(*(array[rows] for array in projection)),
         )  # fmt: skip
         begin = rows.stop
-    lists, whole = sort_into_tiles(projection, tiles_x, tiles_y, buffers), whole_tiles(tiles_x * tiles_y)
-    tiles = heaviest_first(np.arange(tiles_x * tiles_y, dtype=np.int32), lists)
+    whole = whole_tiles(tiles_x * tiles_y)
+    lists, tiles = sort_into_tiles(projection, tiles_x, whole, buffers)
     blended = new_image(camera.width, camera.height, lists, buffers)
     blend_forward(tiles, tiles_x, whole, lists, projection, BLACK_BACKGROUND, blended)
     rgb, alpha = blended.image, 1 - blended.transmittance

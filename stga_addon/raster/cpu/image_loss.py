@@ -7,7 +7,7 @@ maps never reach main memory.
 
 import numpy as np
 
-from . import inline_jit, kernel_jit, part_jit
+from . import inline_jit, jit, kernel_jit, part_jit
 from .threads import next_piece, parallel
 
 WINDOW_RADIUS_PX = 5
@@ -130,7 +130,7 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
 
     image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
     1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, for the
-    rows of all rectangles one after the other, sums (3, rows, 2): Σ |difference| and Σ SSIM over a row's pixels, by
+    rows of all rectangles one after the other, sums (2, 3, rows): Σ |difference| and Σ SSIM over a row's pixels, by
     channel. By row, the sums do not depend on how an image is cut into bands.
     """
     height, width = image.shape[1], image.shape[2]
@@ -188,7 +188,7 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                         beyond = plane * stride + PADDING_PX
                         slopes[beyond + span : beyond + padded] = ZERO
                     if y0 <= middle < y1:
-                        sums[c, first_sum + middle, 1] = _sum_row(similarities, x0 - left, x1 - left)
+                        sums[1, c, first_sum + middle] = _sum_row(similarities, x0 - left, x1 - left)
                 for plane in range(3):
                     into = (plane * RING_ROWS + middle % RING_ROWS) * stride
                     if inside:
@@ -206,8 +206,24 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                     image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
                     gradient[c, out],
                 )  # fmt: skip
-                sums[c, first_sum + out, 0] = absolute
+                sums[0, c, first_sum + out] = absolute
         first_job, past_job = next_piece(work)
+
+
+@jit
+def add_up(sums):
+    """Of sums (2, 3, rows) float64 the two over all rows and channels. Not by numpy, whose code memory has to bring
+    anew after each kernel: six times as long."""
+    return _total(sums[0]), _total(sums[1])
+
+
+@part_jit
+def _total(sums):
+    total = 0.0
+    for c in range(sums.shape[0]):
+        for n in range(sums.shape[1]):
+            total += sums[c, n]
+    return total
 
 
 @parallel(lambda image, *_: len(image), piece=16)

@@ -138,7 +138,7 @@ def scale_limit(
     """
     sums = np.empty(-(-len(rows) // ROWS_PER_SUM))
     sum_excess_scale(sums, rows, log_scale, face, unbound, limits)
-    norm = math.sqrt(sums.sum())
+    norm = math.sqrt(math.fsum(sums.tolist()))
     if norm > 0.0:
         add_excess_scale(rows, log_scale, face, unbound, limits, np.float32(weight / norm), gradient)
     return norm

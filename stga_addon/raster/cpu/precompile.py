@@ -26,11 +26,12 @@ from .rasterize import (
     frames_in_camera,
     new_image,
     new_projection,
+    sort_by_depth,
     sort_into_tiles,
     tile_grid,
     with_strain_color,
 )
-from .tiles import depth_order, find_needed_rows, whole_tiles
+from .tiles import find_needed_rows, split_splats, sum_tiles, whole_tiles
 
 SIZE = 16
 """Width and height of the image, in pixels: one tile."""
@@ -70,15 +71,18 @@ def compile_rasterizer() -> None:
     Two splats that no tile contains: a column of a one-row array is contiguous, which is another type to Numba.
     """
     buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
-    tiles, touched = np.arange(tiles_x * tiles_y, dtype=np.int32), np.ones((tiles_y, tiles_x), bool)
+    tiles, everywhere = np.arange(tiles_x * tiles_y, dtype=np.int32), sum_tiles(np.ones((tiles_y, tiles_x), bool))
     splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
     frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
     face, projection = np.zeros(2, np.int32), new_projection(2, buffers)
-    project_forward(np.arange(2), touched, splats, face, frames, 3, False, False, projection)
+    project_forward(np.arange(2), everywhere, splats, face, frames, 3, False, False, projection)
     projection.rect[:] = 0
+    split_splats(np.ones(2, bool))
     find_needed_rows(projection, np.arange(2), np.float32(0), tiles_x, tiles_y)
-    depth_order(np.arange(1, 3, dtype=np.float32), np.arange(2, dtype=np.int32))
-    lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
+    projection.rect[:, 2:], projection.depth[:] = 1, (1, 2)  # in one tile, behind each other: sorted
+    sort_by_depth(projection, buffers)
+    projection.rect[:] = 0
+    lists, _ = sort_into_tiles(projection, tiles_x, whole_tiles(len(tiles)), buffers)
     blended = new_image(SIZE, SIZE, lists, buffers)
     blend_forward(tiles, tiles_x, whole_tiles(len(tiles)), lists, projection, BLACK_BACKGROUND, blended)
     v_image, v_transmittance = np.zeros((3, SIZE, SIZE), np.float32), np.zeros((SIZE, SIZE), np.float32)

@@ -72,12 +72,23 @@ def _color(b, q, i, coefficients, sh):
 
 
 @part_jit
-def _any_rendered(rendered, x0, y0, x1, y1):
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            if rendered[y, x]:
-                return True
-    return False
+def _count_rendered(covered, x0, y0, x1, y1):
+    """How many tiles within bounds are rendered; covered: see `project_forward`."""
+    return covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0]
+
+
+@part_jit
+def _shrink_bounds(covered, x0, y0, x1, y1):
+    """Bounds of the rendered tiles within bounds, of which there is one at least."""
+    while _count_rendered(covered, x0, y0, x1, y0 + 1) == 0:
+        y0 += 1
+    while _count_rendered(covered, x0, y1 - 1, x1, y1) == 0:
+        y1 -= 1
+    while _count_rendered(covered, x0, y0, x0 + 1, y1) == 0:
+        x0 += 1
+    while _count_rendered(covered, x1 - 1, y0, x1, y1) == 0:
+        x1 -= 1
+    return x0, y0, x1, y1
 
 
 @part_jit
@@ -93,34 +104,44 @@ def _tan_limits(intrinsics, size):
 
 
 @part_jit
-def _mark_seen(rows, rendered, rect, b):
-    """Write `rect` of the block's splats that are not visible, and clear it of the others. Returns how many these are;
-    block.SEEN is 1 for them alone."""
-    count = 0
+def _bound(b, column, q):
+    """One of the block's bounds in tiles; 0 of a splat that is not visible, whose bounds may be no number."""
+    return np.int64(b[column + q] if b[block.SEEN + q] > ZERO else ZERO)
+
+
+@part_jit
+def _list_seen(rows, covered, rect, b, seen):
+    """List the places of the block's visible splats in `seen`, their bounds shrunk to the rendered tiles, and write
+    `rect` of all as of splats that are not. Returns how many are visible.
+
+    Without a branch that depends on which tiles are rendered, but at these tiles' border.
+    """
+    count = np.uint64(0)
     for q in range(np.uint64(len(rows))):
-        i, state = np.uint64(rows[q]), b[block.SEEN + q]
-        if state > ZERO:
-            x0, y0 = np.int32(b[block.X0 + q]), np.int32(b[block.Y0 + q])
-            x1, y1 = np.int32(b[block.X1 + q]), np.int32(b[block.Y1 + q])
-            if _any_rendered(rendered, x0, y0, x1, y1):
-                count += 1
-            else:
-                b[block.SEEN + q] = state = ZERO
-        outside = np.int32(min(ZERO, state))
+        i, outside = np.uint64(rows[q]), np.int32(min(ZERO, b[block.SEEN + q]))
+        x0, y0 = _bound(b, block.X0, q), _bound(b, block.Y0, q)
+        x1, y1 = _bound(b, block.X1, q), _bound(b, block.Y1, q)
+        found = _count_rendered(covered, x0, y0, x1, y1)
         rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = outside
+        seen[count] = q
+        count += np.uint64(found > 0)
+        if found > 0 and found < (x1 - x0) * (y1 - y0):
+            x0, y0, x1, y1 = _shrink_bounds(covered, x0, y0, x1, y1)
+            b[block.X0 + q], b[block.Y0 + q], b[block.X1 + q], b[block.Y1 + q] = x0, y0, x1, y1
     return count
 
 
 @parallel(lambda rows, *_: len(rows), piece=SPLATS_PER_PIECE)
 @kernel_jit
 def project_forward(
-    work, rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection
+    work, rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
 ):  # fmt: skip
     """Write the listed rows of `projection`; the tuples are those of `layout.py`.
 
-    rows (M,): the splats to project. rendered (tiles_y, tiles_x) bool: a splat that reaches none of these tiles counts
-    as not visible. face (N,) int32. degree: of the spherical harmonics used, at most the stored one. Colors follow as
-    many components of strain as both the frames and the splats have.
+    rows (M,): the splats to project. covered (tiles_y + 1, tiles_x + 1) int32: how many tiles above and to the left are
+    rendered; a splat's bounds end at these, and one that reaches none of them counts as not visible. face (N,) int32.
+    degree: of the spherical harmonics used, at most the stored one. Colors follow as many components of strain as both
+    the frames and the splats have.
     depth_as_color: blend (depth, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to a splat's area is
     taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased" mode).
     """
@@ -129,7 +150,7 @@ def project_forward(
     strains = np.uint64(min(strain.shape[1], strain_color.shape[1]))
     tiles_x, tiles_y = (frames.size[0] + TILE - 1) // TILE, (frames.size[1] + TILE - 1) // TILE
     limits, coefficients = _tan_limits(frames.intrinsics, frames.size), np.uint64((degree + 1) * (degree + 1))
-    b = np.zeros(block.FORWARD_SIZE, np.float32)
+    b, seen = np.zeros(block.FORWARD_SIZE, np.float32), np.empty(BLOCK_SPLATS, np.uint64)
     begin, end = next_piece(work)
     while begin < end:
         for first in range(begin, end, BLOCK_SPLATS):
@@ -139,12 +160,12 @@ def project_forward(
             if antialiased:
                 block.compensate_low_pass(b)
             block.project_bounds(b, np.float32(tiles_x), np.float32(tiles_y))
-            if _mark_seen(some, rendered, rect, b) == 0:
+            count = _list_seen(some, covered, rect, b, seen)
+            if count == 0:
                 continue
             block.compute_harmonics(b, frames.to_world)
-            for q in range(np.uint64(len(some))):
-                if not b[block.SEEN + q] > ZERO:
-                    continue
+            for n in range(count):
+                q = seen[n]
                 i = np.uint64(some[q])
                 red, green, blue = _color(b, q, i, coefficients, sh)
                 f = np.uint64(face[i])

@@ -10,17 +10,29 @@ import numpy as np
 from ...avatar.embedding import FaceFrames
 from ...avatar.splats import no_strain_color
 from ...capture.camera import Camera
-from .blend import RUN_TILES, blend_backward, blend_forward
+from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .project import compose_frames, project_backward, project_forward
 from .tiles import (
+    DIGITS,
+    PAIRS,
+    RADIX_BITS,
     SORT_PARTS,
-    compute_offsets,
+    SPLATS,
+    arrange_tiles,
+    count_digits,
     count_pairs,
-    depth_order,
     fill_pairs,
     find_needed_rows,
     list_visible,
+    listed_rows,
+    move_by_digit,
+    move_visible,
+    parts_of,
+    split_splats,
+    sum_digits,
+    sum_parts,
+    sum_tiles,
     whole_tiles,
 )
 
@@ -126,22 +138,20 @@ def render_forward(
     tiles_x, tiles_y = tile_grid(width, height)
     projection = new_projection(len(splats.xyz), buffers)
 
-    def project(rows: np.ndarray, rendered: np.ndarray) -> None:
-        project_forward(rows, rendered, splats, face, frames, degree, depth_as_color, antialiased, projection)
+    def project(rows: np.ndarray, covered: np.ndarray) -> None:
+        project_forward(rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection)
 
-    touched = rendered = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
+    touched = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
+    everywhere = buffers.kept("everywhere", (tiles_y, tiles_x), lambda *shape: sum_tiles(np.ones(shape, bool)))
     if focus is None:
-        project(buffers.kept("everything", (len(splats.xyz),), np.arange), rendered)
+        project(buffers.kept("everything", (len(splats.xyz),), np.arange), everywhere)
         tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), whole_tiles)
     else:
-        focused = np.flatnonzero(focus)
-        project(focused, rendered)
-        touched, tile_rows = find_needed_rows(projection, focused, np.float32(reach), tiles_x, tiles_y)
-        left, past_left, right, past_right = tile_rows.T
-        rendered = ((left < past_left) | (right < past_right)).reshape(touched.shape)
-        project(np.flatnonzero(~focus), rendered)
-    lists = sort_into_tiles(projection, tiles_x, tiles_y, buffers)
-    tiles = heaviest_first(np.flatnonzero(rendered).astype(np.int32), lists)
+        focused, others = split_splats(focus)
+        project(focused, everywhere)
+        touched, covered, tile_rows = find_needed_rows(projection, focused, np.float32(reach), tiles_x, tiles_y)
+        project(others, covered)
+    lists, tiles = sort_into_tiles(projection, tiles_x, tile_rows, buffers)
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, tile_rows, lists, projection, background, blended)
@@ -173,7 +183,7 @@ def render_backward(
     wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
     if output.focus is not None:
         wanted = output.focus
-        tiles, rows = tiles[output.touched.ravel()[tiles]], rows[wanted[rows]]
+        tiles, rows = tiles[output.touched.ravel()[tiles]], listed_rows(rows, wanted)
     pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
     screen_gradient = buffers.get("screen_gradient", (n,))
     if v_transmittance is None:
@@ -210,18 +220,54 @@ def new_image(width: int, height: int, lists: TileLists, buffers: BufferPool) ->
     )
 
 
-def sort_into_tiles(projection: Projection, tiles_x: int, tiles_y: int, buffers: BufferPool) -> TileLists:
-    """Which projected splats reach which tile, front to back; rows of several projections may follow each other."""
-    depth, rect = projection.depth, projection.rect
-    visible = list_visible(rect)
-    order = depth_order(depth, visible)
-    first_pair, pairs = (buffers.get(name, depth.shape, np.int32) for name in ("first_pair", "pairs"))
-    counts = buffers.get("counts", (SORT_PARTS, tiles_x * tiles_y), np.int32)
-    count_pairs(rect, order, tiles_x, counts, pairs)
-    start = compute_offsets(visible, pairs, counts, first_pair)
-    splat_pairs, pair_splat = (buffers.get(name, (start[-1],), np.int32) for name in ("splat_pairs", "pair_splat"))
+def sort_into_tiles(
+    projection: Projection, tiles_x: int, tile_rows: np.ndarray, buffers: BufferPool
+) -> tuple[TileLists, np.ndarray]:
+    """Which projected splats reach which tile, front to back; rows of several projections may follow each other.
+
+    tile_rows (tiles, 4): see `find_needed_rows`. Returns the lists, and the tiles (T,) int32 with a needed row in the
+    order in which they are rendered.
+    """
+    rect = projection.rect
+    visible, order, first_pair, pairs, total = sort_by_depth(projection, buffers)
+    counts = buffers.get("counts", (SORT_PARTS, len(tile_rows)), np.int32)
+    splat_pairs, pair_splat = (buffers.get(name, (total,), np.int32) for name in ("splat_pairs", "pair_splat"))
+    count_pairs(rect, order, tiles_x, counts)
+    start, tiles = arrange_tiles(counts, tile_rows)
     fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
-    return TileLists(visible, first_pair, pairs, splat_pairs, start, pair_splat)
+    return TileLists(visible, first_pair, pairs, splat_pairs, start, pair_splat), tiles
+
+
+def sort_by_depth(
+    projection: Projection, buffers: BufferPool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """The visible splats (M,) int32, the same near to far, where the pairs of each splat begin and how many they are
+    (N,), and how many there are in all; see `TileLists`. Equal depths keep their order.
+
+    Least-significant-digit radix sort on the bits of the float: positive floats order like their bits. Counted from the
+    least, the depths of a head have 22 bits, and take two of the three passes.
+    """
+    (n,) = projection.depth.shape
+    found, visible, order, moved, first_pair, pairs = (
+        buffers.get(name, (n,), np.int32) for name in ("found", "visible", "order", "moved", "first_pair", "pairs")
+    )
+    keys, moved_keys = (buffers.get(name, (n,), np.uint32) for name in ("keys", "moved_keys"))
+    parts = buffers.get("parts", (parts_of(n) + 1, 4), np.int64)
+    counts = buffers.get("digits", (parts_of(n), DIGITS), np.int32)
+    list_visible(projection.rect, projection.depth.view(np.uint32), found, keys, pairs, first_pair, parts, counts)
+    least, greatest = sum_parts(parts, counts)
+    splats, total = int(parts[-1, SPLATS]), int(parts[-1, PAIRS])
+    visible = visible[:splats]
+    move_visible(parts, found, keys, counts, first_pair, visible, moved_keys, order)
+    keys, moved_keys, order, moved = moved_keys[:splats], keys[:splats], order[:splats], moved[:splats]
+    counts = counts[: parts_of(splats)]
+    for shift in range(RADIX_BITS, greatest.bit_length(), RADIX_BITS):
+        digit = np.uint32(least), np.uint32(shift)
+        count_digits(counts, keys, *digit)
+        sum_digits(counts)
+        move_by_digit(counts, keys, order, *digit, moved_keys, moved)
+        keys, moved_keys, order, moved = moved_keys, keys, moved, order
+    return visible, order, first_pair, pairs, total
 
 
 def with_strain_color(splats: Parameters) -> Parameters:
@@ -234,11 +280,3 @@ def with_strain_color(splats: Parameters) -> Parameters:
 def tile_grid(width: int, height: int) -> tuple[int, int]:
     """Columns and rows of tiles of an image of width × height pixels."""
     return -(-width // TILE), -(-height // TILE)
-
-
-def heaviest_first(tiles: np.ndarray, lists: TileLists) -> np.ndarray:
-    """Reorder tiles in runs of neighbors, those of the most pairs first: what is left at the end is short."""
-    whole = len(tiles) // RUN_TILES * RUN_TILES
-    pairs = (lists.start[1:] - lists.start[:-1])[tiles[:whole]].reshape(-1, RUN_TILES).sum(1)
-    runs = tiles[:whole].reshape(-1, RUN_TILES)[np.argsort(-pairs, kind="stable")]
-    return np.concatenate([runs.ravel(), tiles[whole:]])

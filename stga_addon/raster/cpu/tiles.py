@@ -5,70 +5,141 @@ import math
 import numpy as np
 
 from . import inline_jit, jit, kernel_jit, part_jit
+from .blend import RUN_TILES
 from .elementary import prefetch
 from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
 from .threads import next_piece, parallel
 
 RADIX_BITS = 11
-SPLATS_PER_SORT = 8_192
-"""Splats that a thread sorts at a time."""
+DIGITS = 1 << RADIX_BITS
+SPLATS_PER_SORT = 4_096
+"""Splats that a thread lists or sorts at a time."""
 SORT_PARTS = 16
 """Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
-
-
-@jit
-def list_visible(rect):
-    """The splats (M,) int32 with tiles in their bounds, rect (N, 4)."""
-    found, count = np.empty(len(rect), np.int32), 0
-    for i in range(np.uint64(len(rect))):
-        found[count] = i
-        count += rect[i, 2] > rect[i, 0]
-    return found[:count]
-
-
-def depth_order(depth: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """The candidates (M,) int32 sorted by depth, near to far; equal depths keep their order.
-
-    Least-significant-digit radix sort on the bits of the float: positive floats order like their bits. Counted from the
-    least, the depths of a head have 22 bits, and take two of the three passes.
-    """
-    if len(candidates) == 0:
-        return candidates
-    keys, values = np.empty(len(candidates), np.uint32), candidates
-    least, greatest = collect_keys(depth.view(np.uint32), candidates, keys)
-    least = np.uint32(least)
-    counts = np.empty((-(-len(keys) // SPLATS_PER_SORT), 1 << RADIX_BITS), np.int32)
-    for shift in range(0, int(greatest - least).bit_length(), RADIX_BITS):
-        digit, moved_keys, moved = np.uint32(shift), np.empty_like(keys), np.empty_like(values)
-        count_digits(counts, keys, least, digit)
-        sum_digits(counts)
-        move_by_digit(counts, keys, values, least, digit, moved_keys, moved)
-        keys, values = moved_keys, moved
-    return values
-
-
-@jit
-def collect_keys(bits, candidates, keys):
-    """Write the bits (N,) uint32 of the candidates (M,) to keys (M,); returns the least and the greatest, uint32."""
-    least = greatest = bits[np.uint64(candidates[0])]
-    for n in range(np.uint64(len(candidates))):
-        key = bits[np.uint64(candidates[n])]
-        keys[n] = key
-        least, greatest = min(least, key), max(greatest, key)
-    return least, greatest
+SPLATS, PAIRS, LEAST, GREATEST = range(4)
+"""Columns of what `list_visible` finds in a part: splats with a tile, their pairs, and the bounds of their keys."""
+RUN_BUCKETS = 512
+"""Kinds of runs of tiles, by how many pairs they have."""
 
 
 @inline_jit
 def _digit(key, least, shift):
-    return np.uint64((np.uint32(key - least) >> shift) & np.uint32((1 << RADIX_BITS) - 1))
+    return np.uint64((np.uint32(key - least) >> shift) & np.uint32(DIGITS - 1))
 
 
-@parallel(lambda counts, *_: len(counts), piece=16)
+@parallel(lambda rect, *_: parts_of(len(rect)))
+@kernel_jit
+def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, counts):
+    """List the splats with tiles in their bounds, rect (N, 4), by parts of SPLATS_PER_SORT splats.
+
+    Writes from each part's first place on its visible splats to found (N,) int32, and their keys, the bits of their
+    depths (N,), to keys (N,) uint32. pairs, first_pair (N,) int32: how many pairs each splat has, and how many in its
+    part come before. parts (parts + 1, 4) int64: see SPLATS. counts (parts, DIGITS) int32: of the keys' lowest digits.
+    """
+    part, past_part = next_piece(work)
+    while part < past_part:
+        for k in range(part, past_part):
+            row, count, before = counts[k], np.uint64(0), np.int32(0)
+            row[:] = 0
+            begin = np.uint64(k * SPLATS_PER_SORT)
+            least, greatest = np.uint32(0xFFFFFFFF), np.uint32(0)
+            # Without a branch: the processor could not foresee which splats a local iteration sees.
+            for i in range(begin, np.uint64(min(len(rect), (k + 1) * SPLATS_PER_SORT))):
+                width, key = rect[i, 2] - rect[i, 0], depth_bits[i]
+                seen = width > 0
+                found[begin + count], keys[begin + count] = i, key
+                pairs[i], first_pair[i] = width * (rect[i, 3] - rect[i, 1]), before
+                count, before = count + np.uint64(seen), np.int32(before + pairs[i])
+                row[_digit(key, np.uint32(0), np.uint32(0))] += seen
+                least, greatest = min(least, key if seen else least), max(greatest, key if seen else greatest)
+            parts[k, SPLATS], parts[k, PAIRS], parts[k, LEAST], parts[k, GREATEST] = count, before, least, greatest
+        part, past_part = next_piece(work)
+
+
+def parts_of(splats: int) -> int:
+    """How many parts of SPLATS_PER_SORT splats there are."""
+    return -(-splats // SPLATS_PER_SORT)
+
+
+@jit
+def sum_parts(parts, counts):
+    """Turn the splats and pairs of `list_visible`'s parts into those of the parts before, with a last row of all, and
+    its counts of digits into places.
+
+    Returns what all keys are counted from, of lowest digit 0, so that a key's lowest digit is its own, and the greatest
+    of the keys counted from there.
+    """
+    splats, pairs, least, greatest = 0, 0, 0xFFFFFFFF, 0
+    last = len(parts) - 1
+    for k in range(last):
+        count, before = parts[k, SPLATS], parts[k, PAIRS]
+        parts[k, SPLATS], parts[k, PAIRS] = splats, pairs
+        splats, pairs = splats + count, pairs + before
+        least, greatest = min(least, parts[k, LEAST]), max(greatest, parts[k, GREATEST])
+    parts[last, SPLATS], parts[last, PAIRS] = splats, pairs
+    _sum_counts(counts)
+    least = least // DIGITS * DIGITS
+    return least, max(0, greatest - least)
+
+
+@part_jit
+def _sum_counts(counts):
+    """Turn counts (parts, columns) int32 into places: column by column, in each one part after the other.
+
+    Returns where each column begins, and the sum (columns + 1,) int64. Row by row, in loops that vectorize.
+    """
+    start = np.zeros(counts.shape[1] + 1, np.int64)
+    for k in range(counts.shape[0]):
+        for c in range(counts.shape[1]):
+            start[c + 1] += counts[k, c]
+    for c in range(counts.shape[1]):
+        start[c + 1] += start[c]
+    place = start[:-1].astype(np.int32)
+    for k in range(counts.shape[0]):
+        for c in range(counts.shape[1]):
+            count = counts[k, c]
+            counts[k, c] = place[c]
+            place[c] += count
+    return start
+
+
+@jit
+def sum_digits(counts):
+    """Turn the counts of `count_digits` into the place of each part's first key of each digit."""
+    _sum_counts(counts)
+
+
+@parallel(lambda parts, *_: len(parts) - 1)
+@kernel_jit
+def move_visible(work, parts, found, keys, place, first_pair, visible, moved_keys, moved):
+    """Write the splats of `list_visible`, M in all, to visible (M,), and with their keys sorted by the lowest digit to
+    moved (M,) and moved_keys (M,).
+
+    parts and `place`, the places of digits, as of `sum_parts`; `place` is advanced. first_pair (N,): from now on counts
+    the pairs of the parts before as well.
+    """
+    part, past_part = next_piece(work)
+    while part < past_part:
+        for k in range(part, past_part):
+            row, begin, first = place[k], np.uint64(k * SPLATS_PER_SORT), np.uint64(parts[k, SPLATS])
+            before = np.int32(parts[k, PAIRS])
+            for n in range(np.uint64(parts[k + 1, SPLATS] - parts[k, SPLATS])):
+                i, key = found[begin + n], keys[begin + n]
+                visible[first + n] = i
+                first_pair[np.uint64(i)] += before
+                digit = _digit(key, np.uint32(0), np.uint32(0))
+                at = np.uint64(row[digit])
+                moved_keys[at], moved[at] = key, i
+                row[digit] += 1
+        part, past_part = next_piece(work)
+
+
+@parallel(lambda counts, *_: len(counts))
 @kernel_jit
 def count_digits(work, counts, keys, least, shift):
     """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit occurs.
 
-    The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts, digits) int32.
+    The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts, DIGITS) int32.
     """
     part, past_part = next_piece(work)
     while part < past_part:
@@ -78,17 +149,6 @@ def count_digits(work, counts, keys, least, shift):
             for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
                 row[_digit(keys[n], least, shift)] += 1
         part, past_part = next_piece(work)
-
-
-@jit
-def sum_digits(counts):
-    """Turn the counts of `count_digits` into the place of each part's first key of each digit."""
-    found = 0
-    for digit in range(counts.shape[1]):
-        for k in range(counts.shape[0]):
-            count = counts[k, digit]
-            counts[k, digit] = found
-            found += count
 
 
 @parallel(lambda counts, *_: len(counts))
@@ -135,11 +195,10 @@ def _next_tile(tile, column, width, tiles_x):
 
 @parallel(lambda *_: SORT_PARTS)
 @kernel_jit
-def count_pairs(work, rect, order, tiles_x, counts, pairs):
+def count_pairs(work, rect, order, tiles_x, counts):
     """Count the (splat, tile) pairs of each part of order (M,) int32: the splats, near to far.
 
-    rect (N, 4) int32 tile bounds. Writes counts (SORT_PARTS, tiles) int32 and pairs (N,) int32, of the splats in
-    `order`.
+    rect (N, 4) int32 tile bounds. Writes counts (SORT_PARTS, tiles) int32.
     """
     part, past_part = next_piece(work)
     while part < past_part:
@@ -151,7 +210,6 @@ def count_pairs(work, rect, order, tiles_x, counts, pairs):
                 _prefetch_rect(rect, order, n, past)
                 i = np.uint64(order[n])
                 tile, width, total = _tiles_of(rect, i, tiles_x)
-                pairs[i] = total
                 column = np.uint64(1)
                 for _ in range(total):
                     row[tile] += 1
@@ -160,31 +218,48 @@ def count_pairs(work, rect, order, tiles_x, counts, pairs):
 
 
 @jit
-def compute_offsets(visible, pairs, counts, first_pair):
+def arrange_tiles(counts, tile_rows):
     """Turn the counts of `count_pairs` into the offset of each part's pairs in each tile's list.
 
-    visible (M,) int32. Writes first_pair (N,): where each of these splats' pairs begin in `splat_pairs`.
-    Returns start (tiles + 1,) int64: where each tile's list begins.
+    tile_rows (tiles, 4) as of `find_needed_rows`. Returns start (tiles + 1,) int64: where each tile's list begins, and
+    tiles (T,) int32: those with a needed row, in the order in which they are rendered.
     """
-    found = 0
-    for n in range(len(visible)):
-        first_pair[visible[n]] = found
-        found += pairs[visible[n]]
-    start = np.zeros(counts.shape[1] + 1, np.int64)
-    for tile in range(counts.shape[1]):
-        place = start[tile]
-        for k in range(SORT_PARTS):
-            count = counts[k, tile]
-            counts[k, tile] = place
-            place += count
-        start[tile + 1] = place
-    return start
+    start = _sum_counts(counts)
+    tiles, count = np.empty(len(tile_rows), np.int32), 0
+    for tile in range(len(tile_rows)):
+        tiles[count] = tile
+        count += (tile_rows[tile, 0] < tile_rows[tile, 1]) | (tile_rows[tile, 2] < tile_rows[tile, 3])
+    return start, heaviest_first(tiles[:count], start)
+
+
+@part_jit
+def heaviest_first(tiles, start):
+    """Reorder tiles (T,) int32 in runs of neighbors, those of the most pairs first, RUN_BUCKETS kinds of them: what is
+    left at the end is short."""
+    runs = len(tiles) // RUN_TILES
+    pairs, places = np.zeros(runs, np.int64), np.zeros(RUN_BUCKETS + 1, np.int64)
+    most = 1
+    for n in range(runs * RUN_TILES):
+        pairs[n // RUN_TILES] += start[tiles[n] + 1] - start[tiles[n]]
+        most = max(most, pairs[n // RUN_TILES])
+    for n in range(runs):
+        pairs[n] = (most - pairs[n]) * (RUN_BUCKETS - 1) // most
+        places[pairs[n] + 1] += 1
+    for n in range(RUN_BUCKETS):
+        places[n + 1] += places[n]
+    ordered = tiles.copy()
+    for n in range(runs):
+        first = places[pairs[n]] * RUN_TILES
+        places[pairs[n]] += 1
+        for k in range(RUN_TILES):
+            ordered[first + k] = tiles[n * RUN_TILES + k]
+    return ordered
 
 
 @parallel(lambda *_: SORT_PARTS)
 @kernel_jit
 def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
-    """Write every tile's pairs front to back; `place` holds the offsets of `compute_offsets` and is advanced.
+    """Write every tile's pairs front to back; `place` holds the offsets of `arrange_tiles` and is advanced.
 
     pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat stand, its first at
     first_pair[i].
@@ -239,13 +314,41 @@ def _sum_boxes(count):
 
 
 @jit
+def split_splats(focus):
+    """The splats (M,) int64 that are in focus (N,) bool, and the others."""
+    inside, outside = np.empty(len(focus), np.int64), np.empty(len(focus), np.int64)
+    found = 0
+    for i in range(np.uint64(len(focus))):
+        inside[found] = outside[i - np.uint64(found)] = i
+        found += focus[i]
+    return inside[:found], outside[: len(focus) - found]
+
+
+@jit
+def listed_rows(rows, wanted):
+    """Those of the rows (M,) int32 that are wanted (N,) bool."""
+    found, count = np.empty(len(rows), np.int32), 0
+    for n in range(np.uint64(len(rows))):
+        found[count] = rows[n]
+        count += wanted[np.uint64(rows[n])]
+    return found[:count]
+
+
+def sum_tiles(tiles: np.ndarray) -> np.ndarray:
+    """How many of the marked tiles (tiles_y, tiles_x) bool are above and to the left (tiles_y + 1, tiles_x + 1)."""
+    covered = np.zeros((tiles.shape[0] + 1, tiles.shape[1] + 1), np.int32)
+    tiles.cumsum(0, np.int32).cumsum(1, out=covered[1:, 1:])
+    return covered
+
+
+@jit
 def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
     """The tiles that the listed splats (M,) reach, and the rows of tiles in which a pixel may be at most `reach`
     pixels, float32, away from one that they reach.
 
-    Returns touched (tiles_y, tiles_x) bool, the tiles that they reach, which are needed whole, and tile_rows (tiles, 4)
-    uint8: first and past-the-last row in the left and in the right half of each tile, both even; the first is not
-    before the other where there are none.
+    Returns touched (tiles_y, tiles_x) bool, the tiles that they reach, which are needed whole; `sum_tiles` of those
+    with a needed row; and tile_rows (tiles, 4) uint8: first and past-the-last row in the left and in the right half of
+    each tile, both even; the first is not before the other where there are none.
     """
     projected, extent_y, rect = projection.columns, projection.extent_y, projection.rect
     two, half, slack = np.float32(2.0), np.float32(TILE // 2), np.float32(1e-4)
@@ -266,6 +369,7 @@ def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
     _sum_boxes(reached)
     _sum_boxes(near)
     touched, tile_rows = np.empty((tiles_y, tiles_x), np.bool_), np.empty((tiles_y * tiles_x, 4), np.uint8)
+    covered = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
     for tile in range(tiles_y * tiles_x):
         ty, tx = tile // tiles_x, tile % tiles_x
         touched[ty, tx] = reached[ty, tx] > 0
@@ -273,6 +377,61 @@ def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
             first, past = TILE // 2, 0
             for pair in range(TILE // 2):
                 if touched[ty, tx] or near[ty * (TILE // 2) + pair, 2 * tx + side] > 0:
-                    first, past = min(first, pair), pair + 1
+                    first, past, covered[ty + 1, tx + 1] = min(first, pair), pair + 1, 1
             tile_rows[tile, 2 * side], tile_rows[tile, 2 * side + 1] = 2 * first, 2 * past
-    return touched, tile_rows
+    _sum_boxes(covered)
+    return touched, covered, tile_rows
+
+
+@part_jit
+def _number_group(tiles, numbers, tile, number):
+    """Give all marked tiles that are connected to `tile`, by sides or corners, a number; returns their first row and
+    past-the-last."""
+    rows, columns = tiles.shape
+    waiting, count = np.empty(tiles.size, np.int64), 1
+    waiting[0], numbers[tile // columns, tile % columns] = tile, number
+    first, past = rows, 0
+    while count > 0:
+        count -= 1
+        y, x = waiting[count] // columns, waiting[count] % columns
+        first, past = min(first, y), max(past, y + 1)
+        for v in range(max(0, y - 1), min(rows, y + 2)):
+            for u in range(max(0, x - 1), min(columns, x + 2)):
+                if tiles[v, u] and numbers[v, u] == 0:
+                    numbers[v, u] = number
+                    waiting[count] = v * columns + u
+                    count += 1
+    return first, past
+
+
+@jit
+def box_groups(tiles, most_rows):
+    """Boxes (B, 4) int64 x0, y0, x1, y1 around each connected group of marked tiles (rows, columns) bool, the largest
+    first; a group of more than `most_rows` rows is cut into bands of about as many rows each."""
+    columns, numbers = tiles.shape[1], np.zeros(tiles.shape, np.int64)
+    boxes, count, number = np.empty((tiles.size, 4), np.int64), 0, 0
+    for tile in range(tiles.size):
+        if not tiles[tile // columns, tile % columns] or numbers[tile // columns, tile % columns] > 0:
+            continue
+        number += 1
+        first, past = _number_group(tiles, numbers, tile, number)
+        bands = (past - first + most_rows - 1) // most_rows
+        for band in range(bands):
+            y0, y1 = first + (past - first) * band // bands, first + (past - first) * (band + 1) // bands
+            x0, x1 = columns, 0
+            for y in range(y0, y1):
+                for x in range(columns):
+                    if numbers[y, x] == number:
+                        x0, x1 = min(x0, x), max(x1, x + 1)
+            at = count
+            while at > 0 and _size(boxes[at - 1]) < (x1 - x0) * (y1 - y0):
+                boxes[at] = boxes[at - 1]
+                at -= 1
+            boxes[at, 0], boxes[at, 1], boxes[at, 2], boxes[at, 3] = x0, y0, x1, y1
+            count += 1
+    return boxes[:count]
+
+
+@part_jit
+def _size(box):
+    return (box[2] - box[0]) * (box[3] - box[1])

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...capture.camera import Camera
-from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows
+from ...raster.cpu.optimizer import AdamOptions, adam_rows
 from .state import TrainState
 
 BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
@@ -31,11 +31,9 @@ def step(
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """
-    parameters = []
-    for name, arrays in state.tables.items():
-        by_column = np.full(arrays[0].shape[1], rates[name], np.float32)
+    for name, table in state.tables.items():
+        table.rates[:] = rates[name]
         if name == "sh":
-            by_column[3:] = rates["sh_rest"]
-        parameters.append(AdamTables._make((*arrays, by_column)))
+            table.rates[3:] = rates["sh_rest"]
     options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
-    adam_rows(rows, state.numpy.steps, tuple(parameters), options)
+    adam_rows(rows, state.numpy.steps, tuple(state.tables.values()), options)

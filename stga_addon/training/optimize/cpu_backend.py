@@ -9,6 +9,7 @@ from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
 from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
+from ...raster.cpu.threads import threads
 from ..settings import TrainingSettings
 from . import adam, driven_offsets
 from .backend import Batch
@@ -33,7 +34,7 @@ class CpuBackend:
     def step(self, batch: Batch) -> float | None:
         """Forward, backward and optimizer step; returns the image loss of a global iteration, None for a local one."""
         state = self.state
-        focus = None if batch.selected is None else batch.selected[state.numpy.face]
+        focus = None if batch.selected is None else batch.selected.take(state.numpy.face)
         target = self._target(batch)
         rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
         epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
@@ -69,7 +70,11 @@ class CpuBackend:
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
         state, frames = self.state.numpy, self._moved_frames(view.timestep)
         rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
-        rectangles = whole_image(height, width) if focus is None else tile_rectangles(rendering.touched, height, width)
+        if focus is None:
+            key = height, width, threads()
+            rectangles = self._buffers.kept("rectangles", key, lambda *key: whole_image(*key[:2]))
+        else:
+            rectangles = tile_rectangles(rendering.touched, height, width)
         v_image = self._buffers.get("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
         rows, screen = render_backward(
@@ -127,7 +132,7 @@ class CpuBackend:
         if settings.scale_weight:
             gradient, log_scale = state.gradients.log_scale, state.parameters.log_scale
             scale_limit(rows, log_scale, face, unbound, self._scale_limits, settings.scale_weight, gradient)
-        if settings.unseen_opacity_weight:
+        if settings.unseen_opacity_weight and self.state.has_unseen:
             weight = settings.unseen_opacity_weight / len(state)
             opacity_weight(rows, state.parameters.opacity, state.unseen_share, weight, state.gradients.opacity)
         if settings.distance_weight:

@@ -4,13 +4,13 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import find_objects, label
 
-from ...raster.cpu.image_loss import LOSS_REACH_PX, image_loss
+from ...raster.cpu.image_loss import LOSS_REACH_PX, add_up, image_loss
 from ...raster.cpu.layout import TILE
 from ...raster.cpu.threads import threads
+from ...raster.cpu.tiles import box_groups
 
-BAND_TILES = 12
+BAND_TILES = 4
 """Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
 
 
@@ -43,15 +43,7 @@ def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
 
     Groups of more than BAND_TILES rows are cut into bands, which are narrower and more evenly distributed to threads.
     """
-    groups = label(tiles, np.ones((3, 3)))[0]
-    boxes: list[tuple[int, int, int, int]] = []
-    for number, (y, x) in enumerate(find_objects(groups), 1):
-        group = groups[y, x] == number
-        for top, bottom in pairwise(_edges(len(group), -(-len(group) // BAND_TILES))):
-            columns = np.flatnonzero(group[top:bottom].any(0)) + x.start
-            boxes.append((columns[0], y.start + top, columns[-1] + 1, y.start + bottom))
-    boxes.sort(key=lambda box: (box[0] - box[2]) * (box[3] - box[1]))
-    return np.minimum(np.array(boxes, np.int64).reshape(-1, 4) * TILE, [width, height, width, height])
+    return np.minimum(box_groups(tiles, BAND_TILES) * TILE, [width, height, width, height])
 
 
 def image_gradient(
@@ -62,11 +54,11 @@ def image_gradient(
     image, out (3, H, W) float32; target (H, W, 3) uint8. The loss is the mean over the whole image whatever the
     rectangles are. Returns L1 and SSIM, which are the image's only if the rectangles tile it.
     """
-    sums = np.zeros((3, int((rectangles[:, 3] - rectangles[:, 1]).sum()), 2))
+    sums = np.zeros((2, 3, sum(y1 - y0 for _, y0, _, y1 in rectangles.tolist())))
     share = 1.0 / image.size
     image_loss(image, target, rectangles, np.float32(ssim_weight), np.float32(share), out, sums)
-    l1, ssim = sums.reshape(-1, 2).sum(0) * share
-    return float(l1), float(ssim)
+    l1, ssim = add_up(sums)
+    return l1 * share, ssim * share
 
 
 def mean_ssim(image: np.ndarray, target: np.ndarray) -> float:

@@ -11,6 +11,7 @@ import torch
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import ADDED, Splats
 from ...raster.cpu.layout import Parameters
+from ...raster.cpu.optimizer import AdamTables
 
 
 @dataclass
@@ -76,13 +77,20 @@ class TrainState:
         return state_of({name: tensor.numpy() for name, tensor in tensors_of(self).items()})
 
     @cached_property
-    def tables(self) -> dict[str, tuple[np.ndarray, ...]]:
-        """Parameter -> its values, gradient, moments and average as NumPy arrays (N, D) that share their memory."""
+    def tables(self) -> dict[str, AdamTables]:
+        """Parameter -> its values, gradient, moments and average as NumPy arrays (N, D) that share their memory, and
+        room for the learning rates of its columns."""
         kept = self.parameters, self.gradients, self.first, self.second, self.average
-        return {
-            name: tuple(t.numpy().reshape(len(t), t[0].numel()) for t in tensors)
-            for name, tensors in zip(self.parameters._fields, zip(*kept, strict=True), strict=True)
-        }
+        found = {}
+        for name, tensors in zip(self.parameters._fields, zip(*kept, strict=True), strict=True):
+            arrays = [t.numpy().reshape(len(t), t[0].numel()) for t in tensors]
+            found[name] = AdamTables._make((*arrays, np.empty(arrays[0].shape[1], np.float32)))
+        return found
+
+    @cached_property
+    def has_unseen(self) -> bool:
+        """Whether a splat has a share of cameras that did not see it."""
+        return bool(self.unseen_share.any())
 
     def arrays(self) -> Parameters:
         """The parameters as NumPy arrays that share their memory."""
