@@ -275,14 +275,9 @@ def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Av
     ends = np.stack([rng.uniform(-2, -0.3, (len(faces), 3)), rng.uniform(-0.3, 2, (len(faces), 3))], 1)
     unit = 0.004 if convention == "stga" else 0.3
     splats = replace(avatar.splats, face=rng.integers(0, len(faces), count).astype(np.int32))
-    return replace(
-        avatar,
-        splats=splats,
-        neutral=neutral.astype(np.float32),
-        faces=faces,
-        strain_range=ends.astype(np.float32),
-        driven_offsets={"strain_position": rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32)},
-    )
+    offsets = {"strain_position": rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32)}
+    avatar = replace(avatar, splats=splats, neutral=neutral.astype(np.float32), faces=faces)
+    return replace(avatar, strain_range=ends.astype(np.float32), driven_offsets=offsets)
 
 
 @pytest.mark.parametrize("strain_color", [False, True])
@@ -293,9 +288,7 @@ def test_positions_follow_strain(convention, strain_color, tmp_path):
     avatar = following_positions(convention)
     colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3 if strain_color else 0, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors))
-    assert {2, 3, 4} <= set(edge_neighbors(avatar.faces).counts.tolist()), (
-        "triangles at a boundary, inside, and at an edge of three"
-    )
+    assert {2, 3, 4} <= set(edge_neighbors(avatar.faces).counts.tolist())  # at a boundary, inside, an edge of three
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -332,9 +325,8 @@ def test_updated_splats_follow_strain_anew():
     assert can_update(shown, second)
     update_splats(shown, avatar_attributes(second))
     assert_follows(shown, head, second)
-    np.testing.assert_array_equal(
-        stored_avatar(shown).driven_offsets["strain_position"], second.driven_offsets["strain_position"]
-    )
+    stored = stored_avatar(shown).driven_offsets["strain_position"]
+    np.testing.assert_array_equal(stored, second.driven_offsets["strain_position"])
     assert not can_update(shown, replace(second, driven_offsets={}))
     colors = np.zeros((len(second.splats), 3, 3), np.float32)
     assert not can_update(shown, replace(second, splats=replace(second.splats, strain_color=colors)))
@@ -488,16 +480,13 @@ def test_trees_and_materials_are_built_once(tmp_path: Path):
     assert len(bpy.data.materials) == 2
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        ("stga", 3, True),
-        ("gaussian_avatars", 2, False),
-        (None, 0, False),
-        ("stga", 0, False, ("strain_position",)),
-        ("gaussian_avatars", 3, True, ("strain_position",)),
-    ],
-)
+TREES = [
+    ("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False), ("stga", 0, False, ("strain_position",)),
+    ("gaussian_avatars", 3, True, ("strain_position",)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", TREES)
 def test_trees_are_built_one_node_group_at_a_time(kind):
     """Catches what blocks the UI when a live preview first appears: several groups built in one call, a large tree
     (build time is quadratic), and groups that are built again."""
