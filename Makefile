@@ -1,11 +1,11 @@
 # Everything runs in .venv, which the first target that needs it makes from pyproject.toml.
 PYTHON ?= python3.11
 BIN := .venv/bin
-# As many processes as cores, each of up to 2 GB. `worksteal` gives each of them neighboring tests, so that few fixtures
-# are made twice.
-PARALLEL := -n auto --maxprocesses 8 --dist worksteal
+# tests/conftest.py says how many processes. `worksteal` gives each of them neighboring tests, so that few fixtures are
+# made twice.
+PARALLEL := -n auto --dist worksteal
 
-.PHONY: demo demo-footage test test-fast test-gui lint lint-web fuzz extension extension-platform extension-complete repository clean
+.PHONY: demo demo-footage test kernels test-fast test-gui lint lint-web fuzz extension extension-platform extension-complete repository clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -14,8 +14,13 @@ demo: .venv/ready
 demo-footage: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo --footage
 
-test: lint
+test: .venv/ready
+	$(MAKE) --jobs 2 --output-sync lint kernels
 	$(BIN)/python -m pytest $(PARALLEL)
+
+# What the tests would each compile
+kernels: .venv/ready
+	$(BIN)/python tests/kernels.py
 
 test-fast: .venv/ready
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"

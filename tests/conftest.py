@@ -4,20 +4,46 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
-from zlib import crc32
 
 # Before OpenMP is loaded: its threads wait in a loop, and in tests, which run one per core, they would take the time of
 # another test. Kernels have threads of their own (`raster/cpu/threads.py`), which sleep.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import kernels
 import pytest
 from capture import factory
 from filelock import FileLock
 
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
+
+MAX_PROCESSES = 8
+"""Of up to 2 GB each."""
+MIN_MEMORY_BYTES = 8 << 30
+"""Free space of a memory disk with which the tests' files are kept there."""
+
+
+def memory_disk(folder: str = "/dev/shm") -> dict[str, str]:
+    """The variable that has pytest keep its temporary folders in memory, where this machine has enough: what the tests
+    write, most of it flushed file by file, is then no wait."""
+    if not hasattr(os, "ST_NOEXEC") or not os.path.isdir(folder):
+        return {}
+    found = os.statvfs(folder)
+    fits = found.f_bavail * found.f_frsize >= MIN_MEMORY_BYTES and not found.f_flag & os.ST_NOEXEC
+    return {"PYTEST_DEBUG_TEMPROOT": folder} if fits else {}
+
+
+if "PYTEST_XDIST_WORKER" not in os.environ:  # those inherit it
+    os.environ.update(memory_disk() | dict(os.environ))
+    os.environ.update(kernels.shared_kernels())
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One process more than cores, because some tests wait: for a cluster, a browser, an operating system's process."""
+    return min((os.cpu_count() or 1) + 1, MAX_PROCESSES)
+
 
 # A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -31,32 +57,13 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], FileLock]
     return lambda name: FileLock(common / f"{name}.lock")
 
 
-BITS = """
-import contextlib, runpy
-with open(os.environ["NUMBA_CACHE_DIR"] + "/bits.txt", "w") as file, contextlib.redirect_stdout(file):
-    runpy.run_path({!r})
-"""
-
-
 @pytest.fixture(scope="session")
-def kernel_bundle(alone: Callable[[str], FileLock], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def kernel_bundle() -> tuple[Path, str]:
     """Folder of all kernels as the complete edition brings them, and what raster/kernel_bits.py printed where they were
-    compiled, in one process, which takes half a minute. build/kernels keeps both until a kernel changes."""
-    from stga_addon.development import compiled_kernels
-    from stga_addon.development.wheels import Target, this_platform
-
-    script = Path(__file__).with_name("raster") / "kernel_bits.py"
-    target = Target(this_platform(), "{}.{}".format(*sys.version_info[:2]), ("4.2.0", ""))
-    wheels = tmp_path_factory.mktemp("wheels")
-    (wheels / f"numba-{version('numba')}-tests{crc32(script.read_bytes())}").touch()
-    changed = compiled_kernels.SCRIPT.replace("from", "os.cpu_count = lambda: 1\nfrom", 1)
-    changed = changed.replace("print(", BITS.format(str(script)) + "print(")
-    with alone("kernels"), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled_kernels, "SCRIPT", changed)
-        kernels = compiled_kernels.compile_kernels(target, wheels)
-    if not kernels:
+    compiled, in one process, which takes most of a minute."""
+    folder = kernels.bundle()
+    if folder is None:
         pytest.skip("no edition brings kernels for this platform")
-    folder = kernels[0].parents[1]
     return folder, (folder / "bits.txt").read_text()
 
 

@@ -35,7 +35,7 @@ def compile_kernels(target: Target, wheels: Path, blender: Sequence[str] = ()) -
     """
     if target.platform != this_platform() or target.platform not in PROCESSORS:
         return []
-    folder = ROOT / "build/kernels" / f"{target.name}-{_digest(wheels)}"
+    folder = kernels_folder(target, wheels)
     if not _files(folder):
         if blender:
             with _unpacked(wheels) as site:
@@ -43,6 +43,11 @@ def compile_kernels(target: Target, wheels: Path, blender: Sequence[str] = ()) -
         elif _is_target(target, wheels):
             _compile(target, [sys.executable, "-c"], [], folder)
     return _files(folder)
+
+
+def kernels_folder(target: Target, wheels: Path) -> Path:
+    """Where the kernels of these sources are kept; one process at a time may compile into it."""
+    return ROOT / "build/kernels" / f"{target.name}-{_digest(wheels)}"
 
 
 def _compile(target: Target, command: Sequence[str], sites: Sequence[Path], folder: Path) -> None:

@@ -29,14 +29,10 @@ def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
     if not (base / "capture").exists():
         write_mesh_capture(base / "capture", (0, 1, 3, 4), range(4))
     train = {
-        "request": "train",
-        "capture": "capture",
-        "principal_point": "opencv",
-        "device": "cpu",
-        "settings": {**SETTINGS, "iterations": iterations},
-        "sweep": {"settings.seed": list(range(seeds))},
+        "request": "train", "capture": "capture", "principal_point": "opencv", "device": "cpu",
+        "settings": {**SETTINGS, "iterations": iterations}, "sweep": {"settings.seed": list(range(seeds))},
         "minutes": 0.1,
-    }
+    }  # fmt: skip
     tables = {"train": train, "evaluate": {"request": "evaluate", "run": "{train}", "minutes": 0.1}}
     resources = {"threads": 1, "memory_gb": 0.5}
     return make_plan({"out": "runs", "resources": resources, "job": tables}, base, "plan")

@@ -24,16 +24,8 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
 
 OWN_PACKAGES = (
-    "bpy",
-    "numpy",
-    "numpy.libs",
-    "zstandard",
-    "requests",
-    "urllib3",
-    "idna",
-    "certifi",
-    "charset_normalizer",
-)
+    "bpy", "numpy", "numpy.libs", "zstandard", "requests", "urllib3", "idna", "certifi", "charset_normalizer",
+)  # fmt: skip
 """What a Blender's Python has of its own."""
 OFFLINE = ["unshare", "-rn"]
 ITERATIONS = 60
@@ -106,7 +98,7 @@ def test_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> None:
     python = bare_python(tmp_path / "bare")
     offline = OFFLINE if subprocess.run([*OFFLINE, "true"], check=False).returncode == 0 else []
     profile = {"BLENDER_USER_RESOURCES": str(tmp_path / "profile"), "HOME": str(tmp_path)}
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "NUMBA_"))}
     command = [*offline, str(python), "-c", SCRIPT, str(archive), str(tmp_path), str(ITERATIONS)]
     done = subprocess.run(command, cwd=tmp_path, env=kept | profile, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

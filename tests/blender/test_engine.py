@@ -1,6 +1,5 @@
 """The render engine against `render_avatar`, through files that Blender writes."""
 
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,12 +25,11 @@ from stga_addon.raster.cpu.harmonics import basis as harmonics  # noqa: E402
 from stga_addon.render.render import render as render_splats  # noqa: E402
 from stga_addon.render.render import render_avatar  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.compat import choose_image_file, enable_nodes  # noqa: E402
+from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
 from stga_addon.scene.light import settings as light_settings  # noqa: E402
-from stga_addon.scene.render import engine, rasterizer, view_transform  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+from stga_addon.scene.render import engine  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
 from .test_splat_object import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
@@ -300,102 +298,6 @@ def test_world_color_is_the_background(tmp_path):
     assert np.abs(displayed(passes, 0.0) - expected).max() < TOLERANCE
 
 
-def test_standard_view_transform_shows_trained_colors(tmp_path):
-    """Catches colors that differ from the trained ones under the Standard view transform."""
-    one = random_splats(1, 1, degree=0)
-    trained = np.array([0.8, 0.5, 0.1], np.float32)
-    wide = replace(
-        one,
-        xyz=np.zeros((1, 3), np.float32),
-        log_scale=np.full((1, 3), np.log(0.3), np.float32),
-        opacity=np.full(1, 20, np.float32),
-        sh=((trained - 0.5) / 0.28209479177387814).reshape(1, 1, 3),
-    )
-    show_world_splats(wide, "wide")
-    active_camera((0, 0, 1))
-    scene = bpy.context.scene
-    scene.view_settings.view_transform, scene.render.dither_intensity = "Standard", 0
-    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
-    scene.render.filepath = str(tmp_path / "image.png")
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    pixels = np.empty(WIDTH * HEIGHT * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    middle = pixels.reshape(HEIGHT, WIDTH, 4)[HEIGHT // 2, WIDTH // 2]
-    np.testing.assert_allclose(middle[:3], trained, atol=0.6 / 255)
-    assert middle[3] > 0.99
-
-
-def skin_tones():
-    """A sheet of soft splats in mid-tones of skin, in front of the camera."""
-    rng, count = np.random.default_rng(8), 600
-    base = rng.uniform(0.3, 0.75, (count, 1))
-    colors = base * [1, 0.8, 0.68] + rng.normal(0, 0.02, (count, 3))
-    splats = replace(
-        random_splats(1, count, degree=0),
-        xyz=np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)]).astype(np.float32),
-        log_scale=np.full((count, 3), -3.2, np.float32),
-        opacity=np.full(count, 3, np.float32),
-        sh=((colors - 0.5) / 0.28209479177387814).astype(np.float32).reshape(count, 1, 3),
-    )
-    show_world_splats(splats, "skin")
-    active_camera((0, 0, 1))
-
-
-def saved_picture(folder: Path, **view: object) -> np.ndarray:
-    """(H, W, 4) values 0 to 255 of the image that Blender saves of a render through these view settings."""
-    scene = bpy.context.scene
-    scene.view_settings.look = "None"
-    scene.view_settings.view_transform = view["view_transform"]  # which says what looks there are
-    for name, value in {"exposure": 0, "gamma": 1, **view}.items():
-        setattr(scene.view_settings, name, value)
-    choose_image_file(scene.render.image_settings, "PNG", "RGBA", "16")
-    scene.render.dither_intensity = 0
-    scene.render.filepath = str(folder / "picture.png")
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    image.colorspace_settings.name = "Non-Color"
-    pixels = np.empty(len(image.pixels), np.float32)
-    image.pixels.foreach_get(pixels)
-    bpy.data.images.remove(image)
-    return 255 * pixels.reshape(HEIGHT, WIDTH, 4)
-
-
-@pytest.mark.parametrize("transparent", [True, False])
-@pytest.mark.parametrize(
-    "view",
-    [
-        {"view_transform": "AgX"},
-        {"view_transform": "Filmic"},
-        {"view_transform": "AgX", "look": "AgX - Medium High Contrast", "exposure": 0.5, "gamma": 1.1},
-        {"view_transform": "Standard", "exposure": -0.5},
-    ],
-)
-def test_view_transforms_show_trained_colors(view, transparent, tmp_path):
-    """Catches colors that a scene in AgX or Filmic changes, at soft edges too, and data that a measurement leaves."""
-    skin_tones()
-    bpy.context.scene.render.film_transparent = transparent
-    trained = saved_picture(tmp_path, view_transform="Standard")
-    before = len(bpy.data.images), len(bpy.data.scenes)
-    shown = saved_picture(tmp_path, **view)
-    assert (len(bpy.data.images), len(bpy.data.scenes)) == before
-    covered = (trained[..., 3] > 128) & (trained[..., :3].min(-1) > 30)
-    assert covered.mean() > 0.3
-    difference = np.abs(shown - trained)[covered]
-    assert difference.mean() <= 1.5
-    assert np.percentile(difference, 99) <= 6
-
-
-def test_standard_needs_no_table():
-    """Catches a table between the trained colors and the image where the view transform needs none."""
-    scene = bpy.context.scene
-    for name in ("Standard", "Raw"):
-        scene.view_settings.view_transform = name
-        assert not view_transform.needs_inverse(scene)
-    scene.view_settings.view_transform = "AgX"
-    assert view_transform.needs_inverse(scene)
-
-
 def test_depth_in_meters(tmp_path):
     """Catches distances instead of depth, and anything but Blender's 1e10 where nothing is."""
     one = random_splats(1, 2, degree=0)
@@ -452,7 +354,7 @@ def _merged(scans, spaces, eye):
         basis = np.zeros((len(splats), 16), np.float32)
         for row, (x, y, z) in zip(basis, direction.astype(np.float32), strict=True):
             row[:] = harmonics(x, y, z)
-        color = np.einsum("nk,nkc->nc", basis[:, :9], splats.sh) / 0.28209479177387814
+        color = np.einsum("nk,nkc->nc", basis[:, :9], splats.sh) / SH_C0
         parts.append(replace(world, sh=color[:, None].astype(np.float32)))
     names = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound", "strain_color")
     return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -550,68 +452,6 @@ def _png(path: Path) -> np.ndarray:
     return pixels
 
 
-@pytest.mark.parametrize("kind", ["ORTHO", "PANO", None])
-def test_unsupported_cameras_are_refused(kind):
-    """Catches a perspective image from a camera of another type."""
-    if kind is not None:
-        camera_at(type=kind)
-    with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is not a perspective camera"):
-        bpy.ops.render.render()
-
-
-def test_changed_topology_is_refused():
-    """Catches splats scattered over a subdivided mesh, and a traceback."""
-    shown, head = show(avatar_of("stga", 10))
-    camera_at()
-    head.modifiers.new("finer", "SUBSURF")
-    with pytest.raises(RuntimeError, match="head: has other triangles than head splats"):
-        bpy.ops.render.render()
-    set_input(shown, splat_nodes.HEAD, None)
-    with pytest.raises(RuntimeError, match="has no head to follow"):
-        bpy.ops.render.render()
-
-
-def test_a_head_in_edit_mode_is_named():
-    """Catches a head that is being edited and is said to have other triangles than its splats."""
-    _, head = show(avatar_of("stga", 10))
-    bpy.context.view_layer.objects.active = head
-    bpy.ops.object.mode_set(mode="EDIT")
-    with pytest.raises(StgaError, match="head: is in Edit Mode; head splats is drawn again when you leave it"):
-        visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
-    bpy.ops.object.mode_set(mode="OBJECT")
-    assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1
-
-
-@pytest.mark.parametrize(
-    ("stage", "raised", "message"),
-    [
-        ("visible_layers", StgaError("head: is broken"), "^Error: head: is broken$"),
-        ("visible_layers", ValueError("of bones"), r"Unexpected error \(ValueError: of bones\); see the console"),
-        ("combined", MemoryError("of pixels"), r"Unexpected error \(MemoryError: of pixels\); see the console"),
-    ],
-)
-def test_failed_render_is_an_error_and_an_empty_image(stage, raised, message, tmp_path, monkeypatch):
-    """Catches an image without passes, which Blender cannot save or crashes over, and a failure saved as an image."""
-
-    def fail(*_: object) -> None:
-        raise raised
-
-    scene = bpy.context.scene
-    scene.render.filepath = str(tmp_path / "failed.png")
-    camera_at()
-    monkeypatch.setattr(engine, stage, fail)
-    with pytest.raises(RuntimeError, match=message) as reported:
-        bpy.ops.render.render(write_still=True)
-    assert str(reported.value).count(str(raised)) == 1
-    assert not any(tmp_path.iterdir())
-    multilayer(scene.render.image_settings)
-    bpy.data.images["Render Result"].save_render(str(tmp_path / "empty.exr"))
-    passes = read_exr(tmp_path / "empty.exr")
-    combined = [values for name, values in passes.items() if "Combined" in name]
-    assert len(combined) == 4
-    assert all(values.shape == (HEIGHT, WIDTH) and not values.any() for values in combined)
-
-
 def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
     """Catches F12 that renders on the CPU where the preferences say GPU, another picture, and a silent failure."""
     from raster import gpu_device
@@ -640,40 +480,3 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
     monkeypatch.setattr(on_gpu, "compose", lost)
     with pytest.raises(RuntimeError, match="Card 9000 was lost; try again"):
         render(tmp_path)
-
-
-def test_panels_drop_the_engine_on_unregister():
-    """Catches panels that still list the engine after it was unregistered."""
-
-    def panels() -> list[str]:
-        every = bpy.types.Panel.__subclasses__()
-        return [panel.__name__ for panel in every if engine.ENGINE in getattr(panel, "COMPAT_ENGINES", ())]
-
-    engine.unregister()
-    assert not panels()
-    engine.register(no_python)
-
-
-def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
-    """Catches preferences, which belong to the main thread, read from a render thread, and an error that is lost."""
-    monkeypatch.setattr(rasterizer, "missing_packages", lambda: ["numba"])
-    answers, callers = [StgaError("no environment"), "python"], []
-
-    def find() -> str:
-        callers.append(threading.current_thread())
-        answer = answers.pop(0)
-        if isinstance(answer, StgaError):
-            raise answer
-        return answer
-
-    environment = rasterizer.Rasterizer(find, lambda: "cpu")
-    environment.update()
-    with pytest.raises(StgaError, match="no environment"):
-        environment.python()
-    environment.update()
-    found: list[str] = []
-    thread = threading.Thread(target=lambda: found.append(environment.python()))
-    thread.start()
-    thread.join()
-    assert found == ["python"]
-    assert callers == [threading.main_thread()] * 2

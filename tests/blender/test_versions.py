@@ -82,7 +82,8 @@ def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_p
 
 def run(python: str, archive: Path, folder: Path) -> dict[str, object]:
     """What `workflow.py` reports, from a fresh Blender profile."""
-    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "profile")}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    environment = kept | {"BLENDER_USER_RESOURCES": str(folder / "profile")}
     command = [python, str(Path(__file__).with_name("workflow.py")), str(archive), str(folder), TRAINING_PYTHON]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

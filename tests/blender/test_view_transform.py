@@ -1,12 +1,21 @@
-"""Inverses of view transforms that are kept for rendering, of several scenes and of animated settings."""
+"""Colors of the engine's images through view transforms, whose inverses are kept of several scenes and settings."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from stga_addon.avatar.splats import SH_C0  # noqa: E402
+from stga_addon.scene.compat import choose_image_file  # noqa: E402
+from stga_addon.scene.display.splat_object import show_world_splats  # noqa: E402
 from stga_addon.scene.render import view_transform  # noqa: E402
 from stga_addon.scene.render.view_transform import inverse_view, measure  # noqa: E402
+
+from .test_engine import HEIGHT, WIDTH, _engine  # noqa: E402, F401
+from .test_splat_object import active_camera, random_splats  # noqa: E402
 
 
 def scene_with(view: str, exposure: float = 0.0):
@@ -45,3 +54,82 @@ def test_an_animated_exposure_keeps_a_few(monkeypatch):
         assert len(view_transform._measured) <= 8
     animated.view_settings.exposure = 4.8
     assert inverse_view(animated) is not None
+
+
+def sheet(color: np.ndarray | None = None) -> None:
+    """A sheet of soft splats of one color, else of mid-tones of skin, in front of the camera."""
+    rng, count = np.random.default_rng(8), 600
+    skin = rng.uniform(0.3, 0.75, (count, 1)) * [1, 0.8, 0.68] + rng.normal(0, 0.02, (count, 3))
+    colors = skin if color is None else np.tile(color, (count, 1))
+    splats = replace(
+        random_splats(1, count, degree=0),
+        xyz=np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)]).astype(np.float32),
+        log_scale=np.full((count, 3), -3.2, np.float32),
+        opacity=np.full(count, 3, np.float32),
+        sh=((colors - 0.5) / SH_C0).astype(np.float32).reshape(count, 1, 3),
+    )
+    show_world_splats(splats, "skin")
+    active_camera((0, 0, 1))
+
+
+def saved_picture(folder: Path, **view: object) -> np.ndarray:
+    """(H, W, 4) values 0 to 255 of the image that Blender saves of a render through these view settings."""
+    scene = bpy.context.scene
+    scene.view_settings.look = "None"
+    scene.view_settings.view_transform = view["view_transform"]  # which says what looks there are
+    for name, value in {"exposure": 0, "gamma": 1, **view}.items():
+        setattr(scene.view_settings, name, value)
+    choose_image_file(scene.render.image_settings, "PNG", "RGBA", "16")
+    scene.render.dither_intensity = 0
+    scene.render.filepath = str(folder / "picture.png")
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(scene.render.filepath)
+    image.colorspace_settings.name = "Non-Color"
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    bpy.data.images.remove(image)
+    return 255 * pixels.reshape(HEIGHT, WIDTH, 4)
+
+
+def test_standard_view_transform_shows_trained_colors(tmp_path):
+    """Catches colors that differ from the trained ones under the Standard view transform."""
+    trained = np.array([0.8, 0.5, 0.1])
+    sheet(trained)
+    middle = saved_picture(tmp_path, view_transform="Standard")[HEIGHT // 2, WIDTH // 2]
+    np.testing.assert_allclose(middle[:3], 255 * trained, atol=0.6)
+    assert middle[3] > 0.99 * 255
+
+
+@pytest.mark.parametrize("transparent", [True, False])
+@pytest.mark.parametrize(
+    "view",
+    [
+        {"view_transform": "AgX"},
+        {"view_transform": "Filmic"},
+        {"view_transform": "AgX", "look": "AgX - Medium High Contrast", "exposure": 0.5, "gamma": 1.1},
+        {"view_transform": "Standard", "exposure": -0.5},
+    ],
+)
+def test_view_transforms_show_trained_colors(view, transparent, tmp_path):
+    """Catches colors that a scene in AgX or Filmic changes, at soft edges too, and data that a measurement leaves."""
+    sheet()
+    bpy.context.scene.render.film_transparent = transparent
+    trained = saved_picture(tmp_path, view_transform="Standard")
+    before = len(bpy.data.images), len(bpy.data.scenes)
+    shown = saved_picture(tmp_path, **view)
+    assert (len(bpy.data.images), len(bpy.data.scenes)) == before
+    covered = (trained[..., 3] > 128) & (trained[..., :3].min(-1) > 30)
+    assert covered.mean() > 0.3
+    difference = np.abs(shown - trained)[covered]
+    assert difference.mean() <= 1.5
+    assert np.percentile(difference, 99) <= 6
+
+
+def test_standard_needs_no_table():
+    """Catches a table between the trained colors and the image where the view transform needs none."""
+    scene = bpy.context.scene
+    for name in ("Standard", "Raw"):
+        scene.view_settings.view_transform = name
+        assert not view_transform.needs_inverse(scene)
+    scene.view_settings.view_transform = "AgX"
+    assert view_transform.needs_inverse(scene)

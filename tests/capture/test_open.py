@@ -291,7 +291,7 @@ def test_studio_head_without_head_motion(shared_data: Path) -> None:
 
 
 def test_summary(tmp_path: Path) -> None:
-    """Catches counts, gaps, offsets or warnings that `info` would show wrong."""
+    """Catches counts, gaps, offsets or warnings that `info` would show wrong, by one at either end of a gap, too."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
     lines = dict(summarize_capture(open_capture(root, model_file, "opencv")))
     assert lines["layout"] == "flame"
@@ -307,10 +307,6 @@ def test_summary(tmp_path: Path) -> None:
     release = dict(summarize_capture(open_capture(factory.write_release(tmp_path / "release"))))
     assert release["regions"] == "none"
     assert release["given selection"] == "1 timesteps, 0.9% of the triangles on average"
-
-
-def test_spans() -> None:
-    """Catches an off-by-one at either end of a gap."""
     assert format_ranges([4]) == "1: 4"
     assert format_ranges([0, 1, 2]) == "3: 0–2"
     assert format_ranges([0, 2, 3, 7]) == "4: 0, 2–3, 7 (gaps 1, 4–6)"
@@ -352,14 +348,8 @@ def cut(name: str) -> Callable[[Path], object]:
     return lambda root: (root / name).write_bytes((root / name).read_bytes()[:40])
 
 
-def no_mesh_path(root: Path) -> None:
-    factory.edit(root / "transforms_val.json", lambda document: document["frames"][1].pop("mesh_path"))
-
-
-def other_mesh_path(root: Path) -> None:
-    factory.edit(
-        root / "transforms_val.json", lambda document: document["frames"][0].update(mesh_path="meshes/00003.obj")
-    )
+def edited(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], object]:
+    return lambda root: factory.edit(root / "transforms_val.json", lambda document: change(document["frames"]))
 
 
 BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
@@ -375,8 +365,11 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
     (cut("meshes/neutral.obj"), r"neutral\.obj: "),
     (cut("regions.json"), r"regions\.json: is not valid JSON"),
     (cut("fg_masks/00000_00.png"), r"fg_masks/00000_00\.png: is not a readable image"),
-    (no_mesh_path, r"transforms_val\.json: frames\[1\]\.mesh_path: is missing"),
-    (other_mesh_path, r"transforms_val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already"),
+    (edited(lambda frames: frames[1].pop("mesh_path")), r"transforms_val\.json: frames\[1\]\.mesh_path: is missing"),
+    (
+        edited(lambda frames: frames[0].update(mesh_path="meshes/00003.obj")),
+        r"transforms_val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already",
+    ),
 ]
 
 
@@ -469,34 +462,6 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
     factory.write_mesh(tmp_path / "neutral.obj", *factory.ball())
     with pytest.raises(StgaError, match=r"holds no tracked mesh besides .*neutral\.obj"):
         open_capture(tmp_path)
-
-
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
-def test_random_damage_never_escapes(tmp_path: Path, suffix: str) -> None:
-    """Catches any other exception than StgaError, for bytes flipped and files cut at random."""
-    root = factory.write_mesh_capture(tmp_path / "capture", timesteps=(0,), cameras=(0,), suffix=suffix)
-    each_split(root, lambda document: [entry.update(cy=30.0) for entry in document["frames"]])
-    random = np.random.default_rng(4)
-    names = ["transforms_test.json", "regions.json", f"meshes/neutral{suffix}", f"meshes/00000{suffix}"]
-    names += ["images/00000_00.png", "fg_masks/00000_00.png"]
-    refused = 0
-    for round_ in range(120):
-        path = root / names[round_ % len(names)]
-        whole = path.read_bytes()
-        data = bytearray(whole[: random.integers(1, len(whole) + 1)] if random.random() < 0.3 else whole)
-        # The first bytes hold most of the structure.
-        for _ in range(random.integers(1, 6)):
-            data[random.integers(0, min(len(data), 400))] = random.integers(0, 256)
-        path.write_bytes(data)
-        try:
-            capture = open_capture(root)
-            capture.mesh(capture.timesteps[0])
-            view = capture.views["test"][0]
-            read_image(view), read_mask(view)
-        except StgaError:
-            refused += 1
-        path.write_bytes(whole)
-    assert refused > 30
 
 
 def test_a_motion_file_is_a_capture_without_views(tmp_path: Path) -> None:

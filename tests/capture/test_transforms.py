@@ -174,35 +174,15 @@ SKEWED = np.eye(4)
 SKEWED[0, 1] = 0.01
 MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
 MALFORMED: list[tuple[str, Any]] = [
-    ("file_path", None),
-    ("file_path", 3),
-    ("timestep_index", -1),
-    ("timestep_index", 1.5),
-    ("timestep_index", True),
-    ("timestep_index", "3"),
-    ("camera_index", [1]),
-    ("fl_x", 0),
-    ("fl_x", float("nan")),
-    ("fl_x", "200"),
-    ("fl_y", -3.0),
-    ("cx", float("inf")),
-    ("cy", {}),
-    ("w", 0),
-    ("w", 40.5),
-    ("w", 10**9),
-    ("h", True),
-    ("fg_mask_path", 7),
-    ("mesh_path", ["a.obj"]),
-    ("transform_matrix", None),
-    ("transform_matrix", np.eye(3).tolist()),
-    ("transform_matrix", [[1, 0], [0]]),
-    ("transform_matrix", [["a"] * 4] * 4),
-    ("transform_matrix", np.full((4, 4), np.nan).tolist()),
-    ("transform_matrix", (2 * np.eye(4)).tolist()),
-    ("transform_matrix", SKEWED.tolist()),
-    ("transform_matrix", MIRRORED.tolist()),
-    ("transform_matrix", np.zeros((4, 4)).tolist()),
-]
+    ("file_path", None), ("file_path", 3), ("timestep_index", -1), ("timestep_index", 1.5), ("timestep_index", True),
+    ("timestep_index", "3"), ("camera_index", [1]), ("fl_x", 0), ("fl_x", float("nan")), ("fl_x", "200"),
+    ("fl_y", -3.0), ("cx", float("inf")), ("cy", {}), ("w", 0), ("w", 40.5), ("w", 10**9), ("h", True),
+    ("fg_mask_path", 7), ("mesh_path", ["a.obj"]), ("transform_matrix", None),
+    ("transform_matrix", np.eye(3).tolist()), ("transform_matrix", [[1, 0], [0]]),
+    ("transform_matrix", [["a"] * 4] * 4), ("transform_matrix", np.full((4, 4), np.nan).tolist()),
+    ("transform_matrix", (2 * np.eye(4)).tolist()), ("transform_matrix", SKEWED.tolist()),
+    ("transform_matrix", MIRRORED.tolist()), ("transform_matrix", np.zeros((4, 4)).tolist()),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("field", "value"), MALFORMED)

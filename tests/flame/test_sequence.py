@@ -185,13 +185,9 @@ def test_malformed_motions(
 ) -> None:
     # Catches a motion whose arrays disagree about its length, found only when that frame is drawn.
     motion: dict[str, Any] = {
-        "expr": np.zeros((3, 4)),
-        "rotation": np.zeros((3, 3)),
-        "translation": np.zeros((3, 3)),
-        "shape": np.zeros(8),
-        "jaw_pose": np.zeros((3, 3)),
-        "eyes_pose": np.zeros((3, 6)),
-    }
+        "expr": np.zeros((3, 4)), "rotation": np.zeros((3, 3)), "translation": np.zeros((3, 3)), "shape": np.zeros(8),
+        "jaw_pose": np.zeros((3, 3)), "eyes_pose": np.zeros((3, 6)),
+    }  # fmt: skip
     motion.pop(field, None)
     if value is not None:
         motion[field] = value

@@ -41,8 +41,9 @@ pytest.importorskip("torch")
 
 CASES = int(os.environ.get("STGA_FUZZ_CASES", 100))
 """Of every run of the tests; `make fuzz` tries 20,000."""
-PARTS = 10
-"""Tests that the cases are spread over, so that several processes share them."""
+PARTS = min(10, 1 + CASES // 200)
+"""Tests that the cases are spread over, so that several processes share them; each makes the files anew, which takes
+longer than a hundred cases."""
 FIRST_CASE = int(os.environ.get("STGA_FUZZ_FIRST", 0))
 MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000
@@ -50,42 +51,12 @@ REPORTED_FAILURES = 20
 
 REQUESTS = tuple(kind.__name__ for kind in get_args(ask.Request))
 NUMBERS = [
-    "0",
-    "1",
-    "2",
-    "-1",
-    "nan",
-    "inf",
-    "-inf",
-    "1e308",
-    "1e-320",
-    "0x10",
-    "1_0",
-    "٣",
-    " 1",
-    "",
-    "9" * 400,
-    "many",
-]
+    "0", "1", "2", "-1", "nan", "inf", "-inf", "1e308", "1e-320", "0x10", "1_0", "٣", " 1", "", "9" * 400, "many",
+]  # fmt: skip
 TEXTS = [
-    "",
-    " ",
-    ".",
-    "..",
-    "/",
-    "//",
-    "a\0b",
-    "\ud800",
-    "a" * 300,
-    "a/" * 3000,
-    "ä²−",
-    "\n",
-    "\x1b[2J",
-    "-",
-    "--",
-    "=",
+    "", " ", ".", "..", "/", "//", "a\0b", "\ud800", "a" * 300, "a/" * 3000, "ä²−", "\n", "\x1b[2J", "-", "--", "=",
     "~",
-]
+]  # fmt: skip
 JSON_VALUES: list[Any] = [
     *(None, True, False, 0, 1, -1, 2.5, 10**30, -(10**400), 1e308, 1e-320, float("nan"), float("inf"), -float("inf")),
     *(
@@ -105,23 +76,14 @@ JSON_VALUES: list[Any] = [
     *([], {}, [[]], [None], [0] * 1000, {"": {}}, [[0, 0, 0, 0]] * 4, [1e300] * 3, {"a": [1, {"b": None}]}),
 ]
 ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
-    lambda a: a[:-1] if a.ndim else a.reshape(1),
-    lambda a: a[None],
-    lambda a: a.astype(np.float16),
-    lambda a: np.zeros(0, a.dtype),
-    lambda a: np.zeros((0, *a.shape[1:]), a.dtype),
-    lambda a: np.full_like(a, 0),
-    lambda a: -a if a.dtype.kind in "if" else ~a if a.dtype.kind == "b" else a,
-    lambda a: np.full(a.shape, np.nan),
-    lambda a: np.full(a.shape, 1e30),
-    lambda a: np.full(a.shape, np.inf, np.float32),
-    lambda a: np.full(a.shape, 2**62),
-    lambda a: np.full(a.shape, "x"),
-    lambda a: a.astype(complex) if a.dtype.kind in "if" else a,
-    lambda a: a.astype(bool),
-    lambda a: a.T,
+    lambda a: a[:-1] if a.ndim else a.reshape(1), lambda a: a[None], lambda a: a.astype(np.float16),
+    lambda a: np.zeros(0, a.dtype), lambda a: np.zeros((0, *a.shape[1:]), a.dtype), lambda a: np.full_like(a, 0),
+    lambda a: -a if a.dtype.kind in "if" else ~a if a.dtype.kind == "b" else a, lambda a: np.full(a.shape, np.nan),
+    lambda a: np.full(a.shape, 1e30), lambda a: np.full(a.shape, np.inf, np.float32),
+    lambda a: np.full(a.shape, 2**62), lambda a: np.full(a.shape, "x"),
+    lambda a: a.astype(complex) if a.dtype.kind in "if" else a, lambda a: a.astype(bool), lambda a: a.T,
     lambda a: np.concatenate([a, a]) if a.ndim else a,
-]
+]  # fmt: skip
 BYTES = [b"\xff" * 8, b"\0" * 8, b"-1", b"1e999", b"NaN", b"[", b"]", b'"', b"{}", b"\n", b".", b"\x80", b"99999999999"]
 
 
@@ -506,7 +468,8 @@ def batch(rng: random.Random, case: Path) -> list[str]:
     """Plans, and what a farm is given: jobs themselves are requests, which `perform` is tried with."""
     value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"{b}"', '"../x"', '""', "true"])
     new = some_path(rng, case, "new")
-    (case / "plan.toml").write_text(rng.choice(BATCH_PLANS).format(new=new, value=value), encoding="utf-8")
+    plan = rng.choice(BATCH_PLANS).format(new=new, value=value)
+    (case / "plan.toml").write_bytes(plan.encode("utf-8", "surrogatepass"))
     arguments = ["--dry-run"] if rng.random() < 0.7 else ["--emit", rng.choice(["openjd", "flamenco"])]
     if rng.random() < 0.6:
         return [str(case / "plan.toml"), *arguments, *option(rng, 0.3, "--threads", *NUMBERS)]
@@ -520,26 +483,14 @@ def environment(rng: random.Random, case: Path) -> list[str]:
 
 
 COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = {
-    "info": (3, info),
-    "select": (3, select),
-    "export": (3, export),
-    "drive": (1, drive),
-    "render": (3, render),
-    "eval": (2, evaluate),
-    "train": (1, train),
-    "refine": (0.5, refine),
-    "extend": (0.5, extend),
-    "relight": (0.5, relight),
-    "track": (1, track),
-    "avatar": (0.5, avatar),
+    "info": (3, info), "select": (3, select), "export": (3, export), "drive": (1, drive), "render": (3, render),
+    "eval": (2, evaluate), "train": (1, train), "refine": (0.5, refine), "extend": (0.5, extend),
+    "relight": (0.5, relight), "track": (1, track), "avatar": (0.5, avatar),
     "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{name}" for name in REQUESTS))]),
-    "batch": (1, batch),
-    "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
-    "benchmark": (0.5, benchmark),
-    "demo": (0.2, demo),
-    "environment": (0.2, environment),
+    "batch": (1, batch), "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
+    "benchmark": (0.5, benchmark), "demo": (0.2, demo), "environment": (0.2, environment),
     "x": (0.1, lambda rng, case: []),
-}
+}  # fmt: skip
 
 
 # Damage

@@ -125,15 +125,6 @@ def assert_close(errors: dict[str, float], image: float, gradient: float) -> Non
 
 
 __all__ = [
-    "NAMES",
-    "Scene",
-    "assert_close",
-    "cloud",
-    "compare",
-    "facing",
-    "kernel_gradients",
-    "random_cotangents",
-    "reference_gradients",
-    "rows",
-    "steady_pixels",
-]
+    "NAMES", "Scene", "assert_close", "cloud", "compare", "facing", "kernel_gradients", "random_cotangents",
+    "reference_gradients", "rows", "steady_pixels",
+]  # fmt: skip

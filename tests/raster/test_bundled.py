@@ -25,7 +25,8 @@ print("RESULT", USES_BUNDLED_KERNELS, out.min(), out.max())
 
 
 def run(folder: Path, cache: Path, package: str = "stga_addon", **variables: str) -> str:
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "STGA_CACHE": str(cache), "NUMBA_DEBUG_CACHE": "1"}
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
+    environment |= {"NUMBA_CACHE_DIR": str(cache), "STGA_CACHE": str(cache), "NUMBA_DEBUG_CACHE": "1"}
     command = [sys.executable, "-c", STEP.replace("stga_addon", package)]
     environment |= variables
     return subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=True).stdout

@@ -31,15 +31,10 @@ def simple(**changes):
     views = [{"buffer": 0, "byteOffset": 36 * k, "byteLength": 36} for k in range(2)]
     accessors = [{"bufferView": k, "componentType": 5126, "count": 3, "type": "VEC3"} for k in range(2)]
     document = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": 72}],
-    }
+        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": 72}],
+    }  # fmt: skip
     return glb(document | changes, data)
 
 

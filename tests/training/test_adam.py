@@ -11,14 +11,9 @@ from stga_addon.training.optimize.state import TrainState, new_state
 from .toys import bits, random_splats, random_state
 
 RATES = {
-    "xyz": 1e-3,
-    "rotation": 5e-3,
-    "log_scale": 2e-2,
-    "opacity": 5e-2,
-    "sh": 1e-2,
-    "sh_rest": 1e-3,
+    "xyz": 1e-3, "rotation": 5e-3, "log_scale": 2e-2, "opacity": 5e-2, "sh": 1e-2, "sh_rest": 1e-3,
     "strain_color": 4e-3,
-}
+}  # fmt: skip
 
 
 def set_gradients(state: TrainState, rng: np.random.Generator, scale: float = 1.0) -> None:

@@ -198,7 +198,8 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, tmp_path: Path) -
     """Catches coefficients, moments, averages or ages that a checkpoint of a GPU forgets, and sums in the order of
     chance: every bit must agree, across density control."""
     gpu_device.device()  # or skip
-    run = replace(make_run(squeezed(toy), iterations=14, driven_offsets=("strain_position",)), device="gpu")
+    effects = {"driven_offsets": ("strain_position",), "strain_color": True}
+    run = replace(make_run(squeezed(toy), "selective", iterations=14, **effects), device="gpu")
     broken, whole = tmp_path / "broken", tmp_path / "whole"
     train(squeezed(toy), whole, run)
     train(squeezed(toy), broken, run, report=stop_at(6))

@@ -15,14 +15,9 @@ def test_flat_names_round_trip() -> None:
     flat = tensors_of(state)
     assert len(flat) == 5 * 6 + 6
     some = {
-        "parameters/xyz",
-        "average/sh",
-        "gradients/sh",
-        "first/opacity",
-        "second/rotation",
-        "steps",
+        "parameters/xyz", "average/sh", "gradients/sh", "first/opacity", "second/rotation", "steps",
         "screen_gradient",
-    }
+    }  # fmt: skip
     assert some <= set(flat)
     again = tensors_of(state_of(flat))
     assert list(again) == list(flat)

@@ -7,7 +7,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from capture import factory
-from cli.test_cli import refused
+from cli.conftest import refused
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 

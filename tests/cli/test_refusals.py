@@ -1,0 +1,118 @@
+"""Commands that are refused: one sentence, exit code 2, and nothing written."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from capture import factory
+
+from .conftest import TIMESTEPS, refused
+
+REFUSALS = [
+    # Options that have no effect, or none there
+    ("info {root} --presets", "--presets: has no effect without --json"),
+    ("export {run} --format gltf --frames 0:1 --out {o}",
+     "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web"),
+    ("export {run} --format usd --timestep 1 --out {o}", "--timestep cannot be combined with --format usd"),
+    ("export {run} --format ply --motion-only --out {o}",
+     "--motion-only cannot be combined with --format ply, only with web"),
+    ("export {run} --format spz --fps 30 --out {o}", "--fps cannot be combined with --format spz, only with usd, web"),
+    ("export {run} --format usd --out {o}.usda", "o.usda: expected a name that ends in .usdc or .usdz"),
+    ("refine {run}", "--region: is missing"),
+    ("refine {none} --region mouth --growth 1e9",
+     "stga: setting growth: expected a finite number from 0 up to 100, got 1000000000.0"),
+    ("extend {run}", "CAPTURE: is missing"),
+    ("extend {none} {root} --growth 101", "growth: expected a finite number from 0 up to 100"),
+    # A resumed run goes on as it began
+    *((f"train {{root}} --out {{run}} --resume {option}", f"{option.split()[0]}: this run began with")
+      for option in ("--stop-when-flat", "--target-psnr 30", "--preset final", "--seed 5")),
+    *((f"{command} {{none}} {option} --resume",
+       f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined with --resume, which "
+       "continues the run in RUN as it began")
+      for command, option in (
+        ("refine", "--region mouth"), ("refine", "--frames 1-3"), ("refine", "--growth 0.5"), ("refine", "--budget 1m"),
+        ("refine", "--out anna_2"), ("extend", "--iterations 9"), ("extend", "--seed 1"), ("extend", "smile"))),
+    ("refine {run} --resume", "does not continue another run"),
+    # Captures that are missing, broken, or others
+    ("train {none} --out {o} --iterations 3", "is not a folder"),
+    *((f"{command} {{broken}}{options}", "transforms_val.json: is not valid JSON")
+      for command, options in (("train", " --out {o} --iterations 3"), ("info", ""), ("select", ""))),
+    ("train {bare} --out {o} --iterations 3", "has no training views"),
+    ("eval {moved} --split test", "has other images"),
+    ("train {cameras5} --out {run} --resume",
+     "was trained on {root} (3 cameras, 3 timesteps), but {cameras5} (5 cameras"),
+    ("render {avatar} --capture {coarse} --cameras {cameras} --out {o}", "{coarse}: its mesh has other triangles"),
+    ("export {run} --capture {coarse} --format ply-sequence --out {o}", "{coarse}: its mesh has other triangles"),
+    ("export {run} --format gaussian-avatars --out {o}", "needs the FLAME parameters of a FLAME capture"),
+    # Runs and avatars that are missing, broken, or there already
+    ("train {root} --out {run} --iterations 3", "already holds a run; give --resume"),
+    ("refine {run} --region mouth --out {run}", "already holds a run"),
+    ("train {root} --out {none} --resume", "holds no run"),
+    ("train {root} --out {file} --iterations 3", "cannot be written"),
+    ("eval {avatar}", "avatar.npz"),
+    ("eval {root}", "holds no run"),
+    *((f"render {{folder}}/{name} --capture {{root}} --cameras {{cameras}} --out {{o}}", f"{name}: ")
+      for name in ("half.npz", "foreign.npz", "none.npz")),
+    ("render {folder}/mesh.ply --cameras {cameras} --out {o}", "mesh.ply: "),
+    ("render {folder}/none.ply --cameras {cameras} --out {o}", "none.ply: "),
+    # What a capture has not, or is to keep
+    ("render {avatar} --cameras {cameras} --out {o}", "give --capture"),
+    ("export {avatar} --format ply-sequence --out {o}", "give --capture"),
+    ("export {avatar} --format ply --timestep 1 --out {o}.ply", "give --capture"),
+    ("export {run} --format ply-sequence --frames 7:9 --out {o}", "has no timestep from 7 to 9"),
+    ("export {run} --format ply --timestep 2 --out {o}.ply", "has no timestep 2"),
+    ("render {run} --cameras {later} --out {o}", "has no mesh for timestep 2"),
+    ("refine {run} --region chin", "neither a region of the capture"),
+    ("render {run} --cameras {cameras} --out {root}/meshes/../images --device cpu",
+     "is an image of the capture; choose another --out"),
+]  # fmt: skip
+"""Command -> part of the sentence that refuses it, with the names of `refusable`."""
+
+
+@pytest.fixture(scope="session")
+def refusable(root: Path, trained: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """What REFUSALS name, by name."""
+    folder = tmp_path_factory.mktemp("refusals")
+    names = {name: folder / name for name in ("broken", "bare", "cameras5", "coarse", "moved", "file", "none", "o")}
+    names |= {"run": Path(shutil.copytree(trained, folder / "run")), "avatar": folder / "run" / "avatar.npz"}
+    names |= {
+        "root": Path(shutil.copytree(root, folder / "ball")),
+        "folder": folder,
+        "later": folder / "ball" / "a.json",
+    }
+    names["cameras"] = names["root"] / "transforms_val.json"
+    for name in ("broken", "bare", "coarse"):
+        shutil.copytree(root, names[name])
+    factory.write_mesh_capture(names["cameras5"], TIMESTEPS, range(5))
+    (names["broken"] / "transforms_val.json").write_text('{"frames": [')
+    for split in ("train", "test"):
+        (names["bare"] / f"transforms_{split}.json").unlink()
+    shutil.copytree(trained, names["moved"])
+    factory.edit(names["moved"] / "run.json", lambda document: document.update(capture=str(names["bare"])))
+    factory.edit(names["run"] / "run.json", lambda document: document.update(capture=str(names["root"])))
+    sphere = trimesh.creation.icosphere(1, factory.RADIUS)
+    for path in (names["coarse"] / "meshes").iterdir():
+        factory.write_mesh(path, np.array(sphere.vertices), np.array(sphere.faces))
+    (names["coarse"] / "regions.json").write_text(json.dumps({"mouth": [0, 1, 2]}))
+    shutil.copy(names["cameras"], names["later"])
+    factory.edit(names["later"], lambda document: document["frames"][0].update(timestep_index=2))
+    whole = names["avatar"].read_bytes()
+    (folder / "half.npz").write_bytes(whole[: len(whole) // 2])
+    np.savez(folder / "foreign.npz", a=np.zeros(3))
+    (folder / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    names["file"].write_text("x")
+    return names
+
+
+@pytest.mark.parametrize(("command", "says"), REFUSALS, ids=[command for command, _ in REFUSALS])
+def test_refusals(refusable: dict[str, Path], capsys: pytest.CaptureFixture[str], command: str, says: str) -> None:
+    """Catches a traceback, an option that does nothing, talk of something else, and a command that fails but has made
+    a folder, or overwritten a run or a recording."""
+    before = {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()}
+    assert says.format(**refusable) in refused(capsys, *command.format(**refusable).split())
+    assert {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()} == before
+    assert not refusable["o"].exists()
+    assert not refusable["none"].exists()
