@@ -23,8 +23,10 @@ NOISE_LEVELS = 6.0
 LIGHT_PRIOR = 0.02
 """Weight of the camera's usual lighting in that of a view, as a share of the information of all points."""
 LIGHT_ITERATIONS, TEXTURE_ITERATIONS, MEAN_ITERATIONS = 2, 4, 3
-ALBEDO_SCALE, LIGHT_SCALE, MEAN_SCALE = 6 * NOISE_LEVELS, 2 * NOISE_LEVELS, 3 * NOISE_LEVELS
-"""Differences, in levels, beyond which pixels are outliers: against skin of one color, the texture, and the mean."""
+ALBEDO_SCALE, TEXTURE_SCALE = 6 * NOISE_LEVELS, 4 * NOISE_LEVELS
+LIGHT_SCALE, MEAN_SCALE = 2 * NOISE_LEVELS, 3 * NOISE_LEVELS
+"""Differences, in levels, beyond which pixels are outliers: against skin of one color, the texture as it is found, the
+texture, and the mean."""
 MIN_SHADING, MAX_SHADING = 0.2, 4.0
 OWN_VIEW_PRIOR = 6.0
 """Observations of all cameras that count beside a camera's own in its texture: skin shines differently to each side."""
@@ -147,7 +149,7 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     lights = {own.camera: np.eye(own.basis.shape[1])[0] for own in samples}
     lit, values = [own.values for own in samples], [luma]
     for number in range(TEXTURE_ITERATIONS):
-        scale = LIGHT_SCALE if number else ALBEDO_SCALE
+        scale = TEXTURE_SCALE if number else ALBEDO_SCALE
         found = [fitted_light(s.values[0], values[0], s.basis, s.weight, lights[s.camera], scale) for s in samples]
         for name in lights:
             own = [light for light, s in zip(found, samples, strict=True) if s.camera == name]
@@ -157,7 +159,7 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
         values = [_robust_mean([own[level] for own in lit], weight) for level in range(len(lit[0]))]
     difference = np.abs(np.stack([own[0] for own in lit]) - values[0])[..., 1:].max(2)
     deviation = (weight * np.minimum(difference, MAX_DEVIATION_LEVELS)).sum(0) / np.maximum(weight.sum(0), 1e-9)
-    trust = np.where(known, 1 / (1 + (deviation / LIGHT_SCALE) ** 2), 0.0)
+    trust = np.where(known, 1 / (1 + (deviation / TEXTURE_SCALE) ** 2), 0.0)
     by_camera = {name: _own_texture(name, samples, lit, weight, values) for name in lights}
     return Texture(by_camera, lights, trust)
 

@@ -15,14 +15,14 @@ from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .seen_surface import large_parts, surface_points
 from .solve import parameter_precision
 
-HEAD_POINTS = 3000
+HEAD_POINTS = 5000
 """Points over the whole head, of which those near landmarks are used; the landmarks' places come on top, because they
 are dense at eyes and lips."""
 FACE_RADIUS_M = 0.035
 """Distance from the landmarks beyond which there is hair and clothes."""
 HELD_OUT = 8
 """One point of so many is not fitted, and tells whether the fit is better."""
-STEPS = (1, 1, 2, 3)
+STEPS = (1, 2, 2, 3)
 """By level: one point of so many is fitted."""
 REGIONS = ("lower face", "middle face", "eyes", "brows")
 REGION_EDGES = (0.4, 0.62, 0.735)
