@@ -14,7 +14,7 @@ from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE
 from ..worker.helpers import Helpers, Step
 from .appearance import Sample, Texture, average_texture, pyramid, robust
-from .dense_head import HELD_OUT_LEVEL, REGIONS, DenseHead
+from .dense_head import HELD_OUT_LEVEL, REGIONS, UPPER_FACE, DenseHead
 from .dense_terms import Misfit, PyramidView, flow_start, misfit, photo_term, samples
 from .fit import HeadFit, TimestepLandmarks, by_visibility, observed_landmarks, triangulated
 from .landmarks import Report
@@ -59,6 +59,8 @@ KEPT_STIFFNESS = 100.0
 MAX_GROWTH, SMALL_MISS_M, MIN_REGION_GAIN = 1.5, 0.001, 0.1
 """Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it: beyond, landmarks are
 the better evidence there. A forehead in wrinkles looks a little more like lowered brows than like raised ones."""
+MAX_UPPER_MISS_M = 0.01
+"""By which landmarks of the upper face may be missed at most: no brow is raised by more."""
 
 
 @dataclass(frozen=True)
@@ -240,13 +242,17 @@ class _Solver:
         return np.where(shot.by_landmarks[self.head.region], 0.0, visible)
 
     def _astray(self, shot: _Shot, texture: Texture, visible: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """(R,) bool: regions that are not explained clearly better, and whose landmarks are missed by much more."""
+        """(R,) bool: regions whose landmarks are missed by much more, though they are not explained clearly better; and
+        those of the upper face that went farther from them than it moves."""
         old, new = (self._evidence(shot, texture, own, visible).regions for own in (shot.start, values))
         was, now = (self._missed(shot.landmarks, own) for own in (shot.start, values))
-        astray = new > (1 - MIN_REGION_GAIN) * old
-        for region in np.flatnonzero(astray):
+        astray = np.zeros(len(REGIONS), bool)
+        for region in range(len(REGIONS)):
             use = (self.head.landmark_region == region) & (shot.landmarks.weight > 0)
-            astray[region] = use.any() and np.median(now[use]) > MAX_GROWTH * np.median(was[use]) + SMALL_MISS_M
+            before, after = (float(np.median(own[use])) if use.any() else 0.0 for own in (was, now))
+            unproven = new[region] > (1 - MIN_REGION_GAIN) * old[region]
+            astray[region] = unproven and after > MAX_GROWTH * before + SMALL_MISS_M
+            astray[region] |= region >= UPPER_FACE and after > before + MAX_UPPER_MISS_M
         return astray
 
     def _refined(self, shot: _Shot, texture: Texture, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

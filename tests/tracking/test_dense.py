@@ -10,6 +10,7 @@ from stga_addon.development.demo.blend_shapes import EXPRESSIONS
 from stga_addon.development.demo.head import synthetic_head
 from stga_addon.development.demo.paint import paint
 from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.tracking import dense
 from stga_addon.tracking.appearance import Sample, average_texture, light_basis
 from stga_addon.tracking.dense import fit_dense
 from stga_addon.tracking.dense_terms import projection_derivative
@@ -39,6 +40,16 @@ class Scene:
     head: HeadModel
     meshes: list
     take: RecordedTake
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Images of a take; a helping process can be handed them."""
+
+    by_timestep: dict
+
+    def __call__(self, timestep, most=None):
+        return self.by_timestep[timestep]
 
 
 def frame_at(opening, timestep):
@@ -75,15 +86,11 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
         mesh = flame_forward(tracked.model, shape, frame)
         closed = flame_forward(tracked.model, shape, replace(frame, jaw_pose=np.zeros(3)))
         points = places.on(mesh - pull * (mesh - closed), tracked.model.faces) + wrong
-        dense = flame_forward(pictured.model, shape, frame)
+        fine = flame_forward(pictured.model, shape, frame)
         meshes.append(mesh)
         landmarks[t] = seen(cameras, points, noise=0.4, seed=t)
-        pictures[t] = [(c, shaded_image(dense, pictured.model.faces, c, colors)) for c in cameras]
-
-    def images(timestep, most=None):
-        return pictures[timestep]
-
-    return Scene(head, meshes, RecordedTake(places, np.ones(300, bool), landmarks, images, metric=True))
+        pictures[t] = [(c, shaded_image(fine, pictured.model.faces, c, colors)) for c in cameras]
+    return Scene(head, meshes, RecordedTake(places, np.ones(300, bool), landmarks, Pictures(pictures), metric=True))
 
 
 def jaw_errors(take, fit):
@@ -174,6 +181,22 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
     assert before[wide].min() > 8
     assert after[wide].mean() < 1.0
     assert (after < before + 0.4).all()
+
+
+@pytest.mark.slow
+def test_result_does_not_depend_on_how_many_processes_help(monkeypatch):
+    """Catches parts that are put together in another order, and what one part leaves behind for the next."""
+    monkeypatch.setattr(dense, "PART_TIMESTEPS", 3)
+    monkeypatch.setattr(dense, "TEXTURE_PART_TIMESTEPS", 3)
+    take = scene(np.radians([-40, 40]), openings=OPENINGS[:6], size=(115, 150))
+    first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
+    alone = fit_dense(first, take.take, Helpers(1))
+    with Helpers(2) as helpers:
+        together = fit_dense(first, take.take, helpers)
+    for timestep, parameters in alone.fit.parameters.items():
+        np.testing.assert_array_equal(together.fit.parameters[timestep], parameters)
+        np.testing.assert_array_equal(together.landmarks[timestep].points, alone.landmarks[timestep].points)
+        assert together.misfit[timestep].all == alone.misfit[timestep].all
 
 
 @pytest.mark.slow
