@@ -7,7 +7,6 @@ under that view's lighting, looks like the images.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -117,64 +116,27 @@ def fit_dense(
     timesteps = sorted(take.landmarks)
     if len(timesteps) < MIN_TIMESTEPS:
         return None
-    head, chosen = DenseHead(fit.head, take.places, take.reliable), evenly_spread(timesteps, TEXTURE_TIMESTEPS)
-    stage, total = "Refinement" if settled else "Dense tracking", 2 * len(chosen) + len(timesteps)
-    in_parts = partial(_in_parts, helpers, fit, take)
-    texture = _texture(head, fit, in_parts, chosen, settled, lambda steps: report(stage, steps, total))
-    some = [(part, texture) for part in parts_of(chosen, TEXTURE_PART_TIMESTEPS)]
-    coarse = in_parts(_started_part, some, lambda steps: report(stage, len(chosen) + steps, total))
+    chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
+    head, total = DenseHead(fit.head, take.places, take.reliable), 2 * len(chosen) + len(timesteps)
+
+    def in_parts(work: Callable[..., list], parts: Sequence[tuple], before: int) -> list:
+        every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
+        stage = "Refinement" if settled else "Dense tracking"
+        results = helpers.map(work, every, lambda steps: report(stage, before + steps, total))
+        return [one for result in results for one in result]
+
+    weights = np.maximum(head.rest([head.reduced(fit.parameters[t]) for t in chosen]), SETTLED_WEIGHT if settled else 0)
+    some = parts_of(chosen, TEXTURE_PART_TIMESTEPS)
+    rows = np.split(weights, np.cumsum([len(part) for part in some])[:-1])
+    texture = average_texture(in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0))
+    coarse = in_parts(_started_part, [(part, texture) for part in some], len(chosen))
     usual = np.quantile(coarse, USUAL_QUANTILE, axis=0)
     parts = [(part, texture, usual, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
-    every = in_parts(_solved_part, parts, lambda steps: report(stage, 2 * len(chosen) + steps, total))
-    solved = dict(zip(timesteps, every, strict=True))
+    solved = dict(zip(timesteps, in_parts(_solved_part, parts, 2 * len(chosen)), strict=True))
     values, terms = np.stack([own.values for own in solved.values()]), [own.terms for own in solved.values()]
     smooth = smooth_take(head.head, values, terms, fit.ordered)
     moved = replace(fit, parameters={t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)})
     return DenseFit(moved, _agreeing(head, moved, take, solved), {t: own.misfit for t, own in solved.items()})
-
-
-def better_posed(
-    surface: HeadFit, dense: HeadFit, take: RecordedTake, helpers: Helpers, done: Callable[[int], None]
-) -> HeadFit:
-    """The head on its surface with the poses that came with it, or with those of dense tracking before it, where these
-    explain more of the images: cameras that stand far apart show no patch alike."""
-    scale = surface.to_capture.scale / dense.to_capture.scale
-    parameters = {t: np.concatenate([own[:-3], scale * own[-3:]]) for t, own in dense.parameters.items()}
-    other = replace(surface, parameters=parameters)
-    return min(surface, other, key=lambda fit: _unexplained(fit, take, helpers, done))
-
-
-def _unexplained(fit: HeadFit, take: RecordedTake, helpers: Helpers, done: Callable[[int], None]) -> float:
-    """Share of the points held out that the fit's own texture does not explain, at the timesteps that it is of."""
-    head, chosen = (
-        DenseHead(fit.head, take.places, take.reliable),
-        evenly_spread(sorted(take.landmarks), TEXTURE_TIMESTEPS),
-    )
-    in_parts = partial(_in_parts, helpers, fit, take)
-    texture = _texture(head, fit, in_parts, chosen, True, done)
-    some = [(part, texture) for part in parts_of(chosen, TEXTURE_PART_TIMESTEPS)]
-    return float(np.mean(in_parts(_unexplained_part, some, done)))
-
-
-def _in_parts(
-    helpers: Helpers, fit: HeadFit, take: RecordedTake, work: Callable[..., list], parts: Sequence[tuple],
-    done: Callable[[int], None],
-) -> list:  # fmt: skip
-    """What work(fit, take, *arguments, step) returns of every part: its timesteps and arguments."""
-    every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
-    return [one for result in helpers.map(work, every, done) for one in result]
-
-
-def _texture(
-    head: DenseHead, fit: HeadFit, in_parts: Callable[..., list], timesteps: Sequence[int], settled: bool,
-    done: Callable[[int], None],
-) -> Texture:  # fmt: skip
-    """The texture that these timesteps show."""
-    least = SETTLED_WEIGHT if settled else 0.0
-    weights = np.maximum(head.rest([head.reduced(fit.parameters[t]) for t in timesteps]), least)
-    parts = parts_of(timesteps, TEXTURE_PART_TIMESTEPS)
-    rows = np.split(weights, np.cumsum([len(part) for part in parts])[:-1])
-    return average_texture(in_parts(_sampled_part, list(zip(parts, rows, strict=True)), done))
 
 
 def _sampled_part(fit: HeadFit, take: RecordedTake, weights: np.ndarray, step: Step) -> list[Sample]:
@@ -193,16 +155,6 @@ def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step
     for timestep in sorted(take.landmarks):
         shot = solver.shot(timestep)
         found.append(solver.started(shot, texture, shot.start, solver.visible(shot, shot.start))[1].regions)
-        step()
-    return found
-
-
-def _unexplained_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> list[float]:
-    """For each timestep of a part, how badly the points that are not fitted are explained."""
-    solver, found = _Solver(fit, take), []
-    for timestep in sorted(take.landmarks):
-        shot = solver.shot(timestep)
-        found.append(solver.evidence(shot, texture, shot.start, solver.visible(shot, shot.start)).all)
         step()
     return found
 
@@ -270,7 +222,7 @@ class _Solver:
     ) -> _Solved:
         """The result, or the start where the result is not better."""
         by_images = self._by_images(shot, visible)
-        old, new = (self.evidence(shot, texture, own, by_images) for own in (shot.start, values))
+        old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, values))
         better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
         if better:
             terms = self._terms(shot, texture, values, visible, 0, *self.head.linearized(values, 0))
@@ -278,10 +230,10 @@ class _Solver:
             values = shot.start
             stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
             terms = stiff, self.head.precision * values  # which the prior does not move
-        found, missed = self.evidence(shot, texture, values, visible), self._missed(shot.landmarks, values)
+        found, missed = self._evidence(shot, texture, values, visible), self._missed(shot.landmarks, values)
         return _Solved(values, visible, terms, coarse, found, missed, better)
 
-    def evidence(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray) -> Misfit:
+    def _evidence(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray) -> Misfit:
         """How badly the points that are not fitted are explained."""
         return misfit(self.head, shot.views, visible, texture, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
 
@@ -292,7 +244,7 @@ class _Solver:
     def _astray(self, shot: _Shot, texture: Texture, visible: np.ndarray, values: np.ndarray) -> np.ndarray:
         """(R,) bool: regions whose landmarks are missed by much more, though they are not explained clearly better; and
         those of the upper face that went farther from them than it moves."""
-        old, new = (self.evidence(shot, texture, own, visible).regions for own in (shot.start, values))
+        old, new = (self._evidence(shot, texture, own, visible).regions for own in (shot.start, values))
         was, now = (self._missed(shot.landmarks, own) for own in (shot.start, values))
         astray = np.zeros(len(REGIONS), bool)
         for region in range(len(REGIONS)):

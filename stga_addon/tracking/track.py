@@ -21,7 +21,7 @@ from ..worker.helpers import Helpers
 from .camera_scale import scale_warnings
 from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
-from .dense import better_posed, fit_dense
+from .dense import fit_dense
 from .dense_head import REGIONS
 from .detectors import make_detector
 from .fit import (
@@ -195,11 +195,7 @@ def _by_images(
     if dense is None:
         return fit_surface(head, fit, take, helpers, report), {}
     take = replace(take, landmarks=dense.landmarks)
-    surface = fit_surface(head, dense.fit, take, helpers, report)
-    if surface is dense.fit:
-        fit = surface
-    else:
-        fit = better_posed(surface, dense.fit, take, helpers, lambda steps: report("Surface", 1, 1))
+    fit = fit_surface(head, dense.fit, take, helpers, report)
     dense = fit_dense(fit, take, helpers, True, report)
     assert dense is not None
     regions = {t: own.regions.tolist() for t, own in dense.misfit.items()}
