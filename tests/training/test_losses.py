@@ -130,6 +130,19 @@ def test_bands_do_not_change_a_bit() -> None:
         np.testing.assert_array_equal(cut, whole)
 
 
+def test_sums_are_added_up_in_one_order() -> None:
+    """Catches a sum whose order LLVM chooses: it was another after another compilation, and where LLVM feared that
+    arrays overlap, with other addresses."""
+    image, target = random_pair(37, 802, seed=3)
+    rows = np.abs(image - np.moveaxis(target, 2, 0) * np.float32(1 / 255))
+    while rows.shape[2] > 1:
+        half = -(-rows.shape[2] // 2)
+        rows[:, :, : rows.shape[2] - half] += rows[:, :, half:]
+        rows = rows[:, :, :half]
+    l1, _ = image_gradient(image, target, whole_image(37, 802), 0.2, np.empty_like(image))
+    assert l1 == np.add.accumulate(rows.ravel(), dtype=np.float64)[-1] * (1 / image.size)
+
+
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.6, 1.0])
 @pytest.mark.parametrize("seed", range(5))
 def test_tile_rectangles_cover_the_marked_tiles(share: float, seed: int) -> None:

@@ -100,27 +100,35 @@ def _similarity_row(moments, stride, padded, similarity, slopes):
 
 @part_jit
 def _sum_row(values, first, past):
-    total = ZERO
-    for n in range(np.uint64(first), np.uint64(past)):
-        total += values[n]
-    return total
+    """Σ values[first:past], which are overwritten: their second half is added to the first until one is left.
+
+    One total would be added up in an order that LLVM chooses, differently from one compilation to the next, or where
+    it is not sure that arrays do not overlap, from one address to the next.
+    """
+    count = past - first
+    while count > 1:
+        half = (count + 1) // 2
+        for n in range(np.uint64(count - half)):
+            values[np.uint64(first) + n] += values[np.uint64(first + half) + n]
+        count = half
+    return values[first]
 
 
 @inline_jit
-def _gradient_row(image, target_row, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient):
-    """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`. Returns Σ |difference|.
+def _gradient_row(
+    image, target_row, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient, differences
+):
+    """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`, and |image − target|.
 
     image, gradient (W,): the row; target_row: the target's, from `keep` on; blurred: the three blurred slopes, `stride`
-    apart.
+    apart; differences: from `first` to `past`.
     """
-    absolute = ZERO
     for n in range(np.uint64(first), np.uint64(past)):
         x, y = image[np.uint64(left) + n], target_row[np.uint64(keep) + n]
         sign = ONE if x > y else (-ONE if x < y else ZERO)
-        absolute += abs(x - y)
+        differences[n] = abs(x - y)
         slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
         gradient[np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
-    return absolute
 
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
@@ -154,7 +162,8 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
             moments = np.zeros(4 * stride, np.float32)
             slopes = np.zeros(3 * stride, np.float32)
             second = np.zeros(3 * RING_ROWS * stride, np.float32)
-            blurred, similarities = np.zeros(3 * stride, np.float32), np.empty(padded, np.float32)
+            blurred = np.zeros(3 * stride, np.float32)
+            similarities, differences = np.empty(padded, np.float32), np.empty(padded, np.float32)
             for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
                 # 1. horizontal blur of this row's four values
                 inside = 0 <= row < height
@@ -202,11 +211,11 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                 for plane in range(3):
                     _blur_column(second, plane, stride, out, blurred, plane * stride, padded)
                 keep = (out % RING_ROWS) * stride
-                absolute = _gradient_row(
+                _gradient_row(
                     image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
-                    gradient[c, out],
+                    gradient[c, out], differences,
                 )  # fmt: skip
-                sums[0, c, first_sum + out] = absolute
+                sums[0, c, first_sum + out] = _sum_row(differences, x0 - left, x1 - left)
         first_job, past_job = next_piece(work)
 
 
