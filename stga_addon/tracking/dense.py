@@ -37,9 +37,9 @@ DISAGREEMENT_M = 0.0015
 """The same, of the distance beyond that at most timesteps, for landmarks of which a fit begins again."""
 START_STEPS, START_LEVEL = ((3, 2), (2, 2)), 2
 """Levels of the pyramid and Gauss–Newton steps in each, for every start; and the level in which starts are compared."""
-FINE_STEPS, EVIDENCE_LEVEL = ((2, 3), (1, 8), (0, 3)), 1
+FINE_STEPS, EVIDENCE_LEVEL = ((2, 3), (1, 16), (0, 3)), 1
 """The same for the best start; and the level in which points that were not fitted tell whether it is better."""
-LAST_STEPS, LAST_ROUNDS = ((1, 6), (0, 4)), 2
+LAST_STEPS, LAST_ROUNDS = ((1, 12), (0, 4)), 2
 """The same for its result where other points are visible than at the start, as in a mouth that opens."""
 OPENINGS_M = 0.008, 0.016
 """By which the chin is moved for further starts."""

@@ -13,7 +13,7 @@ from .fit import HeadFit, by_visibility, observed_landmarks, rigid_start, triang
 from .head_model import HeadModel
 from .landmarks import Report
 from .photo_consistency import Sweep
-from .posed_points import SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .seen_surface import (
     RecordedTake,
     SeenSurface,
@@ -52,6 +52,9 @@ MIN_SEEN_SHARE = 0.5
 
 PART_TIMESTEPS = 24
 """At most, of the parts of a take that are searched at once."""
+FEW_CAMERAS = 3
+"""Cameras that see most timesteps, up to which a timestep's surface is worse evidence than dense tracking: it rests on
+two patches that look alike, of few points."""
 MAX_OUTLINE_CAMERAS = 8
 """Cameras whose masks are compared at every timestep."""
 
@@ -62,13 +65,16 @@ def fit_surface(
     take: RecordedTake,
     helpers: Helpers,
     report: Report = lambda stage, done, total: None,
+    followed: bool = False,
 ) -> HeadFit:
     """The fit moved onto the surface that several cameras see; unchanged where no timestep has landmarks of several
     cameras, or where the images do not show enough of it.
 
     Rounds of finding the surface along the normals, and of solving scale, identity, expression and pose from it, then
     the person's smooth offsets; at last expression and pose of every timestep. Landmarks stay in at a small weight.
-    Timesteps are searched at once, by helping processes. `fit` is what `fit_head` returns for `head`.
+    Timesteps are searched at once, by helping processes. `fit` is what `fit_head` or `fit_dense` returns for `head`.
+    followed: it is dense tracking's. It then takes the landmarks' place at every timestep, because it shows how skin
+    slides along itself, which the surface does not; and of FEW_CAMERAS, it is what the head on its surface follows.
     """
     timesteps = sorted(take.landmarks)
     several = [t for t in timesteps if len(take.landmarks[t].cameras) > 1]
@@ -98,8 +104,14 @@ def fit_surface(
         solved = _identity(head, start, take, points, near, OUTLINE_SWEEPS, search, begin) or solved
     else:
         take = without
+    if followed:
+        observed = _landmarks_of(solved[0], fit, take)
+        if np.median([len(own.cameras) for own in take.landmarks.values()]) <= FEW_CAMERAS:
+            return _following(solved[0], fit, take, observed)
+    else:
+        observed = {t: _landmarks(solved[0], t, take) for t in timesteps}
     often = [_often_seen(points, solved[1], count) for _, count in TAKE_SWEEPS]
-    return _whole_take(solved[0], fit, take, often, lambda work, parts: search(work, parts, early))
+    return _whole_take(solved[0], fit, take, observed, often, lambda work, parts: search(work, parts, early))
 
 
 def _identity(
@@ -186,28 +198,41 @@ def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface], count: i
     return SurfacePoints(points.face[rows], points.barycentric[rows])
 
 
+def _following(fit: HeadFit, first: HeadFit, take: RecordedTake, observed: Mapping[int, Observation]) -> HeadFit:
+    """The fit at the expressions and poses that put the landmarks' places where they were `observed` on `first`, whose
+    parameters would not: they are those of another identity."""
+    start = np.stack([first.parameters[t] for t in observed])
+    solved = solve_take(fit.head, take.places, list(observed.values()), start, fit.ordered)
+    return replace(fit, parameters=dict(zip(observed, solved, strict=True)))
+
+
 def _whole_take(
-    fit: HeadFit, first: HeadFit, take: RecordedTake, points: Sequence[SurfacePoints], search: Callable[..., list]
+    fit: HeadFit,
+    first: HeadFit,
+    take: RecordedTake,
+    observed: Mapping[int, Observation],
+    points: Sequence[SurfacePoints],
+    search: Callable[..., list],
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
 
-    points: for each of TAKE_SWEEPS; search(work, parts): results of the helping processes. What a landmark misses at
-    the timesteps of `fit`, it misses in all: it is taken off.
+    observed: the landmarks; points: for each of TAKE_SWEEPS; search(work, parts): results of the helping processes.
+    What a landmark misses at the timesteps of `fit`, it misses in all: it is taken off.
     """
     timesteps, model = sorted(take.landmarks), fit.head.model
-    bias = _landmark_bias(fit, take)
-    landmarks = []
-    for t in timesteps:
-        own = _landmarks(fit, t, take)
-        landmarks.append(replace(own, position=own.position - bias @ head_rotation(first.parameters[t]).T))
+    bias = _landmark_bias(fit, take.places, observed)
+    landmarks = [
+        replace(observed[t], position=observed[t].position - bias @ head_rotation(first.parameters[t]).T)
+        for t in timesteps
+    ]
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     near = [near_landmarks(fit.head, on, take) for on in points]
-    observed = dict(zip(timesteps, landmarks, strict=True))
+    corrected = dict(zip(timesteps, landmarks, strict=True))
     parts = [
-        (*excerpt(rough, take, part), [observed[t] for t in part], points, near)
+        (*excerpt(rough, take, part), [corrected[t] for t in part], points, near)
         for part in parts_of(timesteps, PART_TIMESTEPS)
     ]
     found, together = zip(*search(_found_part, parts), strict=True)
@@ -239,14 +264,24 @@ def _found_part(
     return results
 
 
-def _landmark_bias(fit: HeadFit, take: RecordedTake) -> np.ndarray:
+def _landmark_bias(fit: HeadFit, places: SurfacePoints, observed: Mapping[int, Observation]) -> np.ndarray:
     """(N, 3) in the turned head's axes: median distance of the landmarks from their places over the timesteps."""
     missed = [
-        (_landmarks(fit, t, take).position - take.places.on(posed_mesh(fit, values), fit.head.model.faces))
-        @ head_rotation(values)
+        (observed[t].position - places.on(posed_mesh(fit, values), fit.head.model.faces)) @ head_rotation(values)
         for t, values in fit.parameters.items()
     ]
     return np.asarray(np.median(missed, axis=0))
+
+
+def _landmarks_of(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
+    """Where the head of `first` has the landmarks' places at every timestep, in the world of the fit."""
+    points, count = PosedPoints(first.head.model, take.places), len(take.reliable)
+    scale, whole = fit.to_capture.scale / first.to_capture.scale, (np.tile(np.eye(3), (count, 1, 1)), np.ones(count))
+    posed = {t: first.parameters[t] for t in sorted(take.landmarks)}
+    return {
+        t: Observation(scale * points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:]), *whole)
+        for t, values in posed.items()
+    }
 
 
 def _landmarks(fit: HeadFit, timestep: int, take: RecordedTake) -> Observation:

@@ -144,7 +144,7 @@ def track(
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
     recorded = RecordedTake(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
     with Helpers() as helpers:
-        fit, misfits = _by_images(head, fit, recorded, helpers, report)
+        fit, misfits = by_images(head, fit, recorded, helpers, report)
     fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)
@@ -187,15 +187,20 @@ def track(
     return result
 
 
-def _by_images(
-    head: HeadModel, fit: HeadFit, take: RecordedTake, helpers: Helpers, report: Report
+def by_images(
+    head: HeadModel,
+    fit: HeadFit,
+    take: RecordedTake,
+    helpers: Helpers,
+    report: Report = lambda stage, done, total: None,
 ) -> tuple[HeadFit, dict[str, dict[int, float]]]:
-    """The fit moved onto what the images show, and region -> timestep -> how badly they are explained (`Misfit`)."""
+    """The fit moved onto what the images show, and region -> timestep -> how badly they are explained (`Misfit`); none
+    where the take is too short for dense tracking. `fit` is what `fit_head` returns for `head`."""
     dense = fit_dense(fit, take, helpers, report=report)
     if dense is None:
         return fit_surface(head, fit, take, helpers, report), {}
     take = replace(take, landmarks=dense.landmarks)
-    fit = fit_surface(head, dense.fit, take, helpers, report)
+    fit = fit_surface(head, dense.fit, take, helpers, report, followed=True)
     dense = fit_dense(fit, take, helpers, True, report)
     assert dense is not None
     regions = {t: own.regions.tolist() for t, own in dense.misfit.items()}
