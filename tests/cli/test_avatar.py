@@ -35,7 +35,7 @@ def made(take, tmp_path_factory):
         patch.setattr(write_capture, "write_json", interrupt)
         # What takes the longest, and is thrown away here
         patch.setattr("stga_addon.tracking.track.fit_dense", lambda *_, **__: None)
-        patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_: fit)
+        patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
         patch.setattr("stga_addon.tracking.track.follow_torso", lambda fit, own, *_: FollowedTorso(fit, own))
         assert make(take, out) == 130
     assert not (out / "run").exists()

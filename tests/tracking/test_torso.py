@@ -278,7 +278,7 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     """Catches a torso that is followed and then not written, or not reported to those who train on the capture; dense
     tracking that `track` does not run, and a report without it."""
     # What takes the longest, and changes neither
-    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_: fit)
+    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
     fit, parameters, footage = lifted
     cameras = [own.camera for own in footage.cameras]
     numbers = {camera.position.tobytes(): number for number, camera in enumerate(cameras)}

@@ -93,7 +93,7 @@ def take(tmp_path_factory, head):
 def recorded(tmp_path, take, monkeypatch):
     """A copy of the take that a test may change, and its meshes. Its blank images are not searched for the surface,
     which would take a third of the time."""
-    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_: fit)
+    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
     folder, meshes = take
     return shutil.copytree(folder, tmp_path, dirs_exist_ok=True), meshes
 
