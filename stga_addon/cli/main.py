@@ -80,6 +80,7 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
     except RecursionError:
         return _fail(f"'{command}': its input is nested too deeply")
     except KeyboardInterrupt:
+        sys.unraisablehook = lambda _: None  # objects that were not made to the end complain when they are collected
         _fail("interrupted")
         return 130
     return 0

@@ -96,3 +96,25 @@ def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path)
     assert error.splitlines()[-1] == "stga: interrupted"
     assert "Compiling kernels:" in error
     assert "Traceback" not in error
+
+
+# A command that is interrupted while a library makes an object, which then complains when it is collected.
+HALF_MADE = """
+import argparse
+from stga_addon.cli import main
+class Half:
+    def __init__(self):
+        raise KeyboardInterrupt
+    def __del__(self):
+        self.handle
+parser = argparse.ArgumentParser()
+parser.set_defaults(command="info", run=lambda options: Half())
+main.make_parser = lambda head: parser
+raise SystemExit(main.main([]))
+"""
+
+
+def test_interruption_says_nothing_of_what_was_half_made() -> None:
+    """Catches the traceback of a library's destructor below the sentence, where Ctrl-C came while it made an object."""
+    done = shell(f"\"{sys.executable}\" -c '{HALF_MADE}'")
+    assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")
