@@ -1,6 +1,7 @@
 """Entry point of the command line: `python -m stga_addon …` and `blender --background … --command stga …`."""
 
 import argparse
+import gc
 import os
 import sys
 from importlib import import_module
@@ -79,11 +80,19 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
         return _fail(f"'{command}' needs more memory than there is")
     except RecursionError:
         return _fail(f"'{command}': its input is nested too deeply")
-    except KeyboardInterrupt:
-        sys.unraisablehook = lambda _: None  # objects that were not made to the end complain when they are collected
+    except KeyboardInterrupt as error:
+        _forget(error)
         _fail("interrupted")
         return 130
     return 0
+
+
+def _forget(error: BaseException) -> None:
+    """Drop what an interruption left unfinished, without what destructors of objects that were half made say."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    error.__traceback__ = error.__context__ = None
+    gc.collect()  # frames that refer to themselves
+    sys.unraisablehook = hook
 
 
 def _fail(message: str) -> int:

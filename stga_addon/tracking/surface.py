@@ -53,8 +53,8 @@ MIN_SEEN_SHARE = 0.5
 PART_TIMESTEPS = 24
 """At most, of the parts of a take that are searched at once."""
 FEW_CAMERAS = 3
-"""Cameras that see most timesteps, up to which a timestep's surface is worse evidence than dense tracking: it rests on
-two patches that look alike, of few points."""
+"""Median over the timesteps of the cameras that see a face, up to which expressions and poses of dense tracking are
+nearer to the truth than those of the surface (docs/experiments.md)."""
 MAX_OUTLINE_CAMERAS = 8
 """Cameras whose masks are compared at every timestep."""
 
@@ -65,16 +65,16 @@ def fit_surface(
     take: RecordedTake,
     helpers: Helpers,
     report: Report = lambda stage, done, total: None,
-    followed: bool = False,
+    dense: bool = False,
 ) -> HeadFit:
     """The fit moved onto the surface that several cameras see; unchanged where no timestep has landmarks of several
     cameras, or where the images do not show enough of it.
 
     Rounds of finding the surface along the normals, and of solving scale, identity, expression and pose from it, then
     the person's smooth offsets; at last expression and pose of every timestep. Landmarks stay in at a small weight.
-    Timesteps are searched at once, by helping processes. `fit` is what `fit_head` or `fit_dense` returns for `head`.
-    followed: it is dense tracking's. It then takes the landmarks' place at every timestep, because it shows how skin
-    slides along itself, which the surface does not; and of FEW_CAMERAS, it is what the head on its surface follows.
+    Timesteps are searched at once, by helping processes. `fit` is what `fit_head` returns for `head`, or, with `dense`,
+    `fit_dense`: landmarks are then where that fit has them, because it knows how skin slides along itself, which the
+    surface does not show; with up to FEW_CAMERAS cameras, its expressions and poses are kept.
     """
     timesteps = sorted(take.landmarks)
     several = [t for t in timesteps if len(take.landmarks[t].cameras) > 1]
@@ -104,10 +104,10 @@ def fit_surface(
         solved = _identity(head, start, take, points, near, OUTLINE_SWEEPS, search, begin) or solved
     else:
         take = without
-    if followed:
-        observed = _landmarks_of(solved[0], fit, take)
+    if dense:
+        observed = _fitted_landmarks(solved[0], fit, take)
         if np.median([len(own.cameras) for own in take.landmarks.values()]) <= FEW_CAMERAS:
-            return _following(solved[0], fit, take, observed)
+            return _posed_alike(solved[0], fit, take, observed)
     else:
         observed = {t: _landmarks(solved[0], t, take) for t in timesteps}
     often = [_often_seen(points, solved[1], count) for _, count in TAKE_SWEEPS]
@@ -198,9 +198,9 @@ def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface], count: i
     return SurfacePoints(points.face[rows], points.barycentric[rows])
 
 
-def _following(fit: HeadFit, first: HeadFit, take: RecordedTake, observed: Mapping[int, Observation]) -> HeadFit:
-    """The fit at the expressions and poses that put the landmarks' places where they were `observed` on `first`, whose
-    parameters would not: they are those of another identity."""
+def _posed_alike(fit: HeadFit, first: HeadFit, take: RecordedTake, observed: Mapping[int, Observation]) -> HeadFit:
+    """The fit with its landmarks where they are on `first`. The parameters of `first` itself would put them elsewhere,
+    because its identity is another."""
     start = np.stack([first.parameters[t] for t in observed])
     solved = solve_take(fit.head, take.places, list(observed.values()), start, fit.ordered)
     return replace(fit, parameters=dict(zip(observed, solved, strict=True)))
@@ -219,18 +219,18 @@ def _whole_take(
     observed: the landmarks; points: for each of TAKE_SWEEPS; search(work, parts): results of the helping processes.
     What a landmark misses at the timesteps of `fit`, it misses in all: it is taken off.
     """
-    timesteps, model = sorted(take.landmarks), fit.head.model
+    timesteps, model = list(observed), fit.head.model
     bias = _landmark_bias(fit, take.places, observed)
-    landmarks = [
-        replace(observed[t], position=observed[t].position - bias @ head_rotation(first.parameters[t]).T)
-        for t in timesteps
-    ]
+    corrected = {
+        t: replace(own, position=own.position - bias @ head_rotation(first.parameters[t]).T)
+        for t, own in observed.items()
+    }
+    landmarks = list(corrected.values())
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     near = [near_landmarks(fit.head, on, take) for on in points]
-    corrected = dict(zip(timesteps, landmarks, strict=True))
     parts = [
         (*excerpt(rough, take, part), [corrected[t] for t in part], points, near)
         for part in parts_of(timesteps, PART_TIMESTEPS)
@@ -273,15 +273,15 @@ def _landmark_bias(fit: HeadFit, places: SurfacePoints, observed: Mapping[int, O
     return np.asarray(np.median(missed, axis=0))
 
 
-def _landmarks_of(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
-    """Where the head of `first` has the landmarks' places at every timestep, in the world of the fit."""
-    points, count = PosedPoints(first.head.model, take.places), len(take.reliable)
-    scale, whole = fit.to_capture.scale / first.to_capture.scale, (np.tile(np.eye(3), (count, 1, 1)), np.ones(count))
-    posed = {t: first.parameters[t] for t in sorted(take.landmarks)}
-    return {
-        t: Observation(scale * points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:]), *whole)
-        for t, values in posed.items()
-    }
+def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
+    """Where the head of `first` has the landmarks at every timestep, in the world of the fit."""
+    points, scale = PosedPoints(first.head.model, take.places), fit.to_capture.scale / first.to_capture.scale
+    count, found = len(take.reliable), {}
+    for timestep in sorted(take.landmarks):
+        parameters = first.parameters[timestep]
+        at = scale * points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+        found[timestep] = Observation(at, np.tile(np.eye(3), (count, 1, 1)), np.ones(count))
+    return found
 
 
 def _landmarks(fit: HeadFit, timestep: int, take: RecordedTake) -> Observation:

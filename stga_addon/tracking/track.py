@@ -200,7 +200,7 @@ def by_images(
     if dense is None:
         return fit_surface(head, fit, take, helpers, report), {}
     take = replace(take, landmarks=dense.landmarks)
-    fit = fit_surface(head, dense.fit, take, helpers, report, followed=True)
+    fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
     dense = fit_dense(fit, take, helpers, True, report)
     assert dense is not None
     regions = {t: own.regions.tolist() for t, own in dense.misfit.items()}

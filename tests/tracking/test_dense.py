@@ -173,7 +173,7 @@ def test_a_short_take_is_left_to_landmarks_and_surface():
 @pytest.mark.slow
 def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
     """Catches tracking that follows landmarks where they fail: they leave the jaw open by two thirds. Three cameras 60
-    degrees apart: too far for the surface that patches show, whose poses must not replace better ones."""
+    degrees apart, and a surface whose poses are worse."""
     take = scene(np.radians([-60, 0, 60]))
     first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
     found, misfit = by_images(take.head, first, take.take, Helpers(1))

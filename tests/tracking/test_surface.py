@@ -171,25 +171,24 @@ def distances(fit, found, true, head, front):
     return nearest_points(true, head.model.faces, back[front])[1]
 
 
-def test_skin_slides_as_dense_tracking_has_it(head):
+@pytest.mark.parametrize(("count", "share"), [(5, 0.6), (3, 0.5)])
+def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     """Catches poses that follow the detector's landmarks where the surface does not tell, or that of three cameras
-    follow a surface of few points: the detector has the lower face 6 mm to one side, at each timestep another."""
-    model = head.model
+    follow the surface: the detector has the lower face 6 mm to one side, at each timestep another."""
+    model, cameras = head.model, rig(count)
     meshes = [flame_forward(model, np.zeros(model.n_identity), frame_at(head, t)) for t in (0, 3, 6)]
     places, reliable, front = places_on(head, 150), np.ones(150, bool), model.v_template[:, 2] > 0.04
     lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]
-    for count, share in ((5, 0.6), (3, 0.5)):
-        cameras, errors = rig(count), []
-        right = {t: seen(cameras, places.on(mesh, model.faces)) for t, mesh in enumerate(meshes)}
-        wrong = {t: seen(cameras, places.on(mesh, model.faces) + (t - 1) * lower) for t, mesh in enumerate(meshes)}
-        pictures = [[(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes]
-        take = RecordedTake(places, reliable, wrong, lambda t, most=None, own=pictures: own[t], metric=True)
-        for followed in (False, True):
-            first = fit_head(head, places, reliable, right if followed else wrong, metric=True)
-            fit = fit_surface(head, first, take, Helpers(1), followed=followed)
-            assert fit.static_offset is not None
-            errors.append(np.mean([slip(fit, t, mesh)[front].mean() for t, mesh in enumerate(meshes)]))
-        assert errors[1] < share * errors[0]
+    right = {t: seen(cameras, places.on(mesh, model.faces)) for t, mesh in enumerate(meshes)}
+    wrong = {t: seen(cameras, places.on(mesh, model.faces) + (t - 1) * lower) for t, mesh in enumerate(meshes)}
+    pictures = [[(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes]
+    take, errors = RecordedTake(places, reliable, wrong, lambda t, most=None: pictures[t], metric=True), []
+    for dense, landmarks in ((False, wrong), (True, right)):
+        first = fit_head(head, places, reliable, landmarks, metric=True)
+        fit = fit_surface(head, first, take, Helpers(1), dense=dense)
+        assert fit.static_offset is not None
+        errors.append(np.mean([slip(fit, t, mesh)[front].mean() for t, mesh in enumerate(meshes)]))
+    assert errors[1] < share * errors[0]
 
 
 def slip(fit, timestep, true):
