@@ -45,7 +45,7 @@ def _stated(job: Job, paces: dict[str, float | None]) -> float | None:
         return request.seconds
     if not isinstance(request, Train):
         return None
-    if request.settings.seconds is not None and not request.preset_time:
+    if request.settings.seconds is not None:
         return request.settings.seconds
     if job.table not in paces:
         paces[job.table] = pace(job, request)

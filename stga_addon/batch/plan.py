@@ -320,7 +320,7 @@ def _expanded(value: Any, folders: Mapping[str, str]) -> Any:
 def _request(where: str, kind: type[Any], values: Mapping[str, Any], base: Path, folder: Path) -> Request:
     """The request of a kind from the fields that are given; the others have their defaults. Raises StgaError."""
     specs, output = {spec.name: spec for spec in fields(kind)}, output_field(kind)
-    _require_keys(where, values, [name for name in specs if name != "preset_time"])
+    _require_keys(where, values, list(specs))
     values = dict(values)
     if output is not None:
         values.setdefault(output, ".")
@@ -361,16 +361,13 @@ def _absolute(base: Path, text: str) -> Path:
 
 
 def _set_training(where: str, values: dict[str, Any]) -> None:
-    """Replace the changes in `settings` by whole settings, as `stga train` makes them: with a preset's own time where
-    no budget is given, and with the effects decided from the capture."""
+    """Replace the changes in `settings` by whole settings, as `stga train` makes them: with the effects decided from
+    the capture."""
     changes = values.get("settings", {})
     if not isinstance(changes, dict):
         raise StgaError(f"{where}: settings: expected a table, got {shorten(changes)}")
     _require_keys(f"{where}: settings", changes, [spec.name for spec in fields(TrainingSettings)])
     changes = dict(changes)
-    values["preset_time"] = "preset" in changes and not {"seconds", "iterations"} & changes.keys()
-    if values["preset_time"]:
-        changes["seconds"] = 1.0  # counts for nothing
     if changes.get("schedule") != "paper" and changes.get("strategy") != "gaussian-avatars":
         changes.setdefault("effects", {})
     nested = {name: changes.pop(name) for name in ("selection", "rates") if name in changes}

@@ -71,14 +71,12 @@ def training_request(options: Namespace) -> Train | Resume:
     if has_run(options.out):
         raise StgaError(f"{options.out}: already holds a run; give --resume to continue it, or another --out")
     settings = training_settings(options)
-    untimed = options.preset is not None and options.budget is None and options.iterations is None
     return Train(
         options.out,
         options.capture,
         settings,
         options.flame,
         principal_point_of(options),
-        preset_time=untimed,
         device=options.device,
         selection=selection,
     )
@@ -90,7 +88,7 @@ def training_settings(options: Namespace) -> TrainingSettings:
     changes: dict[str, Any] = {"target_psnr": options.target_psnr, "stop_when_flat": bool(options.stop_when_flat)}
     if options.iterations is not None:
         changes["iterations"] = options.iterations
-    else:
+    elif options.preset is None or options.budget is not None:
         changes["seconds"] = options.budget or DEFAULT_SECONDS
     for name in ("seed", "strategy"):
         if getattr(options, name) is not None:

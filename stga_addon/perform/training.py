@@ -14,7 +14,7 @@ from ..capture.region import SELECTED_WEIGHT, find_region
 from ..capture.takes import first_timesteps, join_takes, require_same_head, require_same_scale
 from ..errors import StgaError
 from ..export.ply import write_ply
-from ..format import format_duration, format_table
+from ..format import format_table
 from ..progress import Cancelled, Progress, Report, Say
 from ..raster.cpu.precompile import begin_compiling
 from ..render.device import choose_device
@@ -23,7 +23,6 @@ from ..requests.results import Selected, Written
 from ..requests.values import Extend, Refine, Resume, SelectForTake, Train
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.effects.plan import add_effects, describe_effects, plan_effects
-from ..training.preset_timing import time_preset
 from ..training.run.continuation import continued_settings, select_for_takes
 from ..training.run.folder import AVATAR, WORLD_FILE, Continuation, Run, Take, has_run, read_run
 from ..training.run.identity import file_digest, identity_of
@@ -33,6 +32,7 @@ from ..training.run.progress import Progress as TrainingProgress
 from ..training.run.progress import Report as TrainingReport
 from ..training.run.replay import is_faced
 from ..training.run.tracking_file import TRACKING, with_refined_tracking
+from ..training.settings import with_budget
 from ..training.world.world_splats import world_of
 from .relighting import add_light
 
@@ -167,11 +167,9 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     capture = open_capture(request.capture, request.flame, request.principal_point)
     report(Progress(stage="Analyzing the capture"))
     settings, plan = plan_effects(capture, request.settings, device)
-    if request.preset_time:
-        report(Progress(stage="Timing the preset"))
-        timing = time_preset(capture, settings, device=device)
-        say(f"{timing.preset}: {timing.iterations} iterations, {format_duration(timing.seconds)} on this machine")
-        settings = replace(settings, seconds=timing.seconds, iterations=None)
+    settings = with_budget(settings, len(capture.views.get("train", ())))
+    if settings.iterations != request.settings.iterations:
+        say(f"Preset {settings.preset}: {settings.iterations} iterations")
     say(why)
     flame = None if request.flame is None else request.flame.resolve()
     run = Run(capture.root, flame, request.principal_point, settings, plan, device)

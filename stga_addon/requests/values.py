@@ -44,7 +44,6 @@ class Train:
 
     run             folder of the run
     capture, flame, principal_point   as of `open_capture`
-    preset_time     train for as long as the settings' preset takes on the device; their budget then counts for nothing
     selection       timestep -> (F,) bool, trained instead of what the rule selects
     """
 
@@ -53,14 +52,8 @@ class Train:
     settings: TrainingSettings
     flame: Path | None = None
     principal_point: str = setting(DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
-    preset_time: bool = False
     device: str = device_field()
     selection: Mapping[int, np.ndarray] | None = None
-
-    def check(self) -> None:
-        """Raise StgaError where the time is a preset's and there is none."""
-        if self.preset_time and self.settings.preset is None:
-            raise StgaError("preset_time: the settings name no preset")
 
 
 @dataclass(frozen=True)

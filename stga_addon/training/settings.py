@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ..avatar.embedding import CONVENTIONS
@@ -54,7 +54,8 @@ class TrainingSettings:
                    ones, which measured best at equal time (docs/results.md); "gaussian-avatars" is global training
                    with that method's binding, losses and rates; "refine" and "extend" continue a finished run
     schedule       "paper": with `PAPER_SETTINGS` instead of the defaults
-    seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two
+    seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two,
+                          or neither with a preset, which brings its iterations (`with_budget`)
     seed           fixes the order of views and every random choice
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA, embedding)
     convention     embedding convention
@@ -163,10 +164,10 @@ class TrainingSettings:
 
     def check(self) -> None:
         """Raise StgaError for settings at odds with each other, and for rows and names that types do not tell."""
-        if (self.seconds is None) == (self.iterations is None):
-            raise StgaError("the budget must be given either in seconds or in iterations")
         if self.preset not in (None, *PRESETS):
             raise StgaError(complaint("preset", f"one of {', '.join(PRESETS)}", self.preset))
+        if (self.seconds is None) == (self.iterations is None) and (self.seconds or self.preset is None):
+            raise StgaError("the budget must be given either in seconds or in iterations")
         for row in self.exposure:
             if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
                 expected = "rows of a camera index, three gains above 0, three offsets"
@@ -241,6 +242,13 @@ PRESETS = {
     "final": Preset("the best quality of the three", 9000, 6.0, {"growth": 0.6}),
 }
 """Fewer splats are ahead in the first seconds, more of them in the end."""
+
+
+def with_budget(settings: TrainingSettings, views: int) -> TrainingSettings:
+    """The settings with the iterations of their preset for so many training views, where they give no budget."""
+    if settings.preset is None or settings.seconds is not None or settings.iterations is not None:
+        return settings
+    return replace(settings, iterations=PRESETS[settings.preset].iterations_for(views))
 
 
 def make_settings(

@@ -96,13 +96,13 @@ def test_jobs_follow_those_they_come_after(base: Path) -> None:
 
 
 def test_captures_make_a_plan(base: Path) -> None:
-    """Catches captures that do not come out as `stga train` would train them: with a preset, for the preset's time."""
+    """Catches captures that do not come out as `stga train` would train them: with a preset, its iterations."""
     captures = [base / "footage/anna", base / "footage/ben"]
     plan = plan_of_captures(captures, base / "out", {"preset": "draft"}, {"device": "cpu"})
     assert [job.name for job in plan.jobs] == ["train-anna", "train-ben"]
     request = plan.jobs[1].request
     assert isinstance(request, Train)
-    assert (request.preset_time, request.settings.preset, request.settings.lattice) == (True, "draft", 1)
+    assert (request.settings.preset, request.settings.seconds, request.settings.lattice) == ("draft", None, 1)
     assert request.settings.effects == {}
     assert (request.run, request.capture, request.device) == (base / "out/train-ben", captures[1], "cpu")
 

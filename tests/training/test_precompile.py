@@ -20,7 +20,7 @@ import importlib, json, pkgutil, sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 import stga_addon.raster.cpu as kernels
-from stga_addon.raster.cpu.precompile import compile_rasterizer
+from stga_addon.raster.cpu.precompile import compile_gradients, compile_rendering
 from stga_addon.training.optimize import precompile
 from stga_addon.training.run import loop as run_module
 from stga_addon.training.run.metrics_log import read_metrics
@@ -33,10 +33,11 @@ modules = [importlib.import_module(f"{kernels.__name__}.{m.name}") for m in pkgu
 functions = [getattr(f, "__wrapped__", f) for m in modules for f in vars(m).values()]
 found = {f.__module__ + "." + f.__name__: f for f in functions if isinstance(f, Dispatcher)}
 counts = lambda: {name: len(f.signatures) for name, f in found.items()}
-compile_rasterizer()
-by_helper = counts()
+compile_rendering()
+compile_gradients()
+compiled = counts()
 precompile._render()
-assert counts() == by_helper  # what a second process compiles is all of the rasterizer
+assert counts() == compiled  # what two processes compile is all of the rasterizer
 run_module.precompile_kernels()
 before = counts()
 settings = make_settings(

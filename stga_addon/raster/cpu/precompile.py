@@ -1,4 +1,4 @@
-"""Compilation of the rasterizer's kernels, which take more than half of the time, in a second process.
+"""Compilation of the rasterizer's kernels in two processes: rendering in a second one, gradients in the first.
 
 Numba compiles one function at a time per process. The second process needs no torch, so it starts at once.
 """
@@ -18,7 +18,7 @@ from ..kernel_cache import has_kernels
 from . import KERNEL_CACHE_FOLDER
 from .blend import blend_backward, blend_forward
 from .bundled import PACKAGE
-from .layout import PROJECTED, Parameters
+from .layout import PROJECTED, CameraFrames, Parameters, TileLists
 from .project import project_backward, project_forward
 from .rasterize import (
     BLACK_BACKGROUND,
@@ -40,21 +40,21 @@ SHAPES = ((3,), (4,), (3,), (), (16, 3))
 
 
 def begin_compiling() -> None:
-    """Compile the rasterizer in a second process, while this one does something else."""
+    """Compile rendering in a second process, while this one does something else."""
     if not is_preparing():
         rasterizer_helper()
 
 
 @cache
 def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
-    """The process that runs `compile_rasterizer`, started by the first call; None if the kernels are cached already or
+    """The process that runs `compile_rendering`, started by the first call; None if the kernels are cached already or
     a second process would not help.
     """
     if has_kernels(KERNEL_CACHE_FOLDER) or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
         return None
     try:
         return subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import compile_rasterizer; compile_rasterizer()"],
+            [sys.executable, "-c", f"from {__name__} import compile_rendering; compile_rendering()"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -65,16 +65,12 @@ def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
         return None
 
 
-def compile_rasterizer() -> None:
-    """Compile `render_forward` and `render_backward` with the types of real training.
-
-    Two splats that no tile contains: a column of a one-row array is contiguous, which is another type to Numba.
-    """
+def compile_rendering() -> None:
+    """Compile `render_forward` with the types of real training."""
     buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
     tiles, everywhere = np.arange(tiles_x * tiles_y, dtype=np.int32), sum_tiles(np.ones((tiles_y, tiles_x), bool))
-    splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
-    frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
-    face, projection = np.zeros(2, np.int32), new_projection(2, buffers)
+    splats, face, frames = _two_splats()
+    projection = new_projection(2, buffers)
     project_forward(np.arange(2), everywhere, splats, face, frames, 3, False, False, projection)
     projection.rect[:] = 0
     split_splats(np.ones(2, bool))
@@ -85,15 +81,31 @@ def compile_rasterizer() -> None:
     lists, _ = sort_into_tiles(projection, tiles_x, whole_tiles(len(tiles)), buffers)
     blended = new_image(SIZE, SIZE, lists, buffers)
     blend_forward(tiles, tiles_x, whole_tiles(len(tiles)), lists, projection, BLACK_BACKGROUND, blended)
+
+
+def compile_gradients() -> None:
+    """Compile `render_backward` with the types of real training; nothing has to be rendered before."""
+    buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
+    splats, face, frames = _two_splats()
+    tiles, projection = np.arange(tiles_x * tiles_y, dtype=np.int32), new_projection(2, buffers)
+    none, two = np.zeros(0, np.int32), np.zeros(2, np.int32)
+    lists = TileLists(none, two, two, none, np.zeros(len(tiles) + 1, np.int64), none)
     v_image, v_transmittance = np.zeros((3, SIZE, SIZE), np.float32), np.zeros((SIZE, SIZE), np.float32)
-    pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
+    pair_gradients = buffers.get("pair_gradients", (0, PROJECTED))
     blend_backward(
-        tiles, tiles_x, lists, blended, np.ones(2, bool), projection.columns, BLACK_BACKGROUND, v_image,
-        v_transmittance, pair_gradients,
+        tiles, tiles_x, lists, new_image(SIZE, SIZE, lists, buffers), np.ones(2, bool), projection.columns,
+        BLACK_BACKGROUND, v_image, v_transmittance, pair_gradients,
     )  # fmt: skip
+    projection.columns[:] = 1
     # Without rows, no kernel is called: two, each of no pair.
-    projection.columns[:], lists.first_pair[:], lists.pairs[:] = 1, 0, 0
     project_backward(
         np.arange(2, dtype=np.int32), splats, face, frames, 3, False, False, projection.columns, lists,
         pair_gradients, splats, buffers.get("screen_gradient", (2,)),
     )  # fmt: skip
+
+
+def _two_splats() -> tuple[Parameters, np.ndarray, CameraFrames]:
+    # That no tile contains; two, because a column of a one-row array is contiguous, which is another type to Numba.
+    splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
+    frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
+    return splats, np.zeros(2, np.int32), frames

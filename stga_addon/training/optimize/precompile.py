@@ -13,7 +13,7 @@ from ...raster.cpu import USES_BUNDLED_KERNELS
 from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
-from ...raster.cpu.precompile import rasterizer_helper
+from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
 from ...raster.cpu.threads import start_threads
 from ...render.device import adapter_name
@@ -31,7 +31,7 @@ def precompile_kernels(device: str = "cpu") -> None:
     """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate, and the GPU's.
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
-    second process compiles the rasterizer at the same time (`raster.cpu.precompile`). While a process compiles
+    second process compiles rendering at the same time (`raster.cpu.precompile`). While a process compiles
     ahead (`perform.preparation`), this one waits for it, unless it has kernels that are bundled (`raster.cpu.bundled`).
     """
     if not USES_BUNDLED_KERNELS:
@@ -54,6 +54,7 @@ def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
     helper = rasterizer_helper()
     start_threads()
+    compile_gradients()
     _limit()
     _optimize()
     if helper is not None:
