@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 from stga_addon.development.demo.head import synthetic_flame
@@ -242,6 +243,32 @@ def _gap(camera: Camera) -> float:
     """Distance in meters between head and ball as the camera sees them, without the depth."""
     rotation = camera.world_to_camera[:2, :3]
     return float(np.linalg.norm(rotation @ CENTRE)) - 1.1 * 0.06 + RADIUS / 2
+
+
+@pytest.mark.parametrize(("height", "continued"), [(-0.24, True), (0.2, False)])
+def test_a_single_camera_continues_the_torso_that_it_cuts_off(tmp_path: Path, height: float, continued: bool) -> None:
+    """Catches a chest that ends in the air where the image did, and hair that is continued like one."""
+    model = synthetic_flame(0)
+    frame = neutral_frame(model)
+    head = FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame)
+    mesh, views = sequence_mesh(head, TIMESTEP), scene(tmp_path, np.array([0.0, height, 0.0]), 0.08).views
+    side = min(views["train"], key=lambda view: abs(float(view.camera.position[1])))
+    capture = Capture(
+        tmp_path, "flame", model.faces, model.v_template, views, (TIMESTEP,), {},
+        lambda timestep: mesh, lambda timestep, pose: mesh, head,
+    )  # fmt: skip
+    cut, whole = (in_world(capture, flat_points(capture, side, "stga", 0, torso)) for torso in (False, True))
+    pixels = side.camera.project(whole.xyz.astype(np.float64))[0]
+    beyond = ((pixels < 0) | (pixels >= SIZE)).any(axis=1)
+    assert beyond.any() == continued
+    np.testing.assert_allclose(whole.xyz[~beyond], cut.xyz, atol=1e-6)
+    if continued:
+        assert (pixels[beyond, 1] > SIZE).any()
+        assert pixels[beyond, 1].max() < 1.4 * SIZE
+        np.testing.assert_allclose(
+            whole.sh[beyond, 0] * SH_C0 + 0.5, np.tile([90, 250, 40], (beyond.sum(), 1)) / 255, atol=1e-6
+        )
+        assert (whole.opacity[beyond] > 2).all()
 
 
 def test_no_layer_where_nothing_lies_beside_the_mesh(tmp_path: Path) -> None:

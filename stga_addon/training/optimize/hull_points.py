@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_frames, to_local
 from ...avatar.lattice import lattice_weights
-from ...avatar.splats import Splats, joined
+from ...avatar.splats import SH_C0, Splats, joined
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask
 from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
@@ -34,6 +34,9 @@ SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
 FEW_CAMERAS = 4
 """Up to which the visual hull of a torso bulges by centimeters, so that the points of `TorsoPoints` are better."""
+CONTINUED_SHARE, CONTINUED_OPACITY = 0.4, 3.0
+"""How far a torso is continued beyond the image of a single camera, as a share of the image's width; and the logit of
+these splats' opacity, which may never be trained."""
 SEEN_COPIES, SEEN_SPREAD = 3, 0.5
 """Splats for each of these points, and the standard deviation of their distance from it, in voxels."""
 
@@ -89,17 +92,23 @@ def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, t
 
     A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of its pixel, as deep
     as the part of the mesh that is nearest in the image, follows the same triangle as a hull point there, and has its
-    size and distance.
+    size and distance. torso: what the image cuts off below the neck is continued beyond it, as its border looks, for
+    other timesteps that show more; where none does, it stays so.
     """
     mesh, camera = capture.mesh(view.timestep), view.camera
     voxel = voxel_size(mesh)
     samples = _mesh_samples(mesh, capture.faces)
     pixels, depth = camera.project(samples)
     step = max(1.0, voxel * (camera.fl_x + camera.fl_y) / 2 / float(np.median(depth)))
+    neck = capture.flame if torso else None
+    beyond = 0.0 if neck is None else round(CONTINUED_SHARE * camera.width / step) * step
     rows, columns = np.meshgrid(
-        np.arange(step / 2, camera.height, step), np.arange(step / 2, camera.width, step), indexing="ij"
+        np.arange(step / 2, camera.height + beyond, step),
+        np.arange(step / 2 - beyond, camera.width + beyond, step),
+        indexing="ij",
     )
-    beside = (_foreground(view) & ~_silhouette(mesh, capture.faces, camera))[rows.astype(int), columns.astype(int)]
+    pixel = np.clip(rows.astype(int), 0, camera.height - 1), np.clip(columns.astype(int), 0, camera.width - 1)
+    beside = (_foreground(view) & ~_silhouette(mesh, capture.faces, camera))[pixel]
     centers = np.stack([columns[beside], rows[beside]], axis=1)
     if not len(centers):
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
@@ -108,7 +117,14 @@ def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, t
     if torso:
         face = _carried(capture, view.timestep, points, face)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
-    return to_local(_new_splats(points, voxel, sh_degree), frames, face)
+    splats = _new_splats(points, voxel, sh_degree)
+    if neck is None:
+        return to_local(splats, frames, face)
+    cut = ~in_image(points, camera)
+    splats.sh[cut, 0] = (read_image(view)[pixel][beside][cut] / 255 - 0.5) / SH_C0
+    splats.log_scale[cut], splats.opacity[cut] = np.log(voxel), CONTINUED_OPACITY
+    below = below_neck(neck, view.timestep, points)
+    return to_local(splats, frames, face).rows(~cut | below)
 
 
 def voxel_size(mesh: np.ndarray) -> float:
