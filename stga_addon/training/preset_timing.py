@@ -39,28 +39,19 @@ class PresetTiming:
 
 
 def time_presets(capture: Capture, seconds: float = CALIBRATION_S, device: str = "cpu") -> list[PresetTiming]:
-    """Measure each preset with the effects that suit the capture. Arguments and errors as for `time_preset`."""
-    timings = []
-    for name in PRESETS:
-        settings = make_settings(preset=name, iterations=1, effects={})
-        settings, _ = plan_effects(capture, settings, device)
-        timings.append(time_preset(capture, settings, seconds, device))
-    return timings
-
-
-def time_preset(
-    capture: Capture, settings: TrainingSettings, seconds: float = CALIBRATION_S, device: str = "cpu"
-) -> PresetTiming:
-    """Measure settings with a preset, whatever their budget, for `seconds` on a device of `choose_device`.
+    """Measure each preset, with the effects that suit the capture, for `seconds` on a device of `choose_device`.
 
     Raises StgaError if the capture has no training views.
     """
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
-    name = str(settings.preset)
-    iterations = PRESETS[name].iterations_for(len(capture.views["train"]))
-    pace = seconds_per_iteration(capture, settings, seconds, device)
-    return PresetTiming(name, PRESETS[name].purpose, iterations, iterations * pace)
+    timings = []
+    for name, preset in PRESETS.items():
+        settings, _ = plan_effects(capture, make_settings(preset=name, effects={}), device)
+        iterations = preset.iterations_for(len(capture.views["train"]))
+        pace = seconds_per_iteration(capture, settings, seconds, device)
+        timings.append(PresetTiming(name, preset.purpose, iterations, iterations * pace))
+    return timings
 
 
 def seconds_per_iteration(

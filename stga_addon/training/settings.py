@@ -166,7 +166,8 @@ class TrainingSettings:
         """Raise StgaError for settings at odds with each other, and for rows and names that types do not tell."""
         if self.preset not in (None, *PRESETS):
             raise StgaError(complaint("preset", f"one of {', '.join(PRESETS)}", self.preset))
-        if (self.seconds is None) == (self.iterations is None) and (self.seconds or self.preset is None):
+        given = (self.seconds is not None) + (self.iterations is not None)
+        if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")
         for row in self.exposure:
             if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:

@@ -88,8 +88,8 @@ def compile_gradients() -> None:
     buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
     splats, face, frames = _two_splats()
     tiles, projection = np.arange(tiles_x * tiles_y, dtype=np.int32), new_projection(2, buffers)
-    none, two = np.zeros(0, np.int32), np.zeros(2, np.int32)
-    lists = TileLists(none, two, two, none, np.zeros(len(tiles) + 1, np.int64), none)
+    none, by_splat = np.zeros(0, np.int32), np.zeros(2, np.int32)
+    lists = TileLists(none, by_splat, by_splat, none, np.zeros(len(tiles) + 1, np.int64), none)
     v_image, v_transmittance = np.zeros((3, SIZE, SIZE), np.float32), np.zeros((SIZE, SIZE), np.float32)
     pair_gradients = buffers.get("pair_gradients", (0, PROJECTED))
     blend_backward(
