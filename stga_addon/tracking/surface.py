@@ -44,7 +44,8 @@ SURFACE_TIMESTEPS = 6
 LANDMARK_SHARE = 0.05
 """Weight of landmarks beside surface points: a detector's errors are the same in every frame and stay."""
 TAKE_LANDMARK_SHARE = 0.2
-"""The same once these errors are taken off: where skin slides along itself, as brows do, only landmarks show it."""
+"""The same once these errors are taken off, which takes several timesteps: where skin slides along itself, as brows do,
+only landmarks show it."""
 MIN_SEEN_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better evidence."""
 MIN_SEEN_SHARE = 0.5
@@ -231,8 +232,9 @@ def _whole_take(
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     near = [near_landmarks(fit.head, on, take) for on in points]
+    share = TAKE_LANDMARK_SHARE if len(fit.parameters) > 1 else LANDMARK_SHARE
     parts = [
-        (*excerpt(rough, take, part), [corrected[t] for t in part], points, near)
+        (*excerpt(rough, take, part), [corrected[t] for t in part], share, points, near)
         for part in parts_of(timesteps, PART_TIMESTEPS)
     ]
     found, together = zip(*search(_found_part, parts), strict=True)
@@ -244,6 +246,7 @@ def _found_part(
     fit: HeadFit,
     take: RecordedTake,
     landmarks: Sequence[Observation],
+    share: float,
     points: Sequence[SurfacePoints],
     near: Sequence[np.ndarray],
     step: Step,
@@ -257,7 +260,7 @@ def _found_part(
             rough = replace(fit, parameters={t: here})
             seen = seen_surface(rough, t, on, images, sweep, visible_points[stage])
             seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
-            joined = _joined(own, TAKE_LANDMARK_SHARE, seen)
+            joined = _joined(own, share, seen)
             here = solve_take(fit.head, _both(take.places, on), [joined], here[None], ordered=False)[0]
         results.append((here, joined))
         step()
