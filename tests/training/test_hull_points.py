@@ -132,6 +132,27 @@ def test_masks_that_are_missing_are_read_from_white(beside: Capture) -> None:
     np.testing.assert_array_equal(bare.xyz, masked.xyz)
 
 
+@pytest.mark.parametrize(("whole", "shift"), [(10, 1), (6, 1), (4, 9)])
+def test_blocks_leave_nothing_out(
+    beside: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: int, shift: int
+) -> None:
+    """Catches blocks of voxels that are skipped although some of their voxels are in the hull; all but a few images end
+    `shift` pixels behind the ball's first column."""
+    views = list(beside.views["train"])
+    for number, view in enumerate(views[whole:], whole):
+        assert view.mask
+        mask, path = Image.open(view.mask), tmp_path / view.mask.name
+        width = mask.getbbox()[0] + shift
+        mask.crop((0, 0, width, SIZE)).save(path)
+        views[number] = replace(view, camera=replace(view.camera, width=width), mask=path)
+    capture, found = replace(beside, views={"train": tuple(views)}), []
+    for voxels in (1, 5):
+        monkeypatch.setattr("stga_addon.training.optimize.hull_points.BLOCK_VOXELS", voxels)
+        found.append(hull_points(capture, views, "stga", 0).xyz)
+    assert len(found[0]) > 100
+    assert np.array_equal(*found)
+
+
 def test_nothing_near_the_mesh(tmp_path: Path) -> None:
     """Catches points on the skin itself, where the mesh's own splats are; here the ball is half inside the head."""
     capture = scene(tmp_path, np.array([0.04, 0.04, 0.02]), 0.04)

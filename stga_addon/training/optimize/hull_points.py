@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cdt
 from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_frames, to_local
@@ -25,6 +25,8 @@ MIN_MESH_DISTANCE_M = 0.006
 """Points nearer to the mesh are covered by the mesh's own splats."""
 GRID_MARGIN_SHARE = 0.25
 """Margin of the grid around the mesh's bounding box, as a share of its diagonal."""
+BLOCK_VOXELS = 5
+"""Edge of the blocks of voxels that are looked at first."""
 MIN_VISIBLE_SHARE = 0.25
 """Share of the views in whose image a voxel must lie; it must be foreground in all of these."""
 MIN_EXPOSED_SHARE = 0.125
@@ -163,20 +165,57 @@ def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], vo
     low, high = mesh.min(0), mesh.max(0)
     margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = np.ones(len(grid), bool)
-    visible, exposed = np.zeros(len(grid), np.int32), np.zeros(len(grid), np.int32)
-    for view in views:
-        mask, beside = _foreground(view), ~_silhouette(mesh, faces, view.camera)
+    foreground = [_foreground(view) for view in views]
+    within = _unrefuted(axes, voxel, [view.camera for view in views], foreground)
+    points = np.stack([axis[rows] for axis, rows in zip(axes, np.nonzero(within), strict=True)], axis=1)
+    inside = np.ones(len(points), bool)
+    visible, exposed = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for view, mask in zip(views, foreground, strict=True):
+        beside = ~_silhouette(mesh, faces, view.camera)
         remaining = np.flatnonzero(inside)
-        x, y, seen = pixels_of(grid[remaining], view.camera)
+        x, y, seen = pixels_of(points[remaining], view.camera)
         remaining, x, y = remaining[seen], x[seen], y[seen]
         visible[remaining] += 1
         exposed[remaining] += beside[y, x]
         inside[remaining] = mask[y, x]
-    solid = (inside & (visible >= max(2, MIN_VISIBLE_SHARE * len(views)))).reshape([len(a) for a in axes])
-    surface = (solid & ~binary_erosion(solid)).ravel()
-    return np.asarray(grid[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
+    solid = within.copy()
+    solid[within] = inside & (visible >= _needed(len(views)))
+    surface = (solid & ~binary_erosion(solid))[within]
+    return np.asarray(points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
+
+
+def _unrefuted(
+    axes: Sequence[np.ndarray], voxel: float, cameras: Sequence[Camera], foreground: Sequence[np.ndarray]
+) -> np.ndarray:
+    """(X, Y, Z) bool: grid points but for whole blocks, most of them, that are refuted by their ball: it lies in the
+    background of an image, or beside too many images."""
+    centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
+    points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
+    radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
+    kept, beside = np.ones(len(points), bool), np.zeros(len(points), int)
+    for camera, mask in zip(cameras, foreground, strict=True):
+        pixels, depth = camera.project(points)
+        before = depth - radius > MIN_DEPTH_M
+        # Over a ball, x / z differs from the center's by at most radius · |(x, z)| / (z · (z − radius)).
+        focal = [camera.fl_x, camera.fl_y]
+        slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
+        reach = np.ceil((slope * focal).max(1) * radius / np.maximum(depth - radius, MIN_DEPTH_M)) + 1
+        beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
+        beside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
+        # Pixels around an image refute nothing: their background is not known.
+        clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
+        x, y, seen = pixels_of(points, camera)
+        kept &= ~(before & seen & (clear[y, x] > reach))
+    kept &= len(cameras) - beside >= _needed(len(cameras))
+    blocks = kept.reshape([len(along) for along in centers])
+    for number, axis in enumerate(axes):
+        blocks = blocks.repeat(BLOCK_VOXELS, number).take(range(len(axis)), number)
+    return blocks
+
+
+def _needed(views: int) -> float:
+    """Number of views in whose image a voxel must lie."""
+    return max(2, MIN_VISIBLE_SHARE * views)
 
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
