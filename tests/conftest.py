@@ -41,8 +41,8 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # those inherit it
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """One process more than cores, because some tests wait: for a cluster, a browser, an operating system's process."""
-    return min((os.cpu_count() or 1) + 1, MAX_PROCESSES)
+    """Two processes more than cores, because some tests wait: for a cluster, a browser, a process."""
+    return min((os.cpu_count() or 1) + 2, MAX_PROCESSES)
 
 
 # A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in one.

@@ -14,7 +14,7 @@ from stga_addon.batch.engines.table import make_engine
 from stga_addon.errors import StgaError
 
 from .conftest import TrainedHere
-from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
+from .tiny import ITERATIONS, check_interrupted, interrupt_batch, ray_variables, splats_of, tiny_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = """
@@ -69,15 +69,16 @@ cluster.shutdown()
 print(killed, "nodes killed", flush=True)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
-KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
+KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 1))
 """Nodes that are killed; 20 in the measurement of docs/batch.md."""
 
 
 def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
     """Lines that a script prints in a process of its own, which Ray leaves its settings to."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     command = [sys.executable, "-c", script, str(ROOT), *map(str, arguments)]
-    done = subprocess.run(command, env={**kept, **variables}, capture_output=True, text=True, timeout=1200, cwd=ROOT)
+    done = subprocess.run(
+        command, env={**ray_variables(), **variables}, capture_output=True, text=True, timeout=1200, cwd=ROOT
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     return done.stdout.splitlines()
 
@@ -94,7 +95,7 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
     names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))
     assert states == str([(name, "finished", "") for name in names])
     print(killed)
-    assert int(killed.split()[0]) >= KILLS // 2
+    assert int(killed.split()[0]) >= max(1, KILLS // 2)
     here, there = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
     for seed in range(seeds):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")

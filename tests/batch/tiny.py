@@ -21,6 +21,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 ITERATIONS = 400
 """Some seconds of training, so that workers and machines can be killed between checkpoints."""
+RAY_SETTINGS = {
+    "worker_niceness": "0", "health_check_initial_delay_ms": "1000", "health_check_period_ms": "1000",
+    "health_check_failure_threshold": "3",
+}  # fmt: skip
+"""Tasks are as urgent as the tests beside them, which would otherwise hold them up for minutes; a killed node is known
+after seconds, and one that is only slow has Ray's 10 to answer."""
 SETTINGS = {"strategy": "selective", "hull_points": False}
 
 
@@ -46,6 +52,12 @@ def splats_of(plan: Plan, name: str) -> dict[str, bytes]:
     return {key: array.tobytes() for key, array in read_npz(path).items() if key != "header"}
 
 
+def ray_variables() -> dict[str, str]:
+    """This process's variables, but of Ray's only RAY_SETTINGS."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    return kept | {f"RAY_{name}": value for name, value in RAY_SETTINGS.items()}
+
+
 def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     """Exit code and output of `stga batch` on `base`/plan.toml after Ctrl-C, which came when its job `train-good` was
     training and its job `train-bad` had failed."""
@@ -57,9 +69,8 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
         'cases = [{ name = "good", capture = "capture" }, { name = "bad", capture = "bad" }]\n'
     )
     command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]
-    variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     started = subprocess.Popen(
-        command, cwd=ROOT, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command, cwd=ROOT, env=ray_variables(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:

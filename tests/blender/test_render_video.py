@@ -199,7 +199,7 @@ def test_a_recording_keeps_the_last_frame_only(shown, monkeypatch):
 
     def count() -> None:
         gc.collect()
-        counts.append(sum(isinstance(each, posed) for each in gc.get_objects()))
+        counts.append(sum(type(each) is posed for each in gc.get_objects()))
 
     around_each_image(monkeypatch, lambda: None, count)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
