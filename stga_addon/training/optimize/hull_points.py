@@ -188,11 +188,11 @@ def _unrefuted(
     axes: Sequence[np.ndarray], voxel: float, cameras: Sequence[Camera], foreground: Sequence[np.ndarray]
 ) -> np.ndarray:
     """(X, Y, Z) bool: grid points but for whole blocks, most of them, that are refuted by their ball: it lies in the
-    background of an image, or beside too many images."""
+    background of an image, or outside of too many images."""
     centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
     points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
     radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
-    kept, beside = np.ones(len(points), bool), np.zeros(len(points), int)
+    kept, outside = np.ones(len(points), bool), np.zeros(len(points), int)
     for camera, mask in zip(cameras, foreground, strict=True):
         pixels, depth = camera.project(points)
         before = depth - radius > MIN_DEPTH_M
@@ -201,12 +201,12 @@ def _unrefuted(
         slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
         reach = np.ceil((slope * focal).max(1) * radius / np.maximum(depth - radius, MIN_DEPTH_M)) + 1
         beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
-        beside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
+        outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
         # Pixels around an image refute nothing: their background is not known.
         clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
         x, y, seen = pixels_of(points, camera)
         kept &= ~(before & seen & (clear[y, x] > reach))
-    kept &= len(cameras) - beside >= _needed(len(cameras))
+    kept &= len(cameras) - outside >= _needed(len(cameras))
     blocks = kept.reshape([len(along) for along in centers])
     for number, axis in enumerate(axes):
         blocks = blocks.repeat(BLOCK_VOXELS, number).take(range(len(axis)), number)
