@@ -4,7 +4,8 @@ BIN := .venv/bin
 # tests/conftest.py says how many processes. `worksteal` gives each of them neighboring tests, so that few fixtures are
 # made twice.
 PARALLEL := -n auto --dist worksteal
-# Where the environment forbids it, every process would compile all modules, and its tests' assertions, anew.
+# Bytecode is kept also where the environment forbids it: each process would compile all modules, and its tests'
+# assertions, anew.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo demo-footage test kernels test-fast test-gui lint lint-web fuzz extension extension-platform extension-complete repository clean

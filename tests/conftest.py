@@ -41,7 +41,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # those inherit it
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Two processes more than cores, because some tests wait: for a cluster, a browser, a process."""
+    """Two processes more than cores, because some tests wait: for a cluster, a browser or another process."""
     return min((os.cpu_count() or 1) + 2, MAX_PROCESSES)
 
 

@@ -69,8 +69,8 @@ cluster.shutdown()
 print(killed, "nodes killed", flush=True)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
-KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 1))
-"""Nodes that are killed; 20 in the measurement of docs/batch.md."""
+KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
+"""Nodes that are killed; 6 in the measurement of docs/batch.md."""
 
 
 def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
@@ -95,7 +95,7 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
     names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))
     assert states == str([(name, "finished", "") for name in names])
     print(killed)
-    assert int(killed.split()[0]) >= max(1, KILLS // 2)
+    assert int(killed.split()[0]) >= KILLS // 2
     here, there = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
     for seed in range(seeds):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")

@@ -199,6 +199,7 @@ def test_a_recording_keeps_the_last_frame_only(shown, monkeypatch):
 
     def count() -> None:
         gc.collect()
+        # Not isinstance, which raises for a weak proxy whose object has gone.
         counts.append(sum(type(each) is posed for each in gc.get_objects()))
 
     around_each_image(monkeypatch, lambda: None, count)

@@ -163,6 +163,22 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     )
 
 
+def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
+    """Catches landmarks that count as corrected for the person, although their errors may be the one expression."""
+    model, cameras, places, reliable = head.model, rig(5), places_on(head, 150), np.ones(150, bool)
+    mesh = flame_forward(model, np.zeros(model.n_identity), frame_at(head, 6))
+    wrong = np.random.default_rng(5).normal(0, 0.0018, (150, 3))
+    landmarks = {0: seen(cameras, places.on(mesh, model.faces) + wrong)}
+    pictures = [(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras]
+    take, found = RecordedTake(places, reliable, landmarks, lambda t, most=None: pictures), []
+    first = fit_head(head, places, reliable, landmarks)
+    for share in (0.2, 5.0):
+        monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_SHARE", share)
+        found.append(fit_surface(head, first, take, Helpers(1)).parameters[0])
+    assert np.abs(found[0] - first.parameters[0]).max() > 0.001
+    assert np.array_equal(*found)
+
+
 def distances(fit, found, true, head, front):
     """Distances (N,) of vertices from the true surface along its normals, in meters."""
     from stga_addon.tracking.correspondence import nearest_points

@@ -26,7 +26,7 @@ MIN_MESH_DISTANCE_M = 0.006
 GRID_MARGIN_SHARE = 0.25
 """Margin of the grid around the mesh's bounding box, as a share of its diagonal."""
 BLOCK_VOXELS = 5
-"""Edge of the blocks of voxels that are looked at first."""
+"""Edge of the blocks that are carved before single voxels are, in voxels."""
 MIN_VISIBLE_SHARE = 0.25
 """Share of the views in whose image a voxel must lie; it must be foreground in all of these."""
 MIN_EXPOSED_SHARE = 0.125
@@ -166,7 +166,7 @@ def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], vo
     margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
     foreground = [_foreground(view) for view in views]
-    within = _unrefuted(axes, voxel, [view.camera for view in views], foreground)
+    within = _carved_by_blocks(axes, voxel, [view.camera for view in views], foreground)
     points = np.stack([axis[rows] for axis, rows in zip(axes, np.nonzero(within), strict=True)], axis=1)
     inside = np.ones(len(points), bool)
     visible, exposed = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
@@ -179,16 +179,16 @@ def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], vo
         exposed[remaining] += beside[y, x]
         inside[remaining] = mask[y, x]
     solid = within.copy()
-    solid[within] = inside & (visible >= _needed(len(views)))
+    solid[within] = inside & (visible >= _min_visible_views(len(views)))
     surface = (solid & ~binary_erosion(solid))[within]
     return np.asarray(points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
 
 
-def _unrefuted(
+def _carved_by_blocks(
     axes: Sequence[np.ndarray], voxel: float, cameras: Sequence[Camera], foreground: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """(X, Y, Z) bool: grid points but for whole blocks, most of them, that are refuted by their ball: it lies in the
-    background of an image, or outside of too many images."""
+    """(X, Y, Z) bool: the grid without the blocks whose bounding sphere lies in the background of an image, or outside
+    of too many images."""
     centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
     points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
     radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
@@ -196,24 +196,24 @@ def _unrefuted(
     for camera, mask in zip(cameras, foreground, strict=True):
         pixels, depth = camera.project(points)
         before = depth - radius > MIN_DEPTH_M
-        # Over a ball, x / z differs from the center's by at most radius · |(x, z)| / (z · (z − radius)).
+        # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z − radius)).
         focal = [camera.fl_x, camera.fl_y]
         slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
         reach = np.ceil((slope * focal).max(1) * radius / np.maximum(depth - radius, MIN_DEPTH_M)) + 1
         beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
         outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
-        # Pixels around an image refute nothing: their background is not known.
+        # Beyond an image, what is background is not known.
         clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
         x, y, seen = pixels_of(points, camera)
         kept &= ~(before & seen & (clear[y, x] > reach))
-    kept &= len(cameras) - outside >= _needed(len(cameras))
+    kept &= len(cameras) - outside >= _min_visible_views(len(cameras))
     blocks = kept.reshape([len(along) for along in centers])
     for number, axis in enumerate(axes):
         blocks = blocks.repeat(BLOCK_VOXELS, number).take(range(len(axis)), number)
     return blocks
 
 
-def _needed(views: int) -> float:
+def _min_visible_views(views: int) -> float:
     """Number of views in whose image a voxel must lie."""
     return max(2, MIN_VISIBLE_SHARE * views)
 
