@@ -174,7 +174,7 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
     region = np.any(list(prepared.selection.values()), axis=0)
     base = Trainer(capture, settings, prepared.selection, starting_state(continuation, settings, len(capture.faces)))
-    share = float(region[base.state.face.numpy()].mean())
+    share = float(region[base.state.face].mean())
     grown = replace(settings, growth=share, density_interval=DENSITY_INTERVAL)
     every = view_order(capture.views["train"], 1, seed)
     return {

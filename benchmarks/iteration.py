@@ -165,8 +165,8 @@ def stages(
     pixels, background = width * height, np.ones(3, np.float32)
     tiles_x, tiles_y = tile_grid(width, height)
     state, buffers = new_state(splats), BufferPool()
-    parameters, face = with_strain_color(state.arrays()), state.face.numpy()
-    gradients = with_strain_color(Parameters(*(g.numpy() for g in state.gradients)))
+    parameters, face = with_strain_color(state.parameters), state.face
+    gradients = with_strain_color(state.gradients)
     r = render_forward(parameters, face, frames, 3, background, buffers=buffers)
     lists, columns, rect = r.lists, r.projection.columns, r.projection.rect
     rows = lists.visible
@@ -318,13 +318,13 @@ def compare_opensplat(
     import opensplat  # needs a C++ compiler
 
     state, buffers, background = new_state(splats), BufferPool(), np.ones(3, np.float32)
-    face, gradients = state.face.numpy(), Parameters(*(g.numpy() for g in state.gradients))
+    face, gradients = state.face, state.gradients
 
     def forward():
-        return render_forward(state.arrays(), face, frames, 3, background, buffers=buffers)
+        return render_forward(state.parameters, face, frames, 3, background, buffers=buffers)
 
     def both_ways():
-        render_backward(forward(), state.arrays(), face, frames, v_image, gradients, buffers=buffers)
+        render_backward(forward(), state.parameters, face, frames, v_image, gradients, buffers=buffers)
 
     output = forward()
     v_image = np.empty_like(output.image)

@@ -247,6 +247,21 @@ def test_numpy_is_enough_to_import_the_engine():
     assert done.returncode == 0, done.stderr
 
 
+LOADED = """
+import sys
+from stga_addon.perform.perform import load_ahead
+load_ahead()
+assert "stga_addon.training.run.loop" in sys.modules
+assert "torch" not in sys.modules
+"""
+
+
+def test_training_begins_without_torch():
+    """Catches a worker that waits two seconds for what refining the tracking, LPIPS and autograd alone need."""
+    done = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 SCENE = BLOCKED.replace('"bpy", ', "")
 
 

@@ -22,6 +22,8 @@ from ..worker.status import StatusWriter, status_writer
 
 LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
 """Rooms that a worker which trains loads before it begins."""
+WITH_TORCH = ("flame.forward_torch", "raster.cpu.autograd")
+"""Their modules that take seconds to load; the first is loaded at the start of a training that refines tracking."""
 PREVIEW_INTERVAL_S = 4.0
 """Seconds between two previews of a training."""
 WORK: dict[type[Any], tuple[str, str]] = {
@@ -93,8 +95,9 @@ def load_ahead() -> None:
     for room in LOADED_AHEAD:
         package = import_module(f"..{room}", __package__)
         for module in walk_packages(package.__path__, f"{package.__name__}."):
-            with suppress(ImportError):  # a package that not every Python has, and that nothing here needs
-                import_module(module.name)
+            if not module.name.endswith(WITH_TORCH):
+                with suppress(ImportError):  # a package that not every Python has, and that nothing here needs
+                    import_module(module.name)
 
 
 def resumed(request: Request) -> Request | None:

@@ -18,10 +18,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import torch
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import numpy as np
 from capture import factory
 from training.toys import quick_settings
 
@@ -29,7 +28,7 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.training.optimize.precompile import precompile_kernels
-from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
 from stga_addon.training.run import loop as run_module
@@ -112,12 +111,11 @@ def opened(out: Path, faces: int) -> dict[str, Any]:
 
 
 def same_bits(out: Path, expected: Path) -> bool:
-    ours, theirs = (tensors_of(checkpoints.read_checkpoint(folder).state) for folder in (out, expected))
-    return all(torch.equal(ours[name].view(torch.uint8), theirs[name].view(torch.uint8)) for name in theirs)
+    ours, theirs = (arrays_of(checkpoints.read_checkpoint(folder).state) for folder in (out, expected))
+    return all(np.array_equal(ours[name].view(np.uint8), theirs[name].view(np.uint8)) for name in theirs)
 
 
 def main(root: Path, kills: int) -> dict[str, Any]:
-    torch.set_num_threads(1)
     driver = Driver(root)
     precompile_kernels()
     whole = root / "whole"

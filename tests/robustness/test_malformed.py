@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from capture import factory
 from flame.conftest import model_of, random_arrays
 from PIL import Image
@@ -582,7 +581,7 @@ def test_a_checkpoint_of_an_odd_number_of_coefficients(tmp_path: Path) -> None:
     checkpoint = make_checkpoint()
     for part in ("parameters", "gradients", "first", "second"):
         old = getattr(checkpoint.state, part)
-        setattr(checkpoint.state, part, old._replace(sh=torch.zeros(len(checkpoint.state), 7, 3)))
+        setattr(checkpoint.state, part, old._replace(sh=np.zeros((len(checkpoint.state), 7, 3), np.float32)))
     checkpoints.write_checkpoint(tmp_path, checkpoint)
     assert "7 coefficients" in behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
 

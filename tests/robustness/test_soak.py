@@ -78,7 +78,7 @@ def soak(capture: Capture, until: int, on: int, seed: int = 0) -> Soak:
 
 
 def _step(trainer: Trainer, view, image: np.ndarray, iteration: int, found: Soak) -> None:
-    face = trainer.state.face.numpy().copy()
+    face = trainer.state.face.copy()
     before = bits(trainer.state)
     loss = trainer.step(view, image, iteration / ITERATIONS)
     if loss is not None:
@@ -98,8 +98,8 @@ def _mark(trainer: Trainer, found: Soak) -> None:
     found.memory.append(resident())
     found.counts.append(len(trainer.state))
     for part in ("parameters", "first", "second"):
-        tensors = getattr(trainer.state, part)._asdict()
-        found.broken += [f"{part}/{name}" for name, tensor in tensors.items() if not tensor.isfinite().all()]
+        arrays = getattr(trainer.state, part)._asdict()
+        found.broken += [f"{part}/{name}" for name, array in arrays.items() if not np.isfinite(array).all()]
 
 
 @pytest.fixture(scope="module")

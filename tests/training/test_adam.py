@@ -17,15 +17,15 @@ RATES = {
 
 
 def set_gradients(state: TrainState, rng: np.random.Generator, scale: float = 1.0) -> None:
-    for tensor in state.gradients:
-        tensor.copy_(torch.from_numpy(rng.normal(0, scale, tensor.shape)))
+    for array in state.gradients:
+        array[:] = rng.normal(0, scale, array.shape)
 
 
 def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
     """Each row's parameters as float64 tensors of their own; the view-dependent color apart."""
     rows = []
     for n in range(len(state)):
-        row = {name: t[n].double().clone() for name, t in state.parameters._asdict().items()}
+        row = {name: torch.tensor(a[n], dtype=torch.float64) for name, a in state.parameters._asdict().items()}
         row["sh"], row["sh_rest"] = row["sh"][:1].clone(), row["sh"][1:].clone()
         rows.append({name: value.requires_grad_() for name, value in row.items()})
     return rows
@@ -50,7 +50,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
         set_gradients(state, rng, 10 ** rng.uniform(-8, 0))
         for n, row in enumerate(rows):
             for name, value in row.items():
-                gradient = getattr(state.gradients, name.removesuffix("_rest"))[n].double()
+                gradient = torch.tensor(getattr(state.gradients, name.removesuffix("_rest"))[n], dtype=torch.float64)
                 if name.startswith("sh"):
                     gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
                 value.grad = gradient.clone() if n in listed else None
@@ -59,9 +59,9 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
         for n in listed:
             history[n].append(rows[n]["xyz"].detach().clone())
     for n, values in enumerate(history):
-        average = state.parameters.xyz[n]
+        average = torch.tensor(state.parameters.xyz[n], dtype=torch.float64)
         for count, value in enumerate(values, 1):
-            average = average.double().lerp(value, max(0.2, 4 / (count + 3)))
+            average = average.lerp(value, max(0.2, 4 / (count + 3)))
         np.testing.assert_allclose(state.average.xyz[n], average, rtol=1e-5, atol=25 * RATES["xyz"] * 1e-5)
     for n, row in enumerate(rows):
         for name in ("xyz", "rotation", "log_scale", "opacity", "strain_color"):
@@ -76,8 +76,8 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
 def test_frozen_rows_keep_every_bit() -> None:
     """Catches anything at all happening to rows that are not listed, also where their gradients are large or NaN."""
     state = random_state(40, 7)
-    state.gradients.xyz[3] = torch.nan
-    state.parameters.xyz[5] = torch.tensor([torch.nan, -0.0, 1e-42])
+    state.gradients.xyz[3] = np.nan
+    state.parameters.xyz[5] = [np.nan, -0.0, 1e-42]
     before = bits(state)
     listed = np.array([0, 7, 21, 39], np.int32)
     for _ in range(5):
@@ -101,19 +101,19 @@ def test_first_step_after_the_others_many() -> None:
         adam.step(state, others, RATES)
     state.steps[0] = 10_000
     set_gradients(state, rng)
-    before = {name: t.clone() for name, t in state.parameters._asdict().items()}
+    before = {name: array.copy() for name, array in state.parameters._asdict().items()}
     adam.step(state, np.array([0, 1], np.int32), RATES)
     assert state.steps.tolist() == [10_001, 1]
     for name in ("xyz", "rotation", "log_scale", "opacity"):
         moved = (getattr(state.parameters, name) - before[name])[1]
-        expected = -RATES[name] * getattr(state.gradients, name)[1].sign()
+        expected = -RATES[name] * np.sign(getattr(state.gradients, name)[1])
         np.testing.assert_allclose(moved, expected, rtol=1e-3, atol=1e-7)
     rate = np.array([RATES["sh"], *[RATES["sh_rest"]] * 3])[:, None]
     np.testing.assert_allclose(
-        (state.parameters.sh - before["sh"])[1], -rate * state.gradients.sh[1].sign().numpy(), rtol=1e-3
+        (state.parameters.sh - before["sh"])[1], -rate * np.sign(state.gradients.sh[1]), rtol=1e-3
     )
     # Row 0 has no history but zeros and a full count: (0.1·g) / (√0.001·|g|), corrected by 10,001 steps.
-    expected = -RATES["opacity"] * 0.1 / np.sqrt(0.001 / (1 - 0.999**10_001)) * float(state.gradients.opacity[0].sign())
+    expected = -RATES["opacity"] * 0.1 / np.sqrt(0.001 / (1 - 0.999**10_001)) * np.sign(state.gradients.opacity[0])
     assert float(state.parameters.opacity[0] - before["opacity"][0]) == pytest.approx(expected, rel=1e-3)
 
 
@@ -132,7 +132,7 @@ def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
         np.testing.assert_array_equal(after[f"{part}/sh"][2, rest], before[f"{part}/sh"][2, rest])
         for row in (0, 2, 3):
             assert (after[f"{part}/log_scale"][row] != before[f"{part}/log_scale"][row]).any()
-    assert all(torch.isfinite(t).all() for p in (state.parameters, state.first, state.second) for t in p)
+    assert all(np.isfinite(array).all() for p in (state.parameters, state.first, state.second) for array in p)
 
 
 def test_no_rows() -> None:
@@ -148,30 +148,30 @@ def test_many_rows() -> None:
     """Catches rows that take their neighbours' step counts where the work is cut into blocks for the threads."""
     state = random_state(1500, 7)
     rng = np.random.default_rng(0)
-    state.steps[:] = torch.from_numpy(rng.integers(0, 50, 1500))
+    state.steps[:] = rng.integers(0, 50, 1500)
     rows = np.sort(rng.permutation(1500)[:1100]).astype(np.int32)
-    counts = state.steps.double()[rows] + 1
+    counts = state.steps[rows] + 1.0
     old = {
-        f"{p}/{n}": getattr(getattr(state, p), n)[rows].double()
+        f"{p}/{n}": getattr(getattr(state, p), n)[rows].astype(float)
         for p in ("first", "second")
         for n in RATES
         if n != "sh_rest"
     }
-    before = {name: tensor.double()[rows] for name, tensor in state.parameters._asdict().items()}
+    before = {name: array[rows].astype(float) for name, array in state.parameters._asdict().items()}
     adam.step(state, rows, RATES)
     np.testing.assert_array_equal(state.steps[rows], counts)
     for name, value in before.items():
-        gradient = getattr(state.gradients, name)[rows].double()
-        per_row = counts.reshape(-1, *[1] * (value.dim() - 1))
+        gradient = getattr(state.gradients, name)[rows].astype(float)
+        per_row = counts.reshape(-1, *[1] * (value.ndim - 1))
         mean = (0.9 * old[f"first/{name}"] + 0.1 * gradient) / (1 - 0.9**per_row)
         square = (0.999 * old[f"second/{name}"] + 0.001 * gradient**2) / (1 - 0.999**per_row)
-        rate = torch.full(value.shape[1:], RATES[name], dtype=torch.float64)
+        rate = np.full(value.shape[1:], RATES[name])
         if name == "sh":
             rate[1:] = RATES["sh_rest"]
-        step = rate * mean / square.sqrt()
+        step = rate * mean / np.sqrt(square)
         # Where the random second moment is near zero a step is many rates long, and rounded in proportion.
-        error = (getattr(state.parameters, name)[rows].double() - (value - step)).abs()
-        assert (error <= 1e-6 + 1e-5 * step.abs() + 1e-6 * value.abs()).all(), name
+        error = np.abs(getattr(state.parameters, name)[rows] - (value - step))
+        assert (error <= 1e-6 + 1e-5 * np.abs(step) + 1e-6 * np.abs(value)).all(), name
 
 
 def test_epsilon_is_the_same_share_at_every_image_size() -> None:

@@ -33,7 +33,7 @@ def transmittance_error(capture: Capture, random_background: bool) -> float:
         trainer.step(view, np.full_like(read_image(view), 255), n / 150, read_mask(view))
     errors = []
     for view in capture.views["val"]:
-        splats, frames = trainer.state.arrays(), trainer.frames.of(view.timestep)
+        splats, frames = trainer.state.parameters, trainer.frames.of(view.timestep)
         rendering = trainer._backend._forward(splats, frames, view, np.zeros(3, np.float32), 0)
         mask = read_mask(view)
         assert mask is not None

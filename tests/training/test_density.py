@@ -10,7 +10,7 @@ from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.optimize.density import MIN_OPACITY, control_density
-from stga_addon.training.optimize.state import TrainState, keep_rows, new_state, tensors_of
+from stga_addon.training.optimize.state import TrainState, arrays_of, keep_rows, new_state
 from stga_addon.training.optimize.strategies import DensityControl
 from stga_addon.training.settings import TrainingSettings
 
@@ -23,9 +23,9 @@ FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 def busy_state(listed: list[int]) -> TrainState:
     """Forty splats on six triangles, of which the listed ones have a screen gradient, the first the largest."""
     state = random_state(COUNT, FACES)
-    state.face[:] = torch.arange(COUNT) % FACES
-    state.screen_gradient.zero_()
-    state.gradient_count.fill_(2.0)
+    state.face[:] = np.arange(COUNT) % FACES
+    state.screen_gradient[:] = 0
+    state.gradient_count[:] = 2
     for strength, row in enumerate(reversed(listed), 1):
         state.screen_gradient[row] = float(strength)
     return state
@@ -48,16 +48,16 @@ def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
         if name not in ("screen_gradient", "gradient_count"):
             np.testing.assert_array_equal(after[name][: COUNT - 3], old[survivors], err_msg=name)
     parents = np.tile(listed, 2)  # in the order of their screen_gradient
-    for name, tensor in tensors_of(new).items():
+    for name, array in arrays_of(new).items():
         if name.startswith("first"):
-            assert not tensor[COUNT - 3 :].any()
+            assert not array[COUNT - 3 :].any()
         elif name.startswith(("second", "steps")):
             np.testing.assert_array_equal(after[name][COUNT - 3 :], before[name][parents], err_msg=name)
     for value, average in zip(new.parameters, new.average, strict=True):
-        assert torch.equal(value[COUNT - 3 :], average[COUNT - 3 :])
+        np.testing.assert_array_equal(value[COUNT - 3 :], average[COUNT - 3 :])
     assert not new.screen_gradient.any()
     assert not new.gradient_count.any()
-    assert {len(t) for t in tensors_of(new).values()} == {COUNT + 3}
+    assert {len(array) for array in arrays_of(new).values()} == {COUNT + 3}
 
 
 def test_children_stand_on_either_side_along_the_longest_axis() -> None:
@@ -65,7 +65,7 @@ def test_children_stand_on_either_side_along_the_longest_axis() -> None:
     listed = [3, 17, 30, 8]
     state = busy_state(listed)
     parents = state.splats()
-    state.unseen_share[:] = torch.arange(COUNT) / COUNT
+    state.unseen_share[:] = np.arange(COUNT) / COUNT
     controlled = control(state)
     children = controlled.splats().rows(np.arange(COUNT - 4, COUNT + 4))
     for n, row in enumerate(listed):
@@ -103,7 +103,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
     camera = Camera(64, 64, 128.0, 128.0, 32.0, 32.0, pose)
 
     def cover(state: TrainState) -> np.ndarray:
-        return render_differentiable(Parameters(*state.parameters), camera, degree=0)[1].numpy()
+        return render_differentiable(Parameters(*map(torch.from_numpy, state.parameters)), camera, degree=0)[1].numpy()
 
     state = new_state(splats)
     parent = cover(state)
@@ -141,7 +141,7 @@ def test_turns_end_where_the_splats_have_grown_enough() -> None:
     due = [turns.is_due(iteration, progress) for iteration, progress in ((2, 0.1), (2, 0.2), (3, 0.5), (2, 0.8))]
     assert due == [False, True, False, False]
     for iteration in range(2, 10, 2):
-        state.screen_gradient.fill_(1.0)
+        state.screen_gradient[:] = 1
         state = turns.apply(state, iteration)
         counts.append(len(state))
     assert counts == [44, 48, 50, 50]
@@ -161,8 +161,8 @@ def test_the_screen_gradient_is_a_mean() -> None:
 def test_faint_splats_go_but_no_triangles_last_one() -> None:
     """Catches bald triangles, which nothing would ever fill again; unbound splats do not count as a triangle's own."""
     state = busy_state([])
-    state.unbound[:] = torch.arange(COUNT) % 7 == 3
-    state.parameters.opacity[:] = torch.where(torch.arange(COUNT) < 30, FAINT_LOGIT - 0.1, FAINT_LOGIT + 0.1)
+    state.unbound[:] = np.arange(COUNT) % 7 == 3
+    state.parameters.opacity[:] = np.where(np.arange(COUNT) < 30, FAINT_LOGIT - 0.1, FAINT_LOGIT + 0.1)
     state.parameters.opacity[(state.face == 2)] = FAINT_LOGIT - 1
     state.parameters.opacity[14] = FAINT_LOGIT - 0.5  # the most opaque of triangle 2
     state.parameters.opacity[38] = 3.0
@@ -185,10 +185,10 @@ def test_one_splat_a_triangle_survives_even_when_all_are_transparent_and_have_a_
     """Catches pruning and splitting that together empty a triangle."""
     state = busy_state(list(range(0, COUNT, 2)))
     state.parameters.opacity[:] = -20.0
-    state.unbound[:] = torch.arange(COUNT) % 7 == 0
+    state.unbound[:] = np.arange(COUNT) % 7 == 0
     new = control(state)
     assert set(new.face[~new.unbound].tolist()) == set(range(FACES))
-    assert all(torch.isfinite(t).all() for t in new.parameters)
+    assert all(np.isfinite(array).all() for array in new.parameters)
 
 
 def test_same_random_numbers_same_result() -> None:
@@ -205,4 +205,4 @@ def test_no_splat_is_lost_from_the_input() -> None:
     control(state)
     for name, value in bits(state).items():
         np.testing.assert_array_equal(value, before[name])
-    assert len(keep_rows(state, torch.ones(COUNT, dtype=torch.bool))) == COUNT
+    assert len(keep_rows(state, np.ones(COUNT, bool))) == COUNT

@@ -50,12 +50,12 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
     state = trainer.state
     position = state.driven_offsets["strain_position"]
     before = position.value.copy()
-    kept = [t.clone() for t in state.parameters]
+    kept = [array.copy() for array in state.parameters]
 
     def loss(value: np.ndarray) -> float:
         position.value[:] = value
-        for tensor, was in zip(state.parameters, kept, strict=True):
-            tensor.copy_(was)
+        for array, was in zip(state.parameters, kept, strict=True):
+            array[:] = was
         found = trainer.step(view, target, 0.0)
         assert found is not None
         return found

@@ -148,7 +148,7 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     assert isinstance(step, CpuBackend)
     assert tracking is not None
     view = next(view for view in capture.views["train"] if view.timestep == 3)
-    target, face = read_image(view), trainer.state.face.numpy()
+    target, face = read_image(view), trainer.state.face
     row, before, part = tracking.sequence.timesteps.index(3), tracking.tracked.copy(), GROUPS[name]
     away = np.zeros(before.shape[1])
     away[part] = np.random.default_rng(3).normal(0, AWAY[name], part.stop - part.start)
@@ -163,8 +163,8 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
 
     slope = (differentiate(1.15)[1] - differentiate(0.85)[1]) / 0.3
     rows, _ = differentiate(1.0)
-    gradients, frames = Parameters(*(tensor.numpy() for tensor in trainer.state.gradients)), trainer.frames.of(3)
-    asked = frame_gradient(trainer.state.arrays(), face, gradients, rows, frames)
+    state, frames = trainer.state, trainer.frames.of(3)
+    asked = frame_gradient(state.parameters, face, state.gradients, rows, frames)
     found = tracking.gradient(3, frame_backward(trainer.frames.mesh(3), capture.faces, frames, *asked))
     tracking.tracked = before
     trainer.frames.clear()

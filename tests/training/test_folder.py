@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import checkpoint as checkpoint_files
 from stga_addon.training.run import folder, metrics_log
 from stga_addon.training.run.checkpoint import Checkpoint
@@ -110,13 +110,13 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
     checkpoint = make_checkpoint()
     checkpoint_files.write_checkpoint(tmp_path, checkpoint)
     again = checkpoint_files.read_checkpoint(tmp_path)
-    theirs = tensors_of(again.state)
-    for name, tensor in tensors_of(checkpoint.state).items():
+    theirs = arrays_of(again.state)
+    for name, array in arrays_of(checkpoint.state).items():
         if name.startswith("gradients/"):
-            assert theirs[name].shape == tensor.shape
+            assert theirs[name].shape == array.shape
         else:
-            np.testing.assert_array_equal(theirs[name], tensor, err_msg=name)
-        assert theirs[name].dtype == tensor.dtype
+            np.testing.assert_array_equal(theirs[name], array, err_msg=name)
+        assert theirs[name].dtype == array.dtype
     left, right = ({k: v for k, v in vars(c).items() if k != "state"} for c in (again, checkpoint))
     assert left == right
 
@@ -185,7 +185,7 @@ DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
     "a loss that is no number": ({"meta": meta(losses=[0.5, math.nan])}, "losses is no list of numbers"),
     "identity that is no text": ({"meta": meta(identity=None)}, "identity is no text"),
     "wrong width": ({"parameters/rotation": np.zeros((12, 3), np.float32)}, "parameters/rotation is .*, expected"),
-    "wrong kind": ({"parameters/xyz": np.zeros((12, 3), np.float64)}, "parameters/xyz is torch.float64"),
+    "wrong kind": ({"parameters/xyz": np.zeros((12, 3), np.float64)}, "parameters/xyz is float64"),
     "not finite": ({"parameters/xyz": NOT_FINITE}, "parameters/xyz holds a value that is not finite"),
     "moment of another shape": ({"first/sh": np.zeros((12, 1, 3), np.float32)}, r"/sh is .* \(12, 1, 3\), expected"),
     "coefficients of no degree": ({"parameters/sh": np.zeros((12, 2, 3), np.float32)}, "has 2 coefficients"),

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from raster import gpu_device
 
 from stga_addon.capture.images import read_image
@@ -21,7 +20,7 @@ from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
-from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
+from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.loop import train
@@ -43,10 +42,10 @@ def settings_of(**changes: Any) -> TrainingSettings:
 def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
     """Splats unlike each other, in the middle of training."""
     state = new_state(initial_splats(capture, settings))
-    generator = torch.Generator().manual_seed(0)
+    rng = np.random.default_rng(0)
     for value in state.parameters:
-        value += torch.randn(value.shape, generator=generator) * (1e-3 if value.ndim == 2 else 0.2)
-    state.steps += torch.arange(len(state), dtype=torch.int32) % 7
+        value += rng.normal(0, 1e-3 if value.ndim == 2 else 0.2, value.shape).astype(np.float32)
+    state.steps += np.arange(len(state), dtype=np.int32) % 7
     state.unbound[::5] = True
     state.unseen_share[::5] = 0.7
     return state
@@ -71,7 +70,7 @@ def batch_of(capture: Capture, settings: TrainingSettings, timestep: int = 1, **
 
 def moments(step: Backend) -> dict[str, np.ndarray]:
     """After the first step, a tenth of the gradient."""
-    return {name: tensor.numpy() for name, tensor in step.state.first._asdict().items()}
+    return step.state.first._asdict()
 
 
 @pytest.mark.parametrize("part", ["whole", "mouth", "another background"])
@@ -87,15 +86,15 @@ def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
         changes |= {"mask": mask, "background": np.float32([0.13, 0.82, 0.43])}
     batch = batch_of(toy, settings, **changes)
     cpu, gpu = pair(toy, settings)
-    before = tensors_of(gpu.state)["parameters/xyz"].numpy().copy()
+    before = gpu.state.parameters.xyz
     cpu.step(batch)
     gpu.step(batch)
-    expected, state = tensors_of(cpu.state), tensors_of(gpu.state)
-    assert not np.array_equal(before, expected["parameters/xyz"].numpy())
+    expected, state = arrays_of(cpu.state), arrays_of(gpu.state)
+    assert not np.array_equal(before, expected["parameters/xyz"])
     for name in state:
         if name.startswith("gradients/"):
             continue
-        got, want = state[name].double().numpy(), expected[name].double().numpy()
+        got, want = state[name].astype(float), expected[name].astype(float)
         off = np.abs(got - want) > 2e-4 * np.abs(want).max()
         # The first step is the rate times the gradient's sign, which rounding may turn where the gradient is nothing.
         assert off.mean() < 2e-3 if name.startswith("parameters/") else not off.any(), name
@@ -121,7 +120,7 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> Non
     for _ in range(2):
         gpu.step(batch_of(toy, settings, selected=toy.regions["mouth"]))
     state = gpu.state
-    after, selected = bits(state), toy.regions["mouth"][state.face.numpy()]
+    after, selected = bits(state), toy.regions["mouth"][state.face]
     for name in before:
         np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
     for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
@@ -141,7 +140,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     for name in ("image", "pixels", "v_image", "pair_gradients", "projected", "gradients", "screen"):
         device.upload(name, np.full(device.buffer(name, 0).size // 4, np.nan, np.float32))
     second.step(part)
-    rows = np.flatnonzero(second.state.steps.numpy() != disturbed(toy, settings).steps.numpy())
+    rows = np.flatnonzero(second.state.steps != disturbed(toy, settings).steps)
     assert 0 < device.read(device.buffer("rendered", 0), (8 * 12,), np.uint32).mean() < 0.8
     assert 20 < len(rows) < 0.5 * len(second)
     for name, want in moments(first).items():
@@ -247,7 +246,7 @@ def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:
     settings = settings_of()
     _, step = pair(toy, settings)
     state = step.state
-    state.average.opacity.fill_(-20.0)  # which is what is drawn
+    state.average.opacity[:] = -20  # which is what is drawn
     white = np.ones(3, np.float32)
     assert step.render(view_of(toy, 1), white, 3).min() < 0.9
     step.state = state

@@ -16,7 +16,7 @@ from stga_addon.training.optimize.backend import Batch
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
-from stga_addon.training.optimize.state import new_state, tensors_of
+from stga_addon.training.optimize.state import arrays_of, new_state
 from stga_addon.training.schedule import learning_rates
 
 from .test_trainer import view_of
@@ -57,7 +57,7 @@ def cpu_bytes(capture: Capture, count: int, size: tuple[int, int], log_scale: fl
     backend = CpuBackend(SETTINGS, frames, state)
     backend.step(batch_of(capture, *size))
     buffers = backend._buffers._buffers
-    arrays = [tensor.numpy() for tensor in tensors_of(backend.state).values()] + list(buffers.values())
+    arrays = [*arrays_of(backend.state).values(), *buffers.values()]
     pairs = buffers["pair_blocks"].size * 8 // 9  # an eighth to spare
     return (count, size[0] * size[1], pairs), sum(array.nbytes for array in arrays)
 

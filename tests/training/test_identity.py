@@ -24,7 +24,7 @@ from stga_addon.render import device as device_choice
 from stga_addon.requests.folder import request_folder, write_request
 from stga_addon.requests.values import Resume
 from stga_addon.schema import to_json
-from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import open_run as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, read_run, write_run
@@ -321,9 +321,9 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Pa
     assert len(read_avatar(out / "avatar.npz").splats) == len(toy.faces)
     train(toy, out, make_run(toy), resume=True)
     train(toy, unbroken, make_run(toy))
-    ours, theirs = (tensors_of(read_checkpoint(folder).state) for folder in (out, unbroken))
-    for name, tensor in ours.items():
-        np.testing.assert_array_equal(tensor, theirs[name], err_msg=name)
+    ours, theirs = (arrays_of(read_checkpoint(folder).state) for folder in (out, unbroken))
+    for name, array in ours.items():
+        np.testing.assert_array_equal(array, theirs[name], err_msg=name)
 
 
 def test_second_interrupt_quits_at_once(toy: Capture, tmp_path: Path) -> None:

@@ -94,9 +94,9 @@ def test_within_the_limits_nothing_happens(kernel) -> None:
 def test_stray_resets(to: float) -> None:
     """Catches a limit of another triangle, unbound splats pulled home, and momentum that throws a splat out again."""
     state = random_state(60, FACES)
-    state.unbound[:] = torch.arange(60) % 4 == 0
+    state.unbound[:] = np.arange(60) % 4 == 0
     limit = np.array([0.005, 0.012, 0.02, 0.03, 10.0], np.float32)
-    xyz, face = state.parameters.xyz.numpy().copy(), state.face.numpy()
+    xyz, face = state.parameters.xyz.copy(), state.face
     far = [bool(np.hypot(np.hypot(*p[:2]), p[2]) > limit[f]) for p, f in zip(xyz.astype(float), face, strict=True)]
     strays = np.array(far) & (np.arange(60) % 4 != 0)
     assert 5 < strays.sum() < 40
@@ -113,7 +113,7 @@ def test_stray_resets(to: float) -> None:
         elif name == "parameters/xyz":
             length = np.linalg.norm(xyz[strays].astype(float), axis=1, keepdims=True)
             wanted = xyz[strays] / length * to * limit[face[strays], None]
-            np.testing.assert_allclose(state.parameters.xyz.numpy()[strays], wanted, rtol=1e-5)
+            np.testing.assert_allclose(state.parameters.xyz[strays], wanted, rtol=1e-5)
         elif name == "first/xyz":
             assert not after[name][strays].any()
         else:
@@ -129,11 +129,11 @@ def test_the_first_step_after_a_stray_reset_is_no_longer_than_the_rate() -> None
     state.parameters.xyz[:4] = 1.0
     rng = np.random.default_rng(0)
     for _ in range(2000):
-        state.gradients.xyz.copy_(torch.from_numpy(rng.normal(0, 1e-4, (8, 3))))
+        state.gradients.xyz[:] = rng.normal(0, 1e-4, (8, 3))
         adam.step(state, rows, rates)
     assert reset_strays(state, np.full(FACES, 0.5, np.float32), 0.5) == 4
-    before = state.parameters.xyz.clone()
-    state.gradients.xyz.fill_(1e-4)  # one standard deviation
+    before = state.parameters.xyz.copy()
+    state.gradients.xyz[:] = 1e-4  # one standard deviation
     adam.step(state, rows, rates)
     step = (before - state.parameters.xyz)[:4]
     np.testing.assert_allclose(step, 0.1 * rates["xyz"], rtol=0.2)  # (1 − β1) of the rate, as momentum builds up again

@@ -17,7 +17,7 @@ from stga_addon.files import write_npz
 from stga_addon.perform.training import Prepared, prepare
 from stga_addon.progress import ignore
 from stga_addon.requests.values import Refine
-from stga_addon.training.optimize.state import TrainState, tensors_of
+from stga_addon.training.optimize.state import TrainState, arrays_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import late_rates, starting_state
@@ -80,10 +80,10 @@ def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> 
 
 
 def rows_of(state: TrainState, keep: np.ndarray) -> dict[str, np.ndarray]:
-    """Bytes of every tensor at the rows; without gradients and statistics, which no avatar holds."""
+    """Bytes of every array at the rows; without gradients and statistics, which no avatar holds."""
     skipped = ("gradients", "screen_gradient", "gradient_count")
-    kept = {name: tensor for name, tensor in tensors_of(state).items() if not name.startswith(skipped)}
-    return {name: np.ascontiguousarray(tensor.numpy()[keep]).view(np.uint8) for name, tensor in kept.items()}
+    kept = {name: array for name, array in arrays_of(state).items() if not name.startswith(skipped)}
+    return {name: array[keep].view(np.uint8) for name, array in kept.items()}
 
 
 def test_nothing_outside_the_region_changes_by_one_bit(parent: Path, toy: Capture, tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_nothing_outside_the_region_changes_by_one_bit(parent: Path, toy: Captur
     for name in ("xyz", "sh", "opacity", "strain_color"):
         assert not np.array_equal(getattr(inside[0], name), getattr(inside[1], name)[: len(inside[0])]), name
     states = [read_checkpoint(folder).state for folder in (parent, tmp_path / "refined")]
-    kept = [rows_of(state, ~region[state.face.numpy()]) for state in states]
+    kept = [rows_of(state, ~region[state.face]) for state in states]
     for name, old in kept[0].items():
         if not name.startswith("parameters"):  # which start from the average
             np.testing.assert_array_equal(kept[1][name], old, err_msg=name)

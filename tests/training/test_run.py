@@ -15,7 +15,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import Quality
-from stga_addon.training.optimize.state import tensors_of
+from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import loop as run_module
 from stga_addon.training.run import session as session_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
@@ -53,9 +53,9 @@ def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def assert_same_state(folder: Path, expected: Path) -> None:
     ours, theirs = read_checkpoint(folder), read_checkpoint(expected)
-    right = tensors_of(theirs.state)
-    for name, tensor in tensors_of(ours.state).items():
-        np.testing.assert_array_equal(tensor.numpy().view(np.uint8), right[name].numpy().view(np.uint8), err_msg=name)
+    right = arrays_of(theirs.state)
+    for name, array in arrays_of(ours.state).items():
+        np.testing.assert_array_equal(array.view(np.uint8), right[name].view(np.uint8), err_msg=name)
     assert (ours.iteration, ours.visit, ours.initial_count) == (theirs.iteration, theirs.visit, theirs.initial_count)
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from capture import factory
 from PIL import Image
@@ -66,9 +65,9 @@ def large(view: View, factor: float = 3.0) -> tuple[View, np.ndarray]:
 def disturb(trainer: Trainer) -> None:
     """Rows unlike each other, and as many coefficients as there may be."""
     rng = np.random.default_rng(1)
-    for value, average in zip(trainer.state.arrays(), trainer.state.average, strict=True):
+    for value, average in zip(trainer.state.parameters, trainer.state.average, strict=True):
         value += rng.normal(0, 0.2 if value.ndim != 2 else 1e-3, value.shape).astype(np.float32)
-        average.copy_(torch.from_numpy(value))
+        average[:] = value
 
 
 def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
@@ -78,12 +77,12 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> Non
     target = read_image(view)
     for _ in range(3):  # the third is global, so that every visible row has moments
         trainer.step(view, target, 0.5)
-    assert trainer.state.first.xyz.numpy()[trainer.state.steps.numpy() > 0].any()
+    assert trainer.state.first.xyz[trainer.state.steps > 0].any()
     before = bits(trainer.state)
     for _ in range(2):
         assert trainer.step(view, target, 0.5) is None
     after = bits(trainer.state)
-    selected = toy.regions["mouth"][trainer.state.face.numpy()]
+    selected = toy.regions["mouth"][trainer.state.face]
     assert 0.05 < selected.mean() < 0.5
     for name in before:
         np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
@@ -100,25 +99,25 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
     trainer = make_trainer(toy)
     disturb(trainer)
     view, target = large(view_of(toy, 1, camera))
-    focus = toy.regions["mouth"][trainer.state.face.numpy()]
+    focus = toy.regions["mouth"][trainer.state.face]
     step = cpu_backend(trainer)
     rows, screen, loss = step._backward(view, target, WHITE, degree, None)
-    full = {name: t.numpy().copy() for name, t in trainer.state.gradients._asdict().items()}
+    full = {name: array.copy() for name, array in trainer.state.gradients._asdict().items()}
     screen_gradient, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
     for buffer in step._buffers._buffers.values():
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
-    for tensor in trainer.state.gradients:
-        tensor.fill_(7.0)
+    for array in trainer.state.gradients:
+        array.fill(7.0)
     rows, screen, loss = step._backward(view, target, WHITE, degree, focus)
     assert loss is None
     np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
     assert 20 < len(rows) < 0.5 * len(trainer.state)
     others = np.setdiff1d(np.arange(len(trainer.state)), rows)
-    for name, tensor in trainer.state.gradients._asdict().items():
-        difference = np.abs(tensor.numpy()[rows] - full[name][rows]).max(initial=0)
+    for name, array in trainer.state.gradients._asdict().items():
+        difference = np.abs(array[rows] - full[name][rows]).max(initial=0)
         assert difference <= 1e-6 * np.abs(full[name][rows]).max(initial=0), name
-        np.testing.assert_array_equal(tensor.numpy()[others], 7.0)
+        np.testing.assert_array_equal(array[others], 7.0)
     np.testing.assert_allclose(screen[rows], screen_gradient[rows], rtol=1e-5)
 
 
@@ -126,8 +125,8 @@ def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
     """Catches a restriction that restricts nothing, with which the test above would hold of itself."""
     trainer = make_trainer(toy)
     view, _ = large(view_of(toy, 1))
-    focus = toy.regions["mouth"][trainer.state.face.numpy()]
-    splats, frames = trainer.state.arrays(), trainer.frames.of(view.timestep)
+    focus = toy.regions["mouth"][trainer.state.face]
+    splats, frames = trainer.state.parameters, trainer.frames.of(view.timestep)
 
     def tiles(focus: np.ndarray | None) -> int:
         return len(cpu_backend(trainer)._forward(splats, frames, view, WHITE, 0, focus).tiles)
@@ -143,10 +142,10 @@ def test_a_frame_that_selects_nothing_trains_globally(toy: Capture, timestep: in
     loss = trainer.step(view, read_image(view), 0.5)
     assert loss is not None
     assert loss > 0
-    assert trainer.state.steps.numpy().sum() > 0.3 * len(trainer.state)
+    assert trainer.state.steps.sum() > 0.3 * len(trainer.state)
     trainer.step(view_of(toy, 1), read_image(view_of(toy, 1)), 0.5)
-    selected = toy.regions["mouth"][trainer.state.face.numpy()]
-    assert (trainer.state.steps.numpy()[~selected] <= 1).all()
+    selected = toy.regions["mouth"][trainer.state.face]
+    assert (trainer.state.steps[~selected] <= 1).all()
 
 
 def test_kinds_of_iterations(toy: Capture) -> None:
@@ -187,19 +186,19 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     trainer = make_trainer(toy, "global", **options)
     view = view_of(toy, 1)
     image, counts = read_image(view), []
-    face = trainer.state.face.numpy()
+    face = trainer.state.face
     trainer.state.parameters.xyz[7] = 1.0
     assert not trainer.state.unbound[7]
     for n in range(10):
         if n == 4:
-            assert float(trainer.state.parameters.xyz[trainer.state.face == int(face[7])].norm(dim=1).max()) > 0.9
+            assert np.linalg.norm(trainer.state.parameters.xyz[trainer.state.face == int(face[7])], axis=1).max() > 0.9
         trainer.step(view, image, n / 10)
         counts.append(len(trainer.state))
     first = trainer.initial_count
     assert counts[:2] == [first, first]
     assert first < counts[3] <= counts[5] <= round(first * 1.05)
     assert counts[5:] == [counts[5]] * 5
-    assert float(trainer.state.parameters.xyz.norm(dim=1).max()) < 0.5
+    assert np.linalg.norm(trainer.state.parameters.xyz, axis=1).max() < 0.5
 
 
 def test_screen_gradients_are_accumulated_by_global_iterations_only(toy: Capture) -> None:
@@ -258,9 +257,9 @@ def test_render_shows_the_average(toy: Capture) -> None:
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
     picture = trainer.render(view)
-    trainer.state.parameters.opacity.fill_(-20.0)
+    trainer.state.parameters.opacity[:] = -20
     np.testing.assert_array_equal(trainer.render(view), picture)
-    trainer.state.average.opacity.fill_(-20.0)
+    trainer.state.average.opacity[:] = -20
     assert trainer.render(view).min() == 1
 
 

@@ -3,10 +3,9 @@
 from typing import Any
 
 import numpy as np
-import torch
 
 from stga_addon.avatar.splats import Splats
-from stga_addon.training.optimize.state import TrainState, new_state, tensors_of
+from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 from stga_addon.training.settings import TrainingSettings, make_settings
 
 
@@ -27,14 +26,14 @@ def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Spl
 def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> TrainState:
     """A state in the middle of training: no two rows alike in anything."""
     state = new_state(random_splats(count, faces, seed, degree))
-    generator = torch.Generator().manual_seed(seed)
+    rng = np.random.default_rng(seed)
     for part in (state.gradients, state.first, state.second):
-        for tensor in part:
-            tensor.copy_(torch.rand(tensor.shape, generator=generator))
-    state.steps += torch.arange(1, count + 1, dtype=torch.int32)
-    state.unseen_share += torch.rand(count, generator=generator)
-    state.screen_gradient += torch.rand(count, generator=generator)
-    state.gradient_count += torch.arange(1, count + 1)
+        for array in part:
+            array[:] = rng.random(array.shape)
+    state.steps += np.arange(1, count + 1, dtype=np.int32)
+    state.unseen_share += rng.random(count, np.float32)
+    state.screen_gradient += rng.random(count, np.float32)
+    state.gradient_count += np.arange(1, count + 1, dtype=np.float32)
     return state
 
 
@@ -44,6 +43,6 @@ def quick_settings(strategy: str = "selective", **changes: Any) -> TrainingSetti
 
 
 def bits(state: TrainState) -> dict[str, np.ndarray]:
-    """A copy of every tensor as bytes per row, so that NaN and −0 compare by their bits; gradients left out."""
-    tensors = {name: t for name, t in tensors_of(state).items() if not name.startswith("gradients")}
-    return {name: t.numpy().copy().reshape(len(state), t[0].numel()).view(np.uint8) for name, t in tensors.items()}
+    """A copy of every array as bytes per row, so that NaN and −0 compare by their bits; gradients left out."""
+    arrays = {name: array for name, array in arrays_of(state).items() if not name.startswith("gradients")}
+    return {name: array.copy().reshape(len(state), -1).view(np.uint8) for name, array in arrays.items()}

@@ -5,14 +5,16 @@ import os
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch.nn.functional import conv2d, max_pool2d
 
 from ...errors import StgaError
 from ...files import file_size
 from ...flame.unpickle import read_pickled_arrays
+
+if TYPE_CHECKING:  # imported where there are weights: torch takes seconds to load
+    import torch
 
 WEIGHTS_VARIABLE = "STGA_LPIPS"
 """Environment variable with the path of the weights file; docs/dependencies.md says how to get it."""
@@ -31,12 +33,15 @@ EPSILON = 1e-10
 class Network:
     """Per convolution: kernel (out, in, n, n), bias (out,) and weights (1, out, 1, 1) of the feature differences."""
 
-    kernels: tuple[torch.Tensor, ...]
-    biases: tuple[torch.Tensor, ...]
-    weights: tuple[torch.Tensor, ...]
+    kernels: tuple["torch.Tensor", ...]
+    biases: tuple["torch.Tensor", ...]
+    weights: tuple["torch.Tensor", ...]
 
     def distance(self, image: np.ndarray, target: np.ndarray) -> float:
         """LPIPS of two images (3, H, W) float32 in 0…1, each side at least MIN_SIDE_PX."""
+        import torch
+        from torch.nn.functional import conv2d, max_pool2d
+
         pair = 2 * torch.from_numpy(np.stack([image, target]).astype(np.float32)) - 1
         x = (pair - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
         total = 0.0
@@ -61,6 +66,8 @@ def read_network(path: Path) -> Network:
 
     Nothing in the pickle is executed. Raises StgaError if the file cannot be read or is another one.
     """
+    import torch
+
     file_size(path)
     try:
         with path.open("rb") as stream:

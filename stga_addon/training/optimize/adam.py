@@ -36,4 +36,4 @@ def step(
         if name == "sh":
             table.rates[3:] = rates["sh_rest"]
     options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
-    adam_rows(rows, state.numpy.steps, tuple(state.tables.values()), options)
+    adam_rows(rows, state.steps, tuple(state.tables.values()), options)

@@ -20,7 +20,7 @@ from .state import TrainState
 
 
 class CpuBackend:
-    """Trains in host memory: `state` is the trained tensors themselves, and every loss is returned at once."""
+    """Trains in host memory: `state` is the trained arrays themselves, and every loss is returned at once."""
 
     def __init__(self, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> None:
         self.state = state
@@ -34,7 +34,7 @@ class CpuBackend:
     def step(self, batch: Batch) -> float | None:
         """Forward, backward and optimizer step; returns the image loss of a global iteration, None for a local one."""
         state = self.state
-        focus = None if batch.selected is None else batch.selected.take(state.numpy.face)
+        focus = None if batch.selected is None else batch.selected.take(state.face)
         target = self._target(batch)
         rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
         epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
@@ -44,13 +44,13 @@ class CpuBackend:
         self._add_limit_gradients(rows)
         adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
         if batch.accumulate:
-            add_screen_gradients(rows, screen, state.numpy.screen_gradient, state.numpy.gradient_count)
+            add_screen_gradients(rows, screen, state.screen_gradient, state.gradient_count)
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
         """The view with the splats' exponential moving average: a new (3, H, W) float32 image."""
         frames = self._moved_frames(view.timestep, averaged=True)
-        return self._forward(self.state.numpy.average, frames, view, background, sh_degree).image.copy()
+        return self._forward(self.state.average, frames, view, background, sh_degree).image.copy()
 
     def _target(self, batch: Batch) -> np.ndarray:
         """The target over the batch's background."""
@@ -68,7 +68,7 @@ class CpuBackend:
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the gradients of the trained rows; returns those rows, the screen gradients (N,) and the loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
-        state, frames = self.state.numpy, self._moved_frames(view.timestep)
+        state, frames = self.state, self._moved_frames(view.timestep)
         rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
         if focus is None:
             key = height, width, threads()
@@ -96,7 +96,7 @@ class CpuBackend:
     ) -> RenderOutput:  # fmt: skip
         self._frames_in_camera = frames_in_camera(frames, view.camera)
         return render_forward(
-            splats, self.state.numpy.face, self._frames_in_camera, sh_degree, background, focus, LOSS_REACH_PX,
+            splats, self.state.face, self._frames_in_camera, sh_degree, background, focus, LOSS_REACH_PX,
             antialiased=self._settings.antialiased, buffers=self._buffers,
         )  # fmt: skip
 
@@ -104,8 +104,8 @@ class CpuBackend:
         """Step the timestep's FLAME parameters along the gradient of the loss, computed from the splats' gradients."""
         store, state, timestep = self._frames, self.state, batch.view.timestep
         assert store.tracking is not None
-        frames, gradients = store.of(timestep), state.numpy.gradients
-        splats, face = state.numpy.parameters, state.numpy.face
+        frames, gradients = store.of(timestep), state.gradients
+        splats, face = state.parameters, state.face
         for name, offset in state.driven_offsets.items():
             shift = offset_of(offset.value, store.signals(timestep)(name))
             splats = splats._replace(xyz=splats.xyz + shift[face])
@@ -121,13 +121,13 @@ class CpuBackend:
         """
         state = self.state
         driven_offsets.step(
-            state.driven_offsets, rows, state.numpy.face, state.numpy.gradients.xyz,
+            state.driven_offsets, rows, state.face, state.gradients.xyz,
             self._frames.signals(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
         )  # fmt: skip
 
     def _add_limit_gradients(self, rows: np.ndarray) -> None:
         """Add the gradients that keep splats near what they cover, and unbound ones out of the air."""
-        settings, state = self._settings, self.state.numpy
+        settings, state = self._settings, self.state
         face, unbound = state.face, state.unbound
         if settings.scale_weight:
             gradient, log_scale = state.gradients.log_scale, state.parameters.log_scale

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from ...avatar.splats import Splats
 from ...flame.quaternions import to_matrices
@@ -31,13 +30,13 @@ def control_density(
     triangle, binding and unseen share, lie within the parent's Gaussian in local units, and keep Adam's second moment
     and step count, without which their first steps would all be as long as the rate.
     """
-    gradient = (state.screen_gradient / state.gradient_count.clamp_min(1)).numpy()
-    within = np.ones(len(state), bool) if region is None else region[state.face.numpy()]
+    gradient = state.screen_gradient / np.maximum(state.gradient_count, 1)
+    within = np.ones(len(state), bool) if region is None else region[state.face]
     gradient[~within] = 0.0
     count = max(0, min(budget, int(max_share * within.sum())))
     split = np.argsort(-gradient, kind="stable")[:count]
     split = split[gradient[split] > 0]
-    parents = keep_rows(state, torch.from_numpy(split))
+    parents = keep_rows(state, split)
     pairs = join(parents, parents)
     children = replace(
         new_state(_halves(parents.splats(), rng)),
@@ -47,8 +46,9 @@ def control_density(
     )
     keep = ~(_prunable(state) & within)
     keep[split] = False
-    state = join(keep_rows(state, torch.from_numpy(keep)), children)
-    return replace(state, screen_gradient=torch.zeros(len(state)), gradient_count=torch.zeros(len(state)))
+    state = join(keep_rows(state, keep), children)
+    zero = np.zeros(len(state), np.float32)
+    return replace(state, screen_gradient=zero, gradient_count=zero.copy())
 
 
 def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
@@ -59,15 +59,15 @@ def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
     the step count of the row, which all its parameters share, in the thousands, the bias correction would make the
     next step 3.2 times as long as the learning rate (0.1 / √0.001).
     """
-    distance = state.parameters.xyz.norm(dim=1)
-    allowed = torch.from_numpy(limit)[state.face.long()]
-    strays = ~state.unbound & (distance > allowed)
+    distance = np.linalg.norm(state.parameters.xyz, axis=1)
+    allowed = limit[state.face]
+    strays = np.flatnonzero(~state.unbound & (distance > allowed))
     # Rounding must not leave them just beyond the limit, or they would be strays again.
-    factor = (share * (1 - 1e-6) * allowed / distance)[strays, None]
-    state.parameters.xyz[strays] = torch.where(factor > 0, factor * state.parameters.xyz[strays], 0)
+    factor = (share * (1 - 1e-6) * allowed[strays] / distance[strays])[:, None]
+    state.parameters.xyz[strays] = np.where(factor > 0, factor * state.parameters.xyz[strays], 0)
     state.first.xyz[strays] = 0
     state.average.xyz[strays] = state.parameters.xyz[strays]
-    return int(strays.sum())
+    return len(strays)
 
 
 def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
@@ -96,7 +96,7 @@ def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
 
 def _prunable(state: TrainState) -> np.ndarray:
     """(N,) bool: splats of low opacity, except the most opaque bound splat of each triangle."""
-    opacity, face, unbound = state.parameters.opacity.numpy(), state.face.numpy(), state.unbound.numpy()
+    opacity, face, unbound = state.parameters.opacity, state.face, state.unbound
     prunable = _sigmoid(opacity) < MIN_OPACITY
     bound = np.flatnonzero(~unbound)
     order = bound[np.lexsort((-opacity[bound], face[bound]))]

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from ...avatar.offsets.table import OFFSETS
 from ...capture.model import View
@@ -86,7 +85,7 @@ class GpuBackend:
         count, stride, coefficients = len(self), self._splats.stride, self._splats.coefficients
         read, buffer = self.device.read, self.device.buffer
         tables = {
-            name: Parameters(*map(torch.from_numpy, split_rows(read(buffer(name, 0), (count, stride)), coefficients)))
+            name: Parameters(*split_rows(read(buffer(name, 0), (count, stride)), coefficients))
             for name in ("splats", *TABLES)
         }
         history, traits = read(self._tables.history, (count, 3), np.uint32), read(self._tables.traits, (count, 2))
@@ -97,12 +96,12 @@ class GpuBackend:
             first=tables["first"],
             second=tables["second"],
             average=tables["average"],
-            steps=torch.from_numpy(history[:, 0].astype(np.int32)),
-            face=torch.from_numpy(read(self._splats.face, (count,), np.int32)),
-            unbound=torch.from_numpy(traits[:, 0] > 0),
-            unseen_share=torch.from_numpy(traits[:, 1].copy()),
-            screen_gradient=torch.from_numpy(sums[:, 1].copy()),
-            gradient_count=torch.from_numpy(sums[:, 2].copy()),
+            steps=history[:, 0].astype(np.int32),
+            face=read(self._splats.face, (count,), np.int32),
+            unbound=traits[:, 0] > 0,
+            unseen_share=traits[:, 1].copy(),
+            screen_gradient=sums[:, 1].copy(),
+            gradient_count=sums[:, 2].copy(),
             driven_offsets={name: self._read_offset(name) for name in self._offsets},
         )
 
@@ -110,23 +109,23 @@ class GpuBackend:
     def state(self, state: TrainState) -> None:
         self._finish_all()
         upload = self.device.upload
-        rows = {name: upload(name, splat_rows(_arrays(getattr(state, name)))) for name in TABLES}
+        rows = {name: upload(name, splat_rows(getattr(state, name))) for name in TABLES}
         self._gradients = rows.pop("gradients")
         history = np.stack(
             [
-                state.steps.numpy().astype(np.uint32),
-                state.screen_gradient.numpy().view(np.uint32),
-                state.gradient_count.numpy().view(np.uint32),
+                state.steps.astype(np.uint32),
+                state.screen_gradient.view(np.uint32),
+                state.gradient_count.view(np.uint32),
             ],
             axis=1,
         )
-        traits = np.stack([state.unbound.numpy(), state.unseen_share.numpy()], axis=1, dtype=np.float32)
+        traits = np.stack([state.unbound, state.unseen_share], axis=1, dtype=np.float32)
         self._tables = OptimizerTables(
             **rows, history=upload("history", history), traits=upload("traits", traits),
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
-        self._splats = upload_splats(self.device, _arrays(state.parameters), state.face.numpy())
-        splats_of = upload("splats by triangle", splats_by_triangle(state.face.numpy(), self._triangles))
+        self._splats = upload_splats(self.device, state.parameters, state.face)
+        splats_of = upload("splats by triangle", splats_by_triangle(state.face, self._triangles))
         self._offsets = {
             name: OffsetTables(
                 **{part: upload(f"{name} {part}", table) for part, table in vars(offset).items()}, splats_of=splats_of
@@ -248,7 +247,3 @@ class GpuBackend:
             average=read(tables.average, shape),
             steps=read(tables.steps, (self._triangles,), np.int32),
         )
-
-
-def _arrays(tensors: Parameters) -> Parameters:
-    return Parameters(*(tensor.numpy() for tensor in tensors))

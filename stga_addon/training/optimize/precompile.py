@@ -83,10 +83,10 @@ def _pair() -> TrainState:
 def _render() -> None:
     """Forward and backward pass."""
     state = _pair()
-    seen, face = frames_in_camera(WORLD, CAMERA), state.face.numpy()
-    rendering = render_forward(state.arrays(), face, seen, 3, focus=np.ones(2, bool))
-    gradients = Parameters(*(g.numpy() for g in state.gradients))
-    render_backward(rendering, state.arrays(), face, seen, np.zeros_like(rendering.image), gradients)
+    seen, face = frames_in_camera(WORLD, CAMERA), state.face
+    rendering = render_forward(state.parameters, face, seen, 3, focus=np.ones(2, bool))
+    gradients = state.gradients
+    render_backward(rendering, state.parameters, face, seen, np.zeros_like(rendering.image), gradients)
 
 
 def _optimize() -> None:
@@ -97,10 +97,10 @@ def _optimize() -> None:
     rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
     state, rows = _pair(), np.arange(2, dtype=np.int32)
     adam.step(state, rows, rates)
-    add_screen_gradients(rows, np.zeros(2, np.float32), state.screen_gradient.numpy(), state.gradient_count.numpy())
+    add_screen_gradients(rows, np.zeros(2, np.float32), state.screen_gradient, state.gradient_count)
     offsets = with_offsets(state, OFFSETS, 2).driven_offsets
     driven_offsets.step(
-        offsets, rows, state.face.numpy(), state.gradients.xyz.numpy(),
+        offsets, rows, state.face, state.gradients.xyz,
         lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, 1.0, adam.EPSILON,
     )  # fmt: skip
 
@@ -113,11 +113,11 @@ def _limit() -> None:
     mask.setflags(write=False)
     change_background(target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), np.empty_like(target))
     rows = np.arange(2, dtype=np.int32)
-    face, unbound = state.face.numpy(), state.unbound.numpy()
+    face, unbound = state.face, state.unbound
     # Smaller than the splats: without an excess, its gradient is not computed.
-    limits, log_scale = np.full((2, 1), 0.01, np.float32), state.parameters.log_scale.numpy()
-    scale_limit(rows, log_scale, face, unbound, limits, 1.0, state.gradients.log_scale.numpy())
-    opacity, share = state.parameters.opacity.numpy(), state.unseen_share.numpy()
-    opacity_weight(rows, opacity, share, 1.0, state.gradients.opacity.numpy())
-    xyz, gradient = state.parameters.xyz.numpy(), state.gradients.xyz.numpy()
+    limits, log_scale = np.full((2, 1), 0.01, np.float32), state.parameters.log_scale
+    scale_limit(rows, log_scale, face, unbound, limits, 1.0, state.gradients.log_scale)
+    opacity, share = state.parameters.opacity, state.unseen_share
+    opacity_weight(rows, opacity, share, 1.0, state.gradients.opacity)
+    xyz, gradient = state.parameters.xyz, state.gradients.xyz
     distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradient)

@@ -1,12 +1,12 @@
 """State of the splats in training: parameters, optimizer moments and statistics for density control."""
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import ADDED, Splats
@@ -39,7 +39,7 @@ def new_offset(coefficients: np.ndarray) -> OffsetState:
 
 @dataclass
 class TrainState:
-    """N splats in training: CPU tensors with N rows each.
+    """N splats in training: arrays with N rows each.
 
     parameters, gradients, first, second  values, latest gradients and Adam's two moments, shaped as in `Splats`
     average  exponential moving average of the parameters over their steps, from which the avatar is made
@@ -57,45 +57,31 @@ class TrainState:
     first: Parameters
     second: Parameters
     average: Parameters
-    steps: torch.Tensor
-    face: torch.Tensor
-    unbound: torch.Tensor
-    unseen_share: torch.Tensor
-    screen_gradient: torch.Tensor
-    gradient_count: torch.Tensor
+    steps: np.ndarray
+    face: np.ndarray
+    unbound: np.ndarray
+    unseen_share: np.ndarray
+    screen_gradient: np.ndarray
+    gradient_count: np.ndarray
     driven_offsets: dict[str, OffsetState] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.steps)
 
     @cached_property
-    def numpy(self) -> Any:
-        """A `TrainState` of NumPy arrays that share the tensors' memory, without driven offsets.
-
-        Kept, because asking torch for every array in every iteration takes as long as a small kernel.
-        """
-        return state_of({name: tensor.numpy() for name, tensor in tensors_of(self).items()})
-
-    @cached_property
     def tables(self) -> dict[str, AdamTables]:
-        """Parameter -> its values, gradient, moments and average as NumPy arrays (N, D) that share their memory, and
-        room for the learning rates of its columns."""
+        """Parameter -> its values, gradient, moments and average as views (N, D), and room for learning rates (D,)."""
         kept = self.parameters, self.gradients, self.first, self.second, self.average
         found = {}
-        for name, tensors in zip(self.parameters._fields, zip(*kept, strict=True), strict=True):
-            arrays = [t.numpy().reshape(len(t), t[0].numel()) for t in tensors]
-            found[name] = AdamTables._make((*arrays, np.empty(arrays[0].shape[1], np.float32)))
+        for name, arrays in zip(self.parameters._fields, zip(*kept, strict=True), strict=True):
+            tables = [array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays]
+            found[name] = AdamTables._make((*tables, np.empty(tables[0].shape[1], np.float32)))
         return found
 
     @cached_property
     def has_unseen(self) -> bool:
         """Whether a splat has a share of cameras that did not see it."""
         return bool(self.unseen_share.any())
-
-    def arrays(self) -> Parameters:
-        """The parameters as NumPy arrays that share their memory."""
-        parameters: Parameters = self.numpy.parameters
-        return parameters
 
     def splats(self) -> Splats:
         """A copy of the current splats."""
@@ -106,45 +92,45 @@ class TrainState:
         return self._copy(self.average)
 
     def _copy(self, parameters: Parameters) -> Splats:
-        arrays = {name: t.numpy().copy() for name, t in parameters._asdict().items()}
-        return Splats(**arrays, face=self.face.numpy().copy(), unbound=self.unbound.numpy().copy())
+        arrays = {name: array.copy() for name, array in parameters._asdict().items()}
+        return Splats(**arrays, face=self.face.copy(), unbound=self.unbound.copy())
 
 
 def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainState:
     """A copy of the splats with zero moments; unseen_share (N,), zeros if None."""
-    values = [torch.from_numpy(getattr(splats, name).astype(np.float32)) for name in Parameters._fields]
+    values = [getattr(splats, name).astype(np.float32, order="C") for name in Parameters._fields]
     n = len(splats)
 
     def zeros() -> Parameters:
-        return Parameters(*(torch.zeros_like(v) for v in values))
+        return Parameters(*map(np.zeros_like, values))
 
     return TrainState(
         parameters=Parameters(*values),
         gradients=zeros(),
         first=zeros(),
         second=zeros(),
-        average=Parameters(*(v.clone() for v in values)),
-        steps=torch.zeros(n, dtype=torch.int32),
-        face=torch.from_numpy(splats.face.astype(np.int32)),
-        unbound=torch.from_numpy(splats.unbound.astype(bool)),
-        unseen_share=torch.zeros(n) if unseen_share is None else torch.from_numpy(unseen_share.astype(np.float32)),
-        screen_gradient=torch.zeros(n),
-        gradient_count=torch.zeros(n),
+        average=Parameters(*(v.copy() for v in values)),
+        steps=np.zeros(n, np.int32),
+        face=splats.face.astype(np.int32),
+        unbound=splats.unbound.astype(bool),
+        unseen_share=np.zeros(n, np.float32) if unseen_share is None else unseen_share.astype(np.float32),
+        screen_gradient=np.zeros(n, np.float32),
+        gradient_count=np.zeros(n, np.float32),
     )
 
 
-def keep_rows(state: TrainState, keep: torch.Tensor) -> TrainState:
-    """The rows at `keep`, a mask (N,) or indices, of every tensor."""
-    return _map(lambda tensors: tensors[0][keep], state)
+def keep_rows(state: TrainState, keep: np.ndarray) -> TrainState:
+    """The rows at `keep`, a mask (N,) or indices, of every array."""
+    return _map(lambda arrays: arrays[0][keep], state)
 
 
 def with_added(state: TrainState, names: Collection[str]) -> TrainState:
     """The state with these arrays of ADDED; they and their moments are zero where there were none."""
-    zeros = {name: torch.zeros(len(state), ADDED[name], 3) for name in names}
-    zeros = {name: tensor for name, tensor in zeros.items() if not getattr(state.parameters, name).shape[1]}
+    zeros = {name: np.zeros((len(state), ADDED[name], 3), np.float32) for name in names}
+    zeros = {name: array for name, array in zeros.items() if not getattr(state.parameters, name).shape[1]}
 
-    def added(tensors: Parameters) -> Parameters:
-        return tensors._replace(**{name: tensor.clone() for name, tensor in zeros.items()})
+    def added(arrays: Parameters) -> Parameters:
+        return arrays._replace(**{name: array.copy() for name, array in zeros.items()})
 
     return replace(
         state,
@@ -164,29 +150,29 @@ def with_offsets(state: TrainState, names: Collection[str], triangles: int) -> T
 
 def join(state: TrainState, other: TrainState) -> TrainState:
     """All rows of both states, in order."""
-    return _map(lambda tensors: torch.cat(tensors), state, other)
+    return _map(np.concatenate, state, other)
 
 
-def tensors_of(state: TrainState) -> dict[str, torch.Tensor]:
-    """Every tensor of the splats under a flat name such as "first/xyz"; the inverse of `state_of`."""
+def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
+    """Every array of the splats under a flat name such as "first/xyz"; the inverse of `state_of`."""
     flat = {}
     for f in _splat_fields():
         value = getattr(state, f.name)
-        if isinstance(value, torch.Tensor):
+        if isinstance(value, np.ndarray):
             flat[f.name] = value
         else:
-            flat.update({f"{f.name}/{name}": tensor for name, tensor in value._asdict().items()})
+            flat.update({f"{f.name}/{name}": array for name, array in value._asdict().items()})
     return flat
 
 
-def state_of(tensors: Mapping[str, Any]) -> TrainState:
-    """Rebuild a state from `tensors_of`. Raises KeyError with the name of a missing tensor."""
+def state_of(arrays: Mapping[str, np.ndarray]) -> TrainState:
+    """Rebuild a state from `arrays_of`. Raises KeyError with the name of a missing array."""
     values: dict[str, Any] = {}
     for f in _splat_fields():
-        if f.name in tensors:
-            values[f.name] = tensors[f.name]
+        if f.name in arrays:
+            values[f.name] = arrays[f.name]
         else:
-            values[f.name] = Parameters(*(tensors[f"{f.name}/{name}"] for name in Parameters._fields))
+            values[f.name] = Parameters(*(arrays[f"{f.name}/{name}"] for name in Parameters._fields))
     return TrainState(**values)
 
 
@@ -194,8 +180,8 @@ def _splat_fields() -> list[Field[Any]]:
     return [f for f in fields(TrainState) if f.name != "driven_offsets"]
 
 
-def _map(function: Callable[[list[torch.Tensor]], torch.Tensor], *states: TrainState) -> TrainState:
+def _map(function: Callable[[list[np.ndarray]], np.ndarray], *states: TrainState) -> TrainState:
     """The first state with other splats."""
-    flat = [tensors_of(s) for s in states]
-    mapped = state_of({name: function([f[name] for f in flat]).contiguous() for name in flat[0]})
+    flat = [arrays_of(s) for s in states]
+    mapped = state_of({name: function([f[name] for f in flat]) for name in flat[0]})
     return replace(mapped, driven_offsets=states[0].driven_offsets)

@@ -105,7 +105,7 @@ class PostStep(Protocol):
         """Whether to `apply` after so many iterations, at this share of the budget."""
 
     def apply(self, state: TrainState, iteration: int) -> TrainState:
-        """The changed state, which may share tensors with `state` or change them in place."""
+        """The changed state, which may share arrays with `state` or change them in place."""
 
 
 @dataclass(frozen=True)

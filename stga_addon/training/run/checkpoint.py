@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ...avatar.file import check_array
 from ...avatar.offsets.table import OFFSETS
@@ -17,7 +16,7 @@ from ...avatar.splats import ARRAYS
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
 from ..optimize.flame_refinement import RefinementState
-from ..optimize.state import OffsetState, TrainState, state_of, tensors_of
+from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from .folder import CHECKPOINT, SELECTION
 
 VERSION = 3
@@ -74,7 +73,7 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
-    arrays = {k: t.numpy() for k, t in tensors_of(checkpoint.state).items() if not k.startswith("gradients/")}
+    arrays = {k: array for k, array in arrays_of(checkpoint.state).items() if not k.startswith("gradients/")}
     parts = {f"{name}/": offset for name, offset in checkpoint.state.driven_offsets.items()}
     for prefix, part in {**parts, REFINEMENT: checkpoint.tracking}.items():
         arrays.update({prefix + name: array for name, array in (vars(part) if part is not None else {}).items()})
@@ -93,12 +92,11 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             raise StgaError(f"{path}: was written by another version")
         refinement = _refinement(path, arrays)
         offsets = {name: offset for name in OFFSETS if (offset := _offset(path, arrays, name)) is not None}
-        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        for name in [n for n in tensors if n.startswith("first/")]:
-            tensors[name.replace("first/", "gradients/")] = torch.zeros_like(tensors[name])
-        if any(tensor.ndim == 0 for tensor in tensors.values()):
+        if any(array.ndim == 0 for array in arrays.values()):
             raise StgaError(f"{path}: an array has no rows")
-        state = state_of(tensors)
+        for name in [n for n in arrays if n.startswith("first/")]:
+            arrays[name.replace("first/", "gradients/")] = np.zeros_like(arrays[name])
+        state = state_of({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         _check_state(path, state)
         state.driven_offsets = offsets
         return Checkpoint(state=state, tracking=refinement, **meta)
@@ -145,14 +143,9 @@ def _check_state(path: Path, state: TrainState) -> None:
         if kind.sizes and size not in kind.sizes:
             raise StgaError(f"{path}: parameters/{field} has {size} coefficients, expected one of {kind.sizes}")
         tails[field] = kind.shape_at(size)
-    whole = {"steps": torch.int32, "face": torch.int32, "unbound": torch.bool}
-    for name, tensor in tensors_of(state).items():
-        dtype = whole.get(name, torch.float32)
-        shape = (n, *tails.get(name.rpartition("/")[2], ()))
-        if tensor.dtype != dtype or tuple(tensor.shape) != shape:
-            raise StgaError(f"{path}: {name} is {tensor.dtype} {tuple(tensor.shape)}, expected {dtype} {shape}")
-        if dtype == torch.float32 and not tensor.isfinite().all():
-            raise StgaError(f"{path}: {name} holds a value that is not finite")
+    whole = {"steps": "int32", "face": "int32", "unbound": "bool"}
+    for name, array in arrays_of(state).items():
+        check_array(path, name, array, whole.get(name, "float32"), (n, *tails.get(name.rpartition("/")[2], ())))
 
 
 def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | None:

@@ -7,7 +7,6 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-import torch
 
 from ...avatar.file import Avatar, read_avatar
 from ...avatar.splats import ADDED
@@ -104,9 +103,9 @@ def starting_state(continuation: Continuation, settings: TrainingSettings, trian
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
         if _is_of(kept, avatar):
-            parameters = Parameters(*(tensor.clone() for tensor in kept.average))
-            zero = torch.zeros(len(kept))
-            state = replace(kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.clone())
+            parameters = Parameters(*(array.copy() for array in kept.average))
+            zero = np.zeros(len(kept), np.float32)
+            state = replace(kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.copy())
             for offset in kept.driven_offsets.values():
                 offset.value = offset.average.copy()
     state = with_added(state, settings.added)

@@ -148,7 +148,7 @@ def test_antialiasing_reaches_training_and_evaluation(painted):
         settings = replace(settings, lattice=0, hull_points=False)
         small = trainer.Trainer(capture, settings, {})
         for parameters in (small.state.parameters, small.state.average):
-            parameters.log_scale.sub_(1.5)  # narrower than a pixel
+            parameters.log_scale[:] -= 1.5  # narrower than a pixel
             parameters.sh[:, 0, 0] = 1.0
         expected = reference_image(small, view, choice == "on")
         pictures.append(small.render(view, 0.0))
@@ -165,7 +165,8 @@ def test_antialiasing_reaches_training_and_evaluation(painted):
 def reference_image(small: trainer.Trainer, view: View, antialiased: bool) -> torch.Tensor:
     """The trainer's splats over white, by the reference renderer in float64."""
     state = small.state
-    p = Parameters(*(tensor.double() for tensor in state.parameters))
-    placed = reference.embed(p.xyz, p.rotation, p.log_scale, small.frames.of(view.timestep), state.face.long())
+    p = Parameters(*(torch.from_numpy(array).double() for array in state.parameters))
+    face, frames = torch.from_numpy(state.face).long(), small.frames.of(view.timestep)
+    placed = reference.embed(p.xyz, p.rotation, p.log_scale, frames, face)
     color, alpha, _ = reference.render(*placed, p.opacity, p.sh, view.camera, 0, antialiased=antialiased)
     return color + 1 - alpha
