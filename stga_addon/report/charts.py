@@ -35,6 +35,8 @@ def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
     if detail.size:
         right = axes.twinx()
         right.set(ylabel="detail difference (lower is better)", yscale="log")
+        right.yaxis.set_major_formatter("{x:g}")
+        right.yaxis.set_minor_formatter("{x:g}")
         right.plot(*detail, color=COLORS[-1], linestyle=":", marker=".")
         right.invert_yaxis()
         axes.plot([], [], color=COLORS[-1], linestyle=":", marker=".", label="detail difference")
@@ -46,7 +48,8 @@ def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
     """An empty chart of 900 × 540 pixels; `Figure.savefig` renders it without a display."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 5.4), dpi=100, layout="constrained")
+    figure = Figure(figsize=(9, 5.4), dpi=100)
+    figure.subplots_adjust(left=0.08, right=0.9, bottom=0.1, top=0.93)  # `constrained` takes as long as the drawing
     axes = figure.subplots()
     axes.set(title=title, xlabel="training time [s]", ylabel="PSNR [dB]")
     axes.set_prop_cycle(color=COLORS)
