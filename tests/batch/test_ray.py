@@ -89,7 +89,7 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
     two workers on one."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
-    seeds, iterations = max(2, KILLS // 2), max(ITERATIONS, 200 * KILLS)
+    seeds, iterations = max(1, KILLS // 3), max(ITERATIONS, 80 * KILLS)
     variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "STGA_CHECKPOINT_S": "0.3"}
     killed, states = run_script(NODES, tmp_path, KILLS, seeds, iterations, **variables)[-2:]
     names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))

@@ -27,9 +27,9 @@ from .conftest import Head, show
 from .test_page import psnr
 
 ROOT = Path(__file__).resolve().parents[3]
-PLAY_S, PLAY_RATE = 600, 10
+PLAY_S, PLAY_RATE = 600, 4
 """Length of the long play, and pictures drawn in each second of it."""
-BATCH = 250
+BATCH = 200
 """Pictures drawn at once."""
 MAX_HEAP_GROWTH = 300_000
 """Bytes that may be left over from a run of pictures: compiled code and the browser's own bookkeeping."""
