@@ -191,7 +191,7 @@ def distances(fit, found, true, head, front):
 def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     """Catches poses that follow the detector's landmarks where the surface does not tell, or that of three cameras
     follow the surface: the detector has the lower face 6 mm to one side, at each timestep another."""
-    model, cameras = head.model, rig(count)
+    model, cameras = head.model, rig(count, 280)
     meshes = [flame_forward(model, np.zeros(model.n_identity), frame_at(head, t)) for t in (0, 3, 6)]
     places, reliable, front = places_on(head, 150), np.ones(150, bool), model.v_template[:, 2] > 0.04
     lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]

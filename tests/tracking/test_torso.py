@@ -36,7 +36,7 @@ from stga_addon.tracking.write_capture import posed_mesh
 from .test_fit import places_on
 from .test_track import write_footage
 
-SIZE = 140, 190
+SIZE = 105, 142
 TIMESTEPS = 6
 SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)
 """Of what turns, at each timestep."""
