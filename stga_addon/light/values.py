@@ -102,7 +102,7 @@ class Lighting:
     exposure   stops (powers of two) by which relit colors are made brighter
     white      (3,) linear color that the capture shows of what is white under its own light, relative to the estimate:
                relit colors are divided by it (the eyedropper)
-    roughness  of highlights on skin; 0.05…1. Eyes and teeth have their own (`AvatarLight.roughness`)
+    roughness  of highlights on skin; 0.05…1. Eyeballs have their own (`AvatarLight.roughness`)
     specular   factor of highlights; 0: none
     shadows    whether lights are blocked by the head and casters; world light is always occluded by the head
     """

@@ -46,7 +46,7 @@ def adapter_names(software: bool = True) -> list[str]:
     """The adapters that `choose_device` knows, real GPUs first. Raises StgaError if there is none."""
     if find_spec("wgpu") is None:
         raise StgaError("--device gpu: the package wgpu (WebGPU) is not installed")
-    from ..raster.gpu.device import adapters, is_software
+    from ..raster.gpu.adapters import adapters, is_software
 
     names = [name for name, adapter in adapters().items() if software or not is_software(adapter)]
     if not names:

@@ -34,7 +34,7 @@ def _adapters() -> tuple[list[str], str]:
     """
     cpu = f"CPU with {os.cpu_count()} threads"
     try:
-        from ..raster.gpu.device import adapters, is_software
+        from ..raster.gpu.adapters import adapters, is_software
 
         found = adapters()
     except Exception:  # a package is missing, or a driver fails: the CPU trains

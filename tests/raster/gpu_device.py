@@ -6,7 +6,8 @@ import pytest
 
 wgpu = pytest.importorskip("wgpu")
 
-from stga_addon.raster.gpu.device import Device, adapters  # noqa: E402
+from stga_addon.raster.gpu.adapters import adapters  # noqa: E402
+from stga_addon.raster.gpu.device import Device  # noqa: E402
 
 
 def device() -> Device:

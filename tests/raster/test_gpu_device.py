@@ -8,7 +8,8 @@ import pytest
 from raster import gpu_device
 from stga_addon.errors import StgaError
 from stga_addon.raster.gpu import device as device_module
-from stga_addon.raster.gpu.device import Device, Kernel, Readback, adapters
+from stga_addon.raster.gpu.adapters import adapters
+from stga_addon.raster.gpu.device import Device, Kernel, Readback
 
 NUMBERS = """
 override STEP: u32 = 1u;

@@ -12,7 +12,8 @@ from stga_addon.render.device import adapter_names, choose_device, is_device
 
 pytest.importorskip("wgpu")
 
-from stga_addon.raster.gpu import device as gpu
+from stga_addon.raster.gpu import adapters as gpu
+from stga_addon.raster.gpu import device as gpu_device
 from stga_addon.raster.gpu import trial
 from stga_addon.raster.gpu.trial import Trial
 
@@ -26,7 +27,7 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> dict[str, Trial]:
     adapters = {name: SimpleNamespace(info={"adapter_type": kind}) for name, kind in kinds.items()}
     found = {name: Trial(1e-6, 0.002, 0.02) for name in adapters}
     monkeypatch.setattr(gpu, "adapters", lambda: adapters)
-    monkeypatch.setattr(gpu, "Device", lambda name: name)
+    monkeypatch.setattr(gpu_device, "Device", lambda name: name)
     monkeypatch.setattr(trial, "try_device", lambda name: found[name])
     device_module._trial.cache_clear()
     yield found

@@ -127,7 +127,7 @@ def test_check_in_a_worker(tmp_path):
     assert seen.status.message.startswith(f"Python {sys.version.split()[0]}, torch ")
     assert (tmp_path / ADAPTERS_FILE).exists()
     if find_spec("wgpu") is not None:
-        from stga_addon.raster.gpu.device import adapters
+        from stga_addon.raster.gpu.adapters import adapters
 
         assert stored_adapters(tmp_path) == list(adapters())
 

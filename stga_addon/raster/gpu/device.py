@@ -1,15 +1,14 @@
-"""WebGPU device: adapters by name, buffers that grow, kernels from WGSL files, recorded work, late readback.
+"""WebGPU device: buffers that grow, kernels from WGSL files, recorded work, late readback.
 
 Work is recorded into one command encoder and submitted at once; nothing waits for the device except `read` and
 `Readback.result`. A failure of driver or memory becomes a DeviceError.
 """
 
 import logging
-import os
 import re
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -19,56 +18,20 @@ from typing import Any
 
 import numpy as np
 import wgpu
-from wgpu.backends.wgpu_native.extras import set_instance_extras
 
 from ...errors import DeviceError, StgaError
+from .adapters import adapters, is_software
 from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
 from .timing import KernelTimes
 
-NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
-"""What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
 POLL_INTERVAL_S = 2e-4
 LOST_CHECK_S = 0.5
-BACKENDS = ("Vulkan", "Metal", "DX12")
-"""Without OpenGL, which lacks what the kernels need and complains where there is no display."""
 
 _BINDING = re.compile(r"@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)")
 _LAYOUT_TYPE = {"uniform": "uniform", "storage, read": "read-only-storage", "storage, read_write": "storage"}
 
 Groups = tuple[int, int, int] | tuple[Any, int]
 """Workgroups of a dispatch; or the buffer that holds them as three u32, and the offset in bytes."""
-
-
-@cache
-def adapters() -> dict[str, Any]:
-    """The adapters that can run the kernels, by a name that tells equal ones apart: cards first, software last.
-
-    A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the slowest.
-    """
-    os.environ.setdefault("NODEVICE_SELECT", "1")  # Mesa's layer for windows complains where there is no display
-    with suppress(RuntimeError):  # where this process has an instance already, it stays as it is
-        set_instance_extras(backends=BACKENDS)
-    found: dict[str, Any] = {}
-    every = wgpu.gpu.enumerate_adapters_sync()
-    for adapter in sorted(every, key=_preference):
-        too_small = any(adapter.limits[limit] < least for limit, least in NEEDED_LIMITS.items())
-        if too_small or adapter.info["backend_type"] == "OpenGL":
-            continue
-        name = f"{adapter.info['device']} ({adapter.info['backend_type']})"
-        same = sum(known == name or known.startswith(f"{name} #") for known in found)
-        found[f"{name} #{same + 1}" if same else name] = adapter
-    return found
-
-
-def _preference(adapter: Any) -> tuple[int, bool]:
-    kinds, info = ("DiscreteGPU", "IntegratedGPU", "CPU"), adapter.info
-    rank = kinds.index(info["adapter_type"]) if info["adapter_type"] in kinds else 1
-    return rank, info["backend_type"] == "D3D12"
-
-
-def is_software(adapter: Any) -> bool:
-    """Whether an adapter computes on the CPU."""
-    return bool(adapter.info["adapter_type"] == "CPU")
 
 
 @dataclass(frozen=True)
