@@ -6,7 +6,6 @@ The first training on a machine compiles Numba's kernels, and bytecode of the pa
 import os
 from contextlib import suppress
 from importlib import import_module
-from importlib.util import find_spec
 
 from ..raster.kernel_cache import OWN_KERNELS
 from ..worker.cache import PREPARING, cache_folder
@@ -28,8 +27,9 @@ def prepare() -> None:
             from ..training.optimize.precompile import compile_for_cpu
 
             compile_for_cpu()
-            if find_spec("matplotlib") is not None:
-                import_module("matplotlib.font_manager")  # lists the fonts of this machine
+            for library in ("matplotlib.font_manager", "torch"):  # the fonts of this machine; bytecode
+                with suppress(ImportError):
+                    import_module(library)
 
 
 if __name__ == "__main__":
