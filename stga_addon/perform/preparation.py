@@ -27,7 +27,7 @@ def prepare() -> None:
             from ..training.optimize.precompile import compile_for_cpu
 
             compile_for_cpu()
-            for library in ("matplotlib.font_manager", "torch"):  # the fonts of this machine; bytecode
+            for library in ("matplotlib.font_manager", "torch"):  # which lists this machine's fonts; for its bytecode
                 with suppress(ImportError):
                     import_module(library)
 
