@@ -22,8 +22,8 @@ from ..worker.status import StatusWriter, status_writer
 
 LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
 """Rooms that a worker which trains loads before it begins."""
-WITH_TORCH = ("flame.forward_torch", "raster.cpu.autograd")
-"""Their modules that take seconds to load; the first is loaded at the start of a training that refines tracking."""
+TORCH_MODULES = ("flame.forward_torch", "raster.cpu.autograd")
+"""Modules in them that import torch, which takes seconds; a training that refines tracking loads the first itself."""
 PREVIEW_INTERVAL_S = 4.0
 """Seconds between two previews of a training."""
 WORK: dict[type[Any], tuple[str, str]] = {
@@ -95,7 +95,7 @@ def load_ahead() -> None:
     for room in LOADED_AHEAD:
         package = import_module(f"..{room}", __package__)
         for module in walk_packages(package.__path__, f"{package.__name__}."):
-            if not module.name.endswith(WITH_TORCH):
+            if not module.name.endswith(TORCH_MODULES):
                 with suppress(ImportError):  # a package that not every Python has, and that nothing here needs
                     import_module(module.name)
 

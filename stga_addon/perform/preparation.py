@@ -27,7 +27,8 @@ def prepare() -> None:
             from ..training.optimize.precompile import compile_for_cpu
 
             compile_for_cpu()
-            for library in ("matplotlib.font_manager", "torch"):  # which lists this machine's fonts; for its bytecode
+            # The first lists the machine's fonts; torch's bytecode is not written by `load_ahead`.
+            for library in ("matplotlib.font_manager", "torch"):
                 with suppress(ImportError):
                     import_module(library)
 

@@ -33,6 +33,7 @@ def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
         axes.fill_between(seconds, psnr - error, psnr + error, color=line.get_color(), alpha=0.2, linewidth=0)
     detail = np.array(curve_of(metrics, DETAIL)).reshape(-1, 2).T
     if detail.size:
+        figure.subplots_adjust(right=0.9)
         right = axes.twinx()
         right.set(ylabel="detail difference (lower is better)", yscale="log")
         right.yaxis.set_major_formatter("{x:g}")
@@ -49,7 +50,7 @@ def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 5.4), dpi=100)
-    figure.subplots_adjust(left=0.08, right=0.9, bottom=0.1, top=0.93)  # `constrained` takes as long as the drawing
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.1, top=0.93)  # `constrained` takes as long as the drawing
     axes = figure.subplots()
     axes.set(title=title, xlabel="training time [s]", ylabel="PSNR [dB]")
     axes.set_prop_cycle(color=COLORS)

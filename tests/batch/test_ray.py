@@ -48,29 +48,32 @@ from ray.cluster_utils import Cluster
 from batch.simulated import carry_out
 from batch.tiny import tiny_plan
 from stga_addon.batch.engines.table import make_engine
+from stga_addon.training.run.folder import CHECKPOINT
 from stga_addon.worker.lock import is_locked
 from stga_addon.worker.status import LOCK_FILE
 
 kills, seeds, size = int(sys.argv[3]), int(sys.argv[4]), {"num_cpus": 1, "object_store_memory": 80_000_000}
 cluster = Cluster(initialize_head=True, head_node_args={**size, "num_cpus": 0})
-nodes = [cluster.add_node(**size) for _ in range(2)]
+nodes = [cluster.add_node(**size) for _ in range(min(2, seeds))]  # each of them with work, so that a kill hits
 plan = tiny_plan(Path(sys.argv[2]), seeds, int(sys.argv[5]))
-chance, killed, engine = random.Random(5), 0, make_engine("ray", cluster.address)
+chance, killed, resumable, engine = random.Random(5), 0, 0, make_engine("ray", cluster.address)
 with ThreadPoolExecutor(1) as pool:
     running = pool.submit(carry_out, plan, engine)
     # In this thread: a node sets a signal handler, which only the main thread can.
-    while killed < kills and not wait([running], chance.uniform(0.5, 2)).done:
-        if any(is_locked(job.request_folder / LOCK_FILE) for job in plan.jobs):
+    while killed < kills and not wait([running], chance.uniform(0.2, 1)).done:
+        begun = [job.request_folder for job in plan.jobs if is_locked(job.request_folder / LOCK_FILE)]
+        with_checkpoint = [folder for folder in begun if (folder.parent / CHECKPOINT).exists()]
+        if with_checkpoint if killed % 2 else begun:
             cluster.remove_node(nodes.pop(0), allow_graceful=False)
-            killed += 1
+            killed, resumable = killed + 1, resumable + bool(with_checkpoint)
             nodes.append(cluster.add_node(**size))
     batch, said = running.result()
 cluster.shutdown()
-print(killed, "nodes killed", flush=True)
+print(killed, "nodes killed,", resumable, "of them when a job had a checkpoint", flush=True)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
 KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
-"""Nodes that are killed; 6 in the measurement of docs/batch.md."""
+"""Nodes that are killed, every second one when a job has a checkpoint; 6 in the measurement of docs/batch.md."""
 
 
 def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
@@ -89,13 +92,14 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
     two workers on one."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
-    seeds, iterations = max(1, KILLS // 3), max(ITERATIONS, 80 * KILLS)
+    seeds, iterations = max(1, KILLS // 2), max(ITERATIONS, 200 * KILLS)
     variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "STGA_CHECKPOINT_S": "0.3"}
     killed, states = run_script(NODES, tmp_path, KILLS, seeds, iterations, **variables)[-2:]
     names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))
     assert states == str([(name, "finished", "") for name in names])
     print(killed)
     assert int(killed.split()[0]) >= KILLS // 2
+    assert int(killed.split()[3]) > 0
     here, there = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
     for seed in range(seeds):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")

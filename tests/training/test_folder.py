@@ -121,6 +121,18 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
     assert left == right
 
 
+def test_arrays_by_columns_are_read(tmp_path: Path) -> None:
+    """Catches arrays of another order than rows, of which Adam would step a copy."""
+    checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
+    path = tmp_path / "checkpoint.npz"
+    with np.load(path) as stored:
+        by_columns = {name: np.asfortranarray(array) for name, array in stored.items()}
+    np.savez(path, **by_columns)
+    assert not by_columns["parameters/xyz"].flags.c_contiguous
+    state = checkpoint_files.read_checkpoint(tmp_path).state
+    assert all(array.flags.c_contiguous for array in arrays_of(state).values())
+
+
 def test_checkpoint_before_any_evaluation(tmp_path: Path) -> None:
     """Catches ∞ and None, which plain JSON does not know, lost on their way."""
     checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, np.inf, 0, [])

@@ -41,7 +41,7 @@ def test_keep_and_join() -> None:
 
 
 def test_memory_is_shared_where_promised_and_only_there() -> None:
-    """Catches training that changes the splats it started from, and drawing of parameters of the past."""
+    """Catches training that changes the splats it started from, and Adam on a copy of the parameters."""
     splats = random_splats(6, 4)
     xyz, face = splats.xyz.copy(), splats.face.copy()
     state = new_state(splats)
@@ -52,4 +52,8 @@ def test_memory_is_shared_where_promised_and_only_there() -> None:
     np.testing.assert_array_equal(splats.face, face)
     np.testing.assert_array_equal(copy.xyz, xyz)
     np.testing.assert_array_equal(state.average.xyz, xyz)
-    assert all(not t.any() for part in (state.gradients, state.first, state.second) for t in part)
+    assert all(not array.any() for part in (state.gradients, state.first, state.second) for array in part)
+    for name, table in state.tables.items():
+        parts = (state.parameters, state.gradients, state.first, state.second, state.average)
+        for array, part in zip(table, parts, strict=False):
+            assert np.shares_memory(array, getattr(part, name)) or not array.size
