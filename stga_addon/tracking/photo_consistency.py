@@ -140,7 +140,7 @@ def _patches(points: np.ndarray, normals: np.ndarray, spacing: float) -> tuple[n
 
 def _sampled(view: GrayView, patches: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Levels (M, D, P) of the patches (M, P, 3) moved along their normals by each of the offsets (D,)."""
-    from scipy.ndimage import map_coordinates
+    import cv2
 
     camera, turn = view.camera, view.camera.world_to_camera[:3, :3]
     local = (patches @ turn.T + view.camera.world_to_camera[:3, 3]).astype(np.float32)
@@ -148,7 +148,10 @@ def _sampled(view: GrayView, patches: np.ndarray, normals: np.ndarray, offsets: 
     depth = local[:, None, :, 2] + moved[..., 2:3]
     x = (local[:, None, :, 0] + moved[..., 0:1]) / depth * np.float32(camera.fl_x) + np.float32(camera.cx - 0.5)
     y = (local[:, None, :, 1] + moved[..., 1:2]) / depth * np.float32(camera.fl_y) + np.float32(camera.cy - 0.5)
-    return np.asarray(map_coordinates(view.image, [y, x], np.float32, order=1, mode="nearest"))
+    found = np.empty_like(x)
+    for row in range(len(x)):  # OpenCV takes no more than 2^15 lines at a time
+        cv2.remap(view.image, x[row], y[row], cv2.INTER_LINEAR, found[row], cv2.BORDER_REPLICATE)
+    return found
 
 
 def _normalized(patch: np.ndarray, window: np.ndarray) -> np.ndarray:

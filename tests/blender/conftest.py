@@ -16,10 +16,18 @@ from stga_addon.worker.environment import missing_packages
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(autouse=True)
-def empty_scene():
+@pytest.fixture(autouse=True, scope="session")
+def _factory_settings():
     bpy = pytest.importorskip("bpy")
     bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture(autouse=True)
+def empty_scene(_factory_settings):
+    """As after factory settings, in a fifth of the time: Blender's own add-ons are not registered anew."""
+    import bpy
+
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ HALF_TURNS = [np.diag(signs) for signs in ((1, -1, -1), (-1, 1, -1), (-1, -1, 1)
 
 @pytest.fixture(autouse=True)
 def _empty_scene():
-    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
 def shown_and_expected(posed: list[np.ndarray], neutral: list[np.ndarray], convention: str):

@@ -13,6 +13,8 @@ FORMAT, VERSION = "stga-web", 1
 MAX_PLANES = 4
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
+GZIP_LEVEL = 7
+"""Level 9 takes six times as long and makes the demo's page half a percent smaller."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray | FixedPoint
     complete = {"format": FORMAT, "version": VERSION, **header, "arrays": entries}
     text = json.dumps(complete, ensure_ascii=False, allow_nan=False).encode("utf-8")
     raw = b"".join((MAGIC, VERSION.to_bytes(4, "little"), len(text).to_bytes(4, "little"), text, *blocks))
-    return gzip.compress(raw, 9, mtime=0)
+    return gzip.compress(raw, GZIP_LEVEL, mtime=0)
 
 
 def _entry(name: str, array: np.ndarray | FixedPoint) -> tuple[dict[str, Any], bytes]:

@@ -17,6 +17,7 @@ def add_depths(points, faces, depth):
     points (V, 3) float32: x and y in texels, depth; triangles with a point that is not finite are left out.
     """
     size = len(depth)
+    centers = np.arange(size).astype(np.float32) + HALF
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, az = points[a, 0], points[a, 1], points[a, 2]
@@ -33,14 +34,13 @@ def add_depths(points, faces, depth):
         y0, y1 = max(0, math.ceil(low_y - HALF)), min(size - 1, math.floor(high_y - HALF))
         inverse = ONE / area
         for y in range(y0, y1 + 1):
-            dy = np.float32(y) + HALF - ay
-            for x in range(x0, x1 + 1):
-                dx = np.float32(x) + HALF - ax
+            dy, row, across = np.float32(y) + HALF - ay, depth[y, x0 : x1 + 1], centers[x0 : x1 + 1]
+            for x in range(len(row)):
+                dx = across[x] - ax
                 u, v = (dx * cy - dy * cx) * inverse, (bx * dy - by * dx) * inverse
-                if u >= ZERO and v >= ZERO and u + v <= ONE:
-                    z = az + u * bz + v * cz
-                    if z < depth[y, x]:
-                        depth[y, x] = z
+                z = az + u * bz + v * cz
+                is_nearer = (u >= ZERO) & (v >= ZERO) & (u + v <= ONE) & (z < row[x])
+                row[x] = z if is_nearer else row[x]
 
 
 @parallel(lambda depth, points, *_: len(points), piece=256)

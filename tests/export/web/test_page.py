@@ -176,7 +176,7 @@ def with_header(page: str, *keys: str | int, value: Any) -> str:
     functools.reduce(operator.getitem, outer, header)[last] = value
     text = json.dumps(header).replace("Infinity", "1e999").encode()
     changed = raw[:8] + len(text).to_bytes(4, "little") + text + raw[12 + length :]
-    return start + base64.b64encode(gzip.compress(changed)).decode() + end
+    return start + base64.b64encode(gzip.compress(changed, 1)).decode() + end
 
 
 DATA = r'(?<=id="data">).*?(?=</script>)'
