@@ -1,5 +1,6 @@
 """Fixtures that several test folders share."""
 
+import gc
 import os
 import signal
 import sys
@@ -43,6 +44,11 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # those inherit it
 def pytest_xdist_auto_num_workers() -> int:
     """Two processes more than cores, because some tests wait: for a cluster, a browser or another process."""
     return min((os.cpu_count() or 1) + 2, MAX_PROCESSES)
+
+
+def pytest_collection_finish() -> None:
+    """Objects of modules and tests, which stay to the end, are no longer looked through for garbage."""
+    gc.freeze()
 
 
 # A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in one.

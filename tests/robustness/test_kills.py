@@ -15,7 +15,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not hasattr(os, "fork"), reason="children are forked and killed with SIGKILL"),
 ]
-KILLS = int(os.environ.get("STGA_KILLS", 50))
+KILLS = int(os.environ.get("STGA_KILLS", 32))
 
 
 @pytest.fixture(scope="module")

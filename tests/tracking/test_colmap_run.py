@@ -72,7 +72,7 @@ def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
     pytest.importorskip("cv2")
     pycolmap = pytest.importorskip("pycolmap")
     walls = textures()
-    angles = np.linspace(0.3, 1.25, 10)
+    angles = np.linspace(0.3, 1.25, 7)
     eyes = [(1.6 * np.cos(a), 0.3 + 0.4 * np.sin(3 * a), 1.6 * np.sin(a)) for a in angles]
     truth = [look_at(eye, (-0.6, -0.6, -0.6), WIDTH, HEIGHT, FOCAL) for eye in eyes]
     (tmp_path / "images").mkdir()

@@ -23,7 +23,7 @@ TINY = CaptureOptions(train=1, test=1, cameras=3, width=36, height=50, samples=1
 def demo(tmp_path_factory):
     """Folder of a demo."""
     folder = tmp_path_factory.mktemp("demo")
-    run_demo(folder, {"seconds": 6.0}, SMALL)
+    run_demo(folder, {"iterations": 60}, SMALL)
     return folder
 
 

@@ -24,6 +24,10 @@ from stga_addon.training.settings import TrainingSettings, make_settings
 from .scenes import gloss, sliding, wrinkles
 
 
+FEW_VIEWS = {"cameras": 3, "timesteps": 3}
+"""For what does not depend on how sure evidence is."""
+
+
 def planned(capture, **choices):
     """effect -> decision, and the settings that follow."""
     names = {name.replace("_", "-"): choice for name, choice in choices.items()}
@@ -129,14 +133,14 @@ def test_one_frame(painted):
 
 def test_background(painted):
     """Catches a background that is guessed without masks, and a wrong color that splats are trained against."""
-    plan, settings = planned(painted(background=(0, 0, 0)))
+    plan, settings = planned(painted(background=(0, 0, 0), **FEW_VIEWS))
     assert plan["background"].on
     assert settings.background == (0.0, 0.0, 0.0)
-    plan, settings = planned(painted(masks=False))
+    plan, settings = planned(painted(masks=False, **FEW_VIEWS))
     assert not plan["background"].on
     assert not settings.random_background
     with pytest.raises(StgaError, match="background=on: is not possible, because not every image has a mask"):
-        planned(painted(masks=False), background="on")
+        planned(painted(masks=False, **FEW_VIEWS), background="on")
 
 
 def test_a_room_behind_the_head(painted):
@@ -168,7 +172,7 @@ def test_a_world_is_kept_where_it_is_asked_for(painted):
 
 def test_a_room_without_masks(painted):
     """Catches a run that makes splats of the wall behind the head, or that does not say what it leaves out."""
-    capture = painted(masks=False, background=(90, 110, 70))
+    capture = painted(masks=False, background=(90, 110, 70), **FEW_VIEWS)
     plan, settings = planned(capture)
     assert (settings.backdrop, settings.hull_points, settings.random_background) == ("mesh", False, True)
     assert "sampled images have no mask" in plan["background"].reason
@@ -211,16 +215,16 @@ def test_different_pixels(painted):
 
 def test_many_splats_a_pixel(painted):
     """Catches density control where the first splats are already finer than the images."""
-    settings, plan = plan_effects(painted(), make_settings(iterations=1, lattice=8, effects={}))
+    settings, plan = plan_effects(painted(**FEW_VIEWS), make_settings(iterations=1, lattice=8, effects={}))
     assert not next(decision.on for decision in plan if decision.effect == "density")
     assert settings.density_interval == 0
 
 
 def test_selection_follows_the_strategy(painted):
     """Catches a strategy that was asked for and is dropped, or one that was not and is taken."""
-    settings, _ = plan_effects(painted(), make_settings("selective", iterations=1, effects={}))
+    settings, _ = plan_effects(painted(**FEW_VIEWS), make_settings("selective", iterations=1, effects={}))
     assert settings.strategy == "selective"
-    _, settings = planned(painted(), selection="on")
+    _, settings = planned(painted(**FEW_VIEWS), selection="on")
     assert settings.strategy == "selective"
     settings, plan = plan_effects(
         painted(timesteps=1, deformed=0.0), make_settings("selective", iterations=1, effects={})
@@ -307,9 +311,9 @@ def test_a_capture_that_was_tracked_here(painted, tmp_path):
 def test_what_a_mesh_sequence_has_not(painted):
     """Catches an effect of FLAME's that is forced on a capture without its parameters."""
     with pytest.raises(StgaError, match=r"--effect teeth=on: .* has none"):
-        planned(painted(), teeth="on")
+        planned(painted(**FEW_VIEWS), teeth="on")
     with pytest.raises(StgaError, match=r"--effect jaw=on: .* no parameters of FLAME"):
-        planned(painted(), jaw="on")
+        planned(painted(**FEW_VIEWS), jaw="on")
 
 
 def test_overrides(painted):
