@@ -89,7 +89,7 @@ def toy(toy_root: Path) -> Capture:
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """footage/ of the demo's head, head.npz and its exact landmarks points/, for tests that only read it; in black, so
     that landmarks alone are tracked, in a third of the time."""
-    from tracking.test_track import record
+    from tracking.recording import record
 
     from stga_addon.development.demo.head import synthetic_flame
     from stga_addon.tracking.head_model import HeadModel

@@ -21,8 +21,8 @@ from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 
+from .recording import record
 from .test_fit import frame_at, places_on
-from .test_track import record
 
 HEAD = HeadModel(synthetic_flame(0), "flame")
 PERSON = person(HEAD, np.zeros(HEAD.model.n_identity)).model

@@ -9,6 +9,7 @@ from flame.conftest import random_arrays, random_frame
 from stga_addon.capture.camera import look_at
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import FlameFrame, flame_forward, frame_of
+from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import (
     Similarity,
     TimestepLandmarks,
@@ -294,3 +295,16 @@ def test_timesteps_without_a_face_are_interpolated():
     """Catches gaps that keep the last pose, or extrapolate beyond the ends."""
     found = interpolated({2: np.array([0.0, 1.0]), 6: np.array([4.0, 1.0])}, (1, 2, 3, 6, 7))
     np.testing.assert_allclose([found[t][0] for t in (1, 2, 3, 6, 7)], [0, 0, 1, 4, 4])
+
+
+def test_nearest_points_of_a_mesh(head):
+    """Catches a nearest triangle that is only the one with the nearest center."""
+    points = np.random.default_rng(0).normal(0, 0.08, (40, 3))
+    places, distance = nearest_points(head.model.v_template, head.model.faces, points)
+    on = places.on(head.model.v_template, head.model.faces)
+    np.testing.assert_allclose(np.linalg.norm(on - points, axis=1), distance, atol=1e-9)
+    corners = head.model.v_template[head.model.faces]
+    weights = np.random.default_rng(1).dirichlet([1, 1, 1], 60)
+    samples = np.einsum("sk,fkc->fsc", weights, corners).reshape(-1, 3)
+    for point, found in zip(points, distance, strict=True):
+        assert found <= np.linalg.norm(samples - point, axis=1).min() + 1e-9

@@ -3,12 +3,14 @@
 import json
 import struct
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
+from stga_addon.files import write_npz
 from stga_addon.tracking.head_model import read_head_model, shape_arrays, write_linear_model
 
 MESH = synthetic_flame(0)
@@ -206,3 +208,42 @@ def test_shape_keys_become_a_linear_model(tmp_path):
     assert (found.n_identity, found.n_expression) == (2, 4)
     np.testing.assert_allclose(found.shapedirs[:, :, :5], SHAPES, atol=1e-6)
     np.testing.assert_allclose(found.shapedirs[:, :, 5], 0, atol=1e-6)
+
+
+def linear(**changes):
+    """The arrays of a linear head model of four vertices, and what is changed of them."""
+    return {"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))} | changes
+
+
+@pytest.mark.parametrize(
+    ("arrays", "expected"),
+    [
+        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 2]])}, "neither identity nor expression"),
+        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 9]]), "identity": np.ones((4, 3, 1))}, "names vertices"),
+        ({"mean": np.eye(4, 3) * 30, "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))}, "meters"),
+        ({"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((5, 3, 1))}, "identity has shape"),
+        (linear(mean=np.full((4, 3), "x")), "mean holds <U1, expected numbers"),
+        (linear(mean=np.eye(4, 3) + 1e200), "mean reaches 1e[+]200, expected at most 100000"),
+        (linear(mean=np.eye(4, 3) * 1e308 * [1, -1, 1]), "mean reaches 1e[+]308"),
+        (linear(faces=np.full((1, 3), "x")), "faces is <U1"),
+        (linear(identity=np.full((4, 3, 1), 1e300)), "identity reaches 1e[+]300, expected at most 100"),
+        (linear(identity=np.full((4, 3, 1), np.longdouble("1e4000"))), "identity holds values that are not finite"),
+        (linear(expression=np.full((4, 3, 1), np.nan)), "expression holds values that are not finite"),
+        (linear(J_regressor=np.full((5, 4), 1e300), weights=np.eye(4, 5)), "J_regressor reaches 1e[+]300"),
+        (linear(J_regressor=np.ones((5, 4)) / 4, weights=np.full((4, 5), -1e300)), "weights reaches 1e[+]300"),
+    ],
+)
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_wrong_head_models_are_named(tmp_path, arrays, expected):
+    """Catches head models whose mistake shows up as a strange fit minutes later."""
+    write_npz(tmp_path / "model.npz", arrays)
+    with pytest.raises(StgaError, match=f"model.npz: .*{expected}"):
+        read_head_model(tmp_path / "model.npz")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_flame_model_of_huge_numbers(tmp_path):
+    """Catches an overflow in the fit for numbers that no head has."""
+    write_flame(replace(MESH, shapedirs=1e300 * MESH.shapedirs), tmp_path / "head.npz")
+    with pytest.raises(StgaError, match=r"head.npz: shapedirs reaches .*, expected at most 100"):
+        read_head_model(tmp_path / "head.npz")

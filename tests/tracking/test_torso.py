@@ -33,8 +33,8 @@ from stga_addon.tracking.torso_take import NECK, ROOT, TorsoPose, TorsoTake, wit
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import posed_mesh
 
+from .recording import write_footage
 from .test_fit import places_on
-from .test_track import write_footage
 
 SIZE = 105, 142
 TIMESTEPS = 6

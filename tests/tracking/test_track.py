@@ -9,8 +9,6 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from stga_addon.capture.camera import look_at
-from stga_addon.capture.mesh_raster import rasterize
 from stga_addon.capture.open import open_capture
 from stga_addon.capture.rigid import Similarity
 from stga_addon.cli.main import main
@@ -23,63 +21,19 @@ from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
-from stga_addon.tracking.head_model import HeadModel, read_head_model
-from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera, write_places
+from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera
 from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.track import track
 
+from .recording import LANDMARKS, SIZE, record, rig, write_footage
 from .test_fit import frame_at, places_on
 from .test_sequences import write_folders
-
-SIZE, LANDMARKS = 64, 120
 
 
 @pytest.fixture(scope="module")
 def head():
     return HeadModel(synthetic_flame(0), "flame")
-
-
-def rig(count=5, size=SIZE):
-    eyes = [(np.sin(a), 0.1, np.cos(a)) for a in np.linspace(-0.6, 0.6, count)]
-    return [look_at(eye, (0, -0.02, 0), size, size, 2.6 * size) for eye in eyes]
-
-
-def write_footage(folder, cameras, timesteps, picture):
-    """transforms.json with one entry an image; picture(camera, timestep) gives its pixels."""
-    frames = []
-    for number, camera in enumerate(cameras):
-        for timestep in range(timesteps):
-            name = f"images/{number}_{timestep}.png"
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(picture(camera, timestep)).save(folder / name)
-            entry = {"file_path": name, "timestep_index": timestep, "camera_id": f"cam{number}"}
-            intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.height - camera.cy}
-            pose = {"transform_matrix": camera.camera_to_world_gl.tolist(), "w": camera.width, "h": camera.height}
-            frames.append({**entry, **intrinsics, **pose})
-    write_json(folder / "transforms.json", {"frames": frames})
-    return folder
-
-
-def record(folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8), timesteps=5):
-    """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2; returns its meshes.
-
-    picture(mesh, camera) gives the pixels.
-    """
-    cameras, places = rig(), places_on(head, LANDMARKS)
-    shape = np.zeros(head.model.n_identity)
-    meshes = [flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(timesteps)]
-    write_footage(folder / "footage", cameras, timesteps, lambda camera, timestep: picture(meshes[timestep], camera))
-    write_flame(head.model, folder / "head.npz")
-    write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
-    for number, camera in enumerate(cameras):
-        points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
-        confidence = np.ones(points.shape[:2])
-        confidence[2] = 0
-        write_npz(
-            folder / f"points/cam{number}.npz",
-            {"timesteps": np.arange(timesteps), "points": points, "confidence": confidence},
-        )
-    return meshes
 
 
 @pytest.fixture(scope="module")
@@ -379,45 +333,6 @@ def test_footage_without_a_face(recorded, capsys):
     assert "shows no face in any of 25 frames" in capsys.readouterr().err
 
 
-def linear(**changes):
-    """The arrays of a linear head model of four vertices, and what is changed of them."""
-    return {"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))} | changes
-
-
-@pytest.mark.parametrize(
-    ("arrays", "expected"),
-    [
-        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 2]])}, "neither identity nor expression"),
-        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 9]]), "identity": np.ones((4, 3, 1))}, "names vertices"),
-        ({"mean": np.eye(4, 3) * 30, "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))}, "meters"),
-        ({"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((5, 3, 1))}, "identity has shape"),
-        (linear(mean=np.full((4, 3), "x")), "mean holds <U1, expected numbers"),
-        (linear(mean=np.eye(4, 3) + 1e200), "mean reaches 1e[+]200, expected at most 100000"),
-        (linear(mean=np.eye(4, 3) * 1e308 * [1, -1, 1]), "mean reaches 1e[+]308"),
-        (linear(faces=np.full((1, 3), "x")), "faces is <U1"),
-        (linear(identity=np.full((4, 3, 1), 1e300)), "identity reaches 1e[+]300, expected at most 100"),
-        (linear(identity=np.full((4, 3, 1), np.longdouble("1e4000"))), "identity holds values that are not finite"),
-        (linear(expression=np.full((4, 3, 1), np.nan)), "expression holds values that are not finite"),
-        (linear(J_regressor=np.full((5, 4), 1e300), weights=np.eye(4, 5)), "J_regressor reaches 1e[+]300"),
-        (linear(J_regressor=np.ones((5, 4)) / 4, weights=np.full((4, 5), -1e300)), "weights reaches 1e[+]300"),
-    ],
-)
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_wrong_head_models_are_named(tmp_path, arrays, expected):
-    """Catches head models whose mistake shows up as a strange fit minutes later."""
-    write_npz(tmp_path / "model.npz", arrays)
-    with pytest.raises(StgaError, match=f"model.npz: .*{expected}"):
-        read_head_model(tmp_path / "model.npz")
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_a_flame_model_of_huge_numbers(tmp_path, head):
-    """Catches an overflow in the fit for numbers that no head has."""
-    write_flame(replace(head.model, shapedirs=1e300 * head.model.shapedirs), tmp_path / "head.npz")
-    with pytest.raises(StgaError, match=r"head.npz: shapedirs reaches .*, expected at most 100"):
-        read_head_model(tmp_path / "head.npz")
-
-
 class Counting:
     """A detector that sees `faces` in each image."""
 
@@ -524,41 +439,6 @@ def test_two_faces_are_reported_with_camera_and_frame(recorded):
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     with pytest.raises(StgaError, match=r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
         detect_landmarks(open_footage(folder / "footage"), Counting([two, two + 30]), folder / "found", lambda *_: None)
-
-
-def test_the_picture_of_a_mesh_shows_its_nearest_triangles(head):
-    """Catches a wrong depth order or barycentric coordinates, against rays through pixel centers."""
-    camera, vertices, faces = rig(3, 48)[0], head.model.v_template, head.model.faces
-    triangle, weights = rasterize(vertices, faces, camera)
-    rows, columns = np.nonzero(triangle >= 0)
-    assert 300 < len(rows) < 48 * 48
-    corners = vertices[faces]
-    for y, x in np.random.default_rng(0).permutation(np.column_stack([rows, columns]))[:60]:
-        local = np.array([(x + 0.5 - camera.cx) / camera.fl_x, (y + 0.5 - camera.cy) / camera.fl_y, 1.0])
-        direction = local @ camera.world_to_camera[:3, :3]
-        system = np.stack(
-            [corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], 0 * corners[:, 0] - direction], 2
-        )
-        usable = np.abs(np.linalg.det(system)) > 1e-12
-        hits = np.linalg.solve(system[usable], (camera.position - corners[usable, 0])[..., None])[..., 0]
-        inside = (hits[:, :2] >= -1e-9).all(1) & (hits[:, :2].sum(1) <= 1 + 1e-9) & (hits[:, 2] > 0)
-        nearest = np.flatnonzero(usable)[inside][hits[inside, 2].argmin()]
-        assert triangle[y, x] == nearest
-        pixel, _ = camera.project((weights[y, x] @ corners[nearest])[None])
-        np.testing.assert_allclose(pixel[0], [x + 0.5, y + 0.5], atol=0.05)
-
-
-def test_nearest_points_of_a_mesh(head):
-    """Catches a nearest triangle that is only the one with the nearest center."""
-    points = np.random.default_rng(0).normal(0, 0.08, (40, 3))
-    places, distance = nearest_points(head.model.v_template, head.model.faces, points)
-    on = places.on(head.model.v_template, head.model.faces)
-    np.testing.assert_allclose(np.linalg.norm(on - points, axis=1), distance, atol=1e-9)
-    corners = head.model.v_template[head.model.faces]
-    weights = np.random.default_rng(1).dirichlet([1, 1, 1], 60)
-    samples = np.einsum("sk,fkc->fsc", weights, corners).reshape(-1, 3)
-    for point, found in zip(points, distance, strict=True):
-        assert found <= np.linalg.norm(samples - point, axis=1).min() + 1e-9
 
 
 def test_mediapipe_tracks_pictures_of_a_head(tmp_path, head):

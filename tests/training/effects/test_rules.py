@@ -23,7 +23,6 @@ from stga_addon.training.settings import TrainingSettings, make_settings
 
 from .scenes import gloss, sliding, wrinkles
 
-
 FEW_VIEWS = {"cameras": 3, "timesteps": 3}
 """For what does not depend on how sure evidence is."""
 

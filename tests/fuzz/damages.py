@@ -1,0 +1,157 @@
+"""Damages of one file of a case: bytes, values of JSON, arrays, pictures, and what is in the file's place."""
+
+import copy
+import json
+import os
+import random
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from .arguments import TEXTS
+
+JSON_VALUES: list[Any] = [
+    *(None, True, False, 0, 1, -1, 2.5, 10**30, -(10**400), 1e308, 1e-320, float("nan"), float("inf"), -float("inf")),
+    *(
+        "1",
+        "nan",
+        *TEXTS,
+        "/",
+        "//",
+        "a" * 5000,
+        "vhap",
+        "opencv",
+        "../x",
+        "/dev/null",
+        "images",
+        "images/00000_00.png",
+    ),
+    *([], {}, [[]], [None], [0] * 1000, {"": {}}, [[0, 0, 0, 0]] * 4, [1e300] * 3, {"a": [1, {"b": None}]}),
+]
+ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
+    lambda a: a[:-1] if a.ndim else a.reshape(1), lambda a: a[None], lambda a: a.astype(np.float16),
+    lambda a: np.zeros(0, a.dtype), lambda a: np.zeros((0, *a.shape[1:]), a.dtype), lambda a: np.full_like(a, 0),
+    lambda a: -a if a.dtype.kind in "if" else ~a if a.dtype.kind == "b" else a, lambda a: np.full(a.shape, np.nan),
+    lambda a: np.full(a.shape, 1e30), lambda a: np.full(a.shape, np.inf, np.float32),
+    lambda a: np.full(a.shape, 2**62), lambda a: np.full(a.shape, "x"),
+    lambda a: a.astype(complex) if a.dtype.kind in "if" else a, lambda a: a.astype(bool), lambda a: a.T,
+    lambda a: np.concatenate([a, a]) if a.ndim else a,
+]  # fmt: skip
+BYTES = [b"\xff" * 8, b"\0" * 8, b"-1", b"1e999", b"NaN", b"[", b"]", b'"', b"{}", b"\n", b".", b"\x80", b"99999999999"]
+
+
+def damage(rng: random.Random, case: Path, arguments: list[str]) -> str:
+    """Change one file of the case, mostly one that the arguments name; returns what was done to it."""
+    files = sorted(path for path in case.rglob("*") if path.is_file() and not path.is_symlink())
+    named = [path for path in files if any(str(path).startswith(a) for a in arguments if a.startswith(f"{case}/"))]
+    small = [path for path in named if path.suffix in (".json", ".npz", ".ply", ".jsonl", ".obj")]
+    path = rng.choice(rng.choice([small, small, named, files]) or files)
+    special = {".json": mutate_json, ".jsonl": mutate_json, ".npz": mutate_npz, ".png": mutate_picture}
+    kind = rng.choice([special.get(path.suffix, mutate_bytes)] * 6 + [mutate_bytes] * 2 + [replace_file])
+    return f"{path.relative_to(case)}: {kind.__name__} {kind(rng, path)}"
+
+
+def mutate_bytes(rng: random.Random, path: Path) -> str:
+    content = path.read_bytes()
+    at, length = rng.randrange(len(content) + 1), rng.choice([0, 1, 4, 40])
+    piece = rng.choice([*BYTES, rng.randbytes(4), content[at : at + length] * 2, b""])
+    content = content[:at] + piece + content[at + length :]
+    path.write_bytes(content if rng.random() < 0.8 else content[:at])
+    return f"at {at}"
+
+
+def mutate_json(rng: random.Random, path: Path) -> str:
+    """Replace, delete, add or copy one value, at any depth."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        document = [json.loads(line) for line in (text.splitlines() if path.suffix == ".jsonl" else [text])]
+    except (ValueError, RecursionError):  # an earlier damage
+        return mutate_bytes(rng, path)
+    node: Any = document
+    trail: list[Any] = []
+    while True:
+        keys: list[Any] = list(node) if isinstance(node, dict) else list(range(len(node)))
+        if not keys:
+            return "nothing"
+        key = rng.choice(keys)
+        trail.append(key)
+        if not isinstance(node[key], (dict, list)) or not node[key] or rng.random() < 0.15 * (len(trail) > 1):
+            break
+        node = node[key]
+    kind = rng.choice(["replace"] * 6 + ["delete", "copy", "scale"])
+    if kind == "replace":
+        node[key] = copy.deepcopy(rng.choice(JSON_VALUES))
+    elif kind == "scale" and isinstance(node[key], (int, float)):
+        node[key] *= rng.choice([-1, 0, 1e-9, 1e9, 0.5])
+    elif kind == "copy":
+        node[key] = copy.deepcopy(rng.choice([node[k] for k in keys]))
+    elif isinstance(node, dict) or len(trail) > 1:
+        del node[key]
+    texts = [json.dumps(value) for value in document]
+    path.write_text("\n".join(texts))
+    return f"{kind} {trail}"
+
+
+def mutate_npz(rng: random.Random, path: Path) -> str:
+    """Change, remove or rename one array of an intact archive."""
+    try:
+        with np.load(path) as data:
+            arrays = dict(data)
+    except Exception:  # an earlier damage
+        return mutate_bytes(rng, path)
+    if not arrays:
+        return "nothing"
+    name = rng.choice(list(arrays))
+    chance = rng.random()
+    if chance < 0.1:
+        del arrays[name]
+    elif chance < 0.2:
+        arrays[rng.choice(["x", "../x", "0", f"{name}/"])] = arrays.pop(name)
+    elif chance < 0.4 and arrays[name].size and arrays[name].dtype.kind in "if":
+        flat = arrays[name] = arrays[name].copy()
+        worst = [np.nan, np.inf, -1e30, 1e6] if flat.dtype.kind == "f" else [-1, np.iinfo(flat.dtype).max]
+        flat.reshape(-1)[rng.randrange(flat.size)] = rng.choice(worst)
+    else:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                arrays[name] = rng.choice(ARRAYS)(arrays[name])
+            except (ValueError, TypeError):
+                del arrays[name]
+    with zipfile.ZipFile(path, "w") as archive:
+        for entry, array in arrays.items():
+            with archive.open(f"{entry}.npy", "w") as stream:
+                np.lib.format.write_array(stream, np.asarray(array))
+    return f"{name} {arrays[name].dtype if name in arrays else 'gone'}"
+
+
+def mutate_picture(rng: random.Random, path: Path) -> str:
+    """Another size, mode or format in the same file."""
+    size = rng.choice([(40, 60), (60, 40), (1, 1), (41, 60), (4000, 4000)])
+    mode = rng.choice(["RGB", "RGBA", "L", "LA", "P", "I;16", "1", "F", "CMYK"])
+    kind = {"F": "TIFF", "CMYK": "JPEG"}.get(mode, "PNG")
+    Image.new(mode, size).save(path, kind)
+    return f"{mode} {size}"
+
+
+def replace_file(rng: random.Random, path: Path) -> str:
+    """Nothing, an empty file, a folder, a link to itself, a pipe or another file in its place."""
+    kind = rng.choice(["missing", "empty", "folder", "link", "pipe", "other"])
+    content = rng.choice(sorted(other for other in path.parent.iterdir() if other.is_file())).read_bytes()
+    path.unlink()
+    if kind == "empty":
+        path.touch()
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "link":
+        path.symlink_to(path.name)
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "other":
+        path.write_bytes(content)
+    return kind

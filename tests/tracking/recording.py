@@ -1,0 +1,57 @@
+"""Footage that is written for tests: images, cameras, a FLAME file and exact landmarks."""
+
+import numpy as np
+from PIL import Image
+
+from stga_addon.capture.camera import look_at
+from stga_addon.development.demo.head import write_flame
+from stga_addon.files import write_json, write_npz
+from stga_addon.flame.forward import flame_forward
+from stga_addon.tracking.landmarks import write_places
+
+from .test_fit import frame_at, places_on
+
+SIZE, LANDMARKS = 64, 120
+
+
+def rig(count=5, size=SIZE):
+    eyes = [(np.sin(a), 0.1, np.cos(a)) for a in np.linspace(-0.6, 0.6, count)]
+    return [look_at(eye, (0, -0.02, 0), size, size, 2.6 * size) for eye in eyes]
+
+
+def write_footage(folder, cameras, timesteps, picture):
+    """transforms.json with one entry an image; picture(camera, timestep) gives its pixels."""
+    frames = []
+    for number, camera in enumerate(cameras):
+        for timestep in range(timesteps):
+            name = f"images/{number}_{timestep}.png"
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(picture(camera, timestep)).save(folder / name)
+            entry = {"file_path": name, "timestep_index": timestep, "camera_id": f"cam{number}"}
+            intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.height - camera.cy}
+            pose = {"transform_matrix": camera.camera_to_world_gl.tolist(), "w": camera.width, "h": camera.height}
+            frames.append({**entry, **intrinsics, **pose})
+    write_json(folder / "transforms.json", {"frames": frames})
+    return folder
+
+
+def record(folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8), timesteps=5):
+    """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2; returns its meshes.
+
+    picture(mesh, camera) gives the pixels.
+    """
+    cameras, places = rig(), places_on(head, LANDMARKS)
+    shape = np.zeros(head.model.n_identity)
+    meshes = [flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(timesteps)]
+    write_footage(folder / "footage", cameras, timesteps, lambda camera, timestep: picture(meshes[timestep], camera))
+    write_flame(head.model, folder / "head.npz")
+    write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
+    for number, camera in enumerate(cameras):
+        points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
+        confidence = np.ones(points.shape[:2])
+        confidence[2] = 0
+        write_npz(
+            folder / f"points/cam{number}.npz",
+            {"timesteps": np.arange(timesteps), "points": points, "confidence": confidence},
+        )
+    return meshes
