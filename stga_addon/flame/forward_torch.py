@@ -93,6 +93,6 @@ def parameters_gradient(flame: FlameTensors, frame: FlameFrame, vertex_gradient:
     no_shape = parameters.new_zeros(0)
     vertices = flame_forward(flame, no_shape, expr, pose.reshape(1, -1, 3), translation, offset)
     outer = torch.tensor(vertex_gradient[None], dtype=torch.float32)
-    # Of a sum: `grad` imports SymPy, which takes a second, where it is handed an outer gradient.
+    # `grad` would import SymPy, in half a second, if it were handed the outer gradient.
     (gradient,) = torch.autograd.grad((vertices * outer).sum(), parameters)
     return gradient[0].numpy().astype(np.float64)

@@ -11,6 +11,8 @@ from typing import Any
 from stga_addon.errors import StgaError
 
 SECONDS, MEGABYTES = 1.0, 200.0
+GIGA = 10**9
+"""As many values as a malformed file says it holds."""
 
 
 def behaves(read: Callable[[], Any], folder: Path) -> str:

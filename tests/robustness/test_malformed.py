@@ -40,9 +40,7 @@ from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
 from stga_addon.training.run import metrics_log
 
-from .limits import behaves
-
-GIGA = 10**9
+from .limits import GIGA, behaves
 
 
 def npy(descr: Any = "<f4", shape: Any = (GIGA,), data: bytes = b"", header: str = "") -> bytes:

@@ -11,9 +11,7 @@ import pytest
 
 from stga_addon.capture.meshes import read_mesh
 
-from .limits import behaves
-
-GIGA = 10**9
+from .limits import GIGA, behaves
 
 
 def glb(document: dict[str, Any], data: bytes = b"") -> bytes:

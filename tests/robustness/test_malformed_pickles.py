@@ -14,8 +14,6 @@ from stga_addon.flame.unpickle import read_pickled_arrays
 
 from .limits import behaves
 
-GIGA = 10**9
-
 
 def doubled(inner: bytes, times: int) -> bytes:
     """Pickle code of [[…[x, x], …], …]: a list that stands for 2^times things."""

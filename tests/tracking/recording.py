@@ -1,4 +1,4 @@
-"""Footage that is written for tests: images, cameras, a FLAME file and exact landmarks."""
+"""The recording of a moving head: its footage, its FLAME file and exact landmarks."""
 
 import numpy as np
 from PIL import Image
