@@ -6,6 +6,7 @@ Called again with the same arguments, it continues where it was interrupted.
 import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
+from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
@@ -16,6 +17,7 @@ from ..errors import StgaError, shorten
 from ..files import read_json, write_json
 from ..format import format_duration
 from ..requests.open_head import OpenHead
+from ..requests.values import Track
 from ..training.run.folder import AVATAR, has_run
 from .arguments import usable_path
 from .carry_out import carry_out
@@ -25,9 +27,6 @@ from .train import add_training, training_request, training_settings
 NAME, HELP = "avatar", "make an avatar from footage: track, train, and write a report and a .blend file"
 INPUTS, CAPTURE, RUN, BLEND = "inputs.json", "capture", "run", "avatar.blend"
 """Files and folders of OUT."""
-TRACKING_OPTIONS = (
-    "footage", "model", "cameras", "landmarks", "detector", "focal", "start", "stop", "step", "offset", "mattes",
-)  # fmt: skip
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -97,10 +96,11 @@ def _track(options: Namespace, capture: Path) -> None:
 
     path, inputs = options.out / INPUTS, _inputs(options)
     if path.exists():
-        before = _read_inputs(options.out)
-        changed = next((name for name in inputs if before.get(name) != inputs[name]), None)
+        stored = _read_inputs(options.out)
+        before = {name: stored.get(name, getattr(Track, name, None)) for name in inputs}  # an older version noted less
+        changed = next((name for name in inputs if before[name] != inputs[name]), None)
         if changed is not None:
-            raise StgaError(f"{changed}: {options.out} began with {shorten(before.get(changed))}; give another --out")
+            raise StgaError(f"{changed}: {options.out} began with {shorten(before[changed])}; give another --out")
     elif is_written(capture) or (options.out / RUN).exists():
         raise StgaError(f"{options.out}: holds something else ({INPUTS} is missing); give another --out")
     if not is_written(capture):
@@ -125,8 +125,8 @@ def _read_inputs(out: Path) -> dict[str, Any]:
 
 
 def _inputs(options: Namespace) -> dict[str, Any]:
-    """The options that decide what is tracked, as JSON; paths are absolute."""
-    values = {name: getattr(options, name) for name in TRACKING_OPTIONS}
+    """The options that decide what is tracked, as JSON: the fields of `Track` but its folder; paths are absolute."""
+    values = {spec.name: getattr(options, spec.name) for spec in fields(Track) if spec.name != "out"}
     values["offset"] = dict(sorted(options.offset))
     return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in values.items()}
 

@@ -10,6 +10,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli import avatar
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
+from stga_addon.files import read_json, write_json
 from stga_addon.tracking import write_capture
 from stga_addon.tracking.torso import FollowedTorso
 
@@ -30,7 +31,6 @@ def made(take, tmp_path_factory):
             raise KeyboardInterrupt
         write_json(path, value)
 
-    write_json = write_capture.write_json
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write_capture, "write_json", interrupt)
         # What takes the longest, and is thrown away here
@@ -70,8 +70,10 @@ def test_the_blend_file_shows_the_avatar_on_the_head(made, take):
 
 
 def test_a_finished_avatar_is_not_made_again(made, take):
-    """Catches a second call that tracks or trains from the beginning."""
+    """Catches a second call that tracks or trains from the beginning, also of what a version made that noted less."""
     out, _ = made
+    inputs = read_json(out / "inputs.json")
+    write_json(out / "inputs.json", {name: inputs[name] for name in inputs if name not in ("sync", "world", "meshes")})
     files = [out / "capture/transforms_train.json", out / "run/checkpoint.npz"]
     before = [path.stat().st_mtime_ns for path in files]
     assert make(take, out, "--no-blend") == 0
@@ -83,6 +85,9 @@ def test_a_finished_avatar_is_not_made_again(made, take):
     [
         (["--start", "1"], "start: .*out began with 0; give another --out"),
         (["--offset", "cam1=2"], "offset: .*out began with"),
+        (["--sync", "motion"], "sync: .*out began with 'none'"),
+        (["--world", "keep"], "world: .*out began with 'auto'"),
+        (["--meshes"], "meshes: .*out began with False"),
         (["--iterations", "9"], "--iterations: this run began with 6, which cannot change"),
     ],
 )
