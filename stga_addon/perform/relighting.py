@@ -16,7 +16,7 @@ from ..light.estimate import Known, estimate_light
 from ..progress import Report, Say, ignore
 from ..requests.results import Written
 from ..requests.values import Relight
-from ..training.run.folder import AVATAR
+from ..training.run.folder import AVATAR, locked
 from ..training.run.open_run import open_refined
 
 
@@ -36,10 +36,14 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
 
 
 def add_light(avatar_file: Path, capture: Capture, known: Known = Known(), report: Report = ignore) -> tuple[str, ...]:  # noqa: B008
-    """Write the light of a capture into an avatar file; returns what there is to say. Raises StgaError."""
-    avatar = read_avatar(avatar_file)
-    light = estimate_light(capture, known, report)
-    write_avatar(avatar_file, replace(avatar, light=light))
+    """Write the light of a capture into a run's avatar file; returns what there is to say.
+
+    Raises StgaError, also while another process trains or lights the run.
+    """
+    with locked(avatar_file.parent):
+        avatar = read_avatar(avatar_file)
+        light = estimate_light(capture, known, report)
+        write_avatar(avatar_file, replace(avatar, light=light))
     return describe_light(light)
 
 

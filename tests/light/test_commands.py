@@ -1,5 +1,6 @@
 """The commands: a run's avatar learns its light, is rendered under others, and exported without."""
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,11 @@ from PIL import Image
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.color import srgb_to_linear
 from stga_addon.cli.main import main
+from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
+from stga_addon.light.estimate import estimate_light
 from stga_addon.light.relight import Relighter, albedo_avatar
+from stga_addon.training.run.folder import locked
 
 LIGHTS = """
 world = [0.3, 0.3, 0.3]
@@ -81,6 +85,30 @@ def test_a_gray_card_sets_the_level(run: Path, tmp_path: Path, root: Path) -> No
         assert light.source == "gray_card"
         found.append(light.irradiance.mean(0))
     np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)  # the ball of this capture has no red
+
+
+def test_a_running_trainings_avatar_is_kept(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a light that is written into an older avatar than the one which a training saved meanwhile."""
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    before = (copy / "avatar.npz").read_bytes()
+    with locked(copy):  # as a training has it
+        assert main(["relight", str(copy)]) == 2
+    assert f"another run is working in this folder (process {os.getpid()})" in capsys.readouterr().err
+    assert (copy / "avatar.npz").read_bytes() == before
+
+    def estimate(*given: object) -> object:
+        with pytest.raises(StgaError, match="another run is working"), locked(copy):
+            pytest.fail("a training could begin between reading and writing")
+        return estimate_light(*given)
+
+    monkeypatch.setattr("stga_addon.perform.relighting.estimate_light", estimate)
+    assert main(["relight", str(copy), "--gray-card", "0.5,0.5,0.5"]) == 0
+    light = read_avatar(copy / "avatar.npz").light
+    assert light is not None
+    assert light.source == "gray_card"
 
 
 def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
