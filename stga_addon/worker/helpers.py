@@ -6,6 +6,7 @@ matrices among threads that are too small for it.
 
 import os
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -133,7 +134,7 @@ class _Task:
         assert process.stdout is not None
         _send(process.stdin, (self._work, part))
         while True:
-            kind, value = pickle.load(process.stdout)
+            kind, value = _Unpickler(process.stdout).load()
             if kind == STEP:
                 self.steps.add()
             elif kind == ERROR:
@@ -146,6 +147,14 @@ def _start() -> "subprocess.Popen[bytes]":
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     quiet = {"creationflags": 0x08000000} if os.name == "nt" else {"preexec_fn": end_with_this_process()}
     return start_python(own_python(), ["stga_addon.worker.helpers"], SINGLE, **pipes, **quiet)
+
+
+class _Unpickler(pickle.Unpickler):
+    """Finds this package's functions and classes by the name that it has in this process: another one in Blender."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        own = (__package__ or "").removesuffix(".worker")
+        return super().find_class(re.sub(r"^(.+\.)?stga_addon(?=\.)", own, module), name)
 
 
 def _send(stream: IO[bytes], message: Any) -> None:
@@ -161,7 +170,7 @@ def help_until_closed() -> None:
     answers = claim_stdout()
     while True:
         try:
-            work, part = pickle.load(sys.stdin.buffer)
+            work, part = _Unpickler(sys.stdin.buffer).load()
         except EOFError:
             return
         try:

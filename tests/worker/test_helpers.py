@@ -5,7 +5,9 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -34,6 +36,15 @@ def is_killed(number, step):
 def takes_long(seconds, step):
     step()
     time.sleep(seconds)
+
+
+def is_own(value, function, step):
+    """A value and a function of the package as it is called here, and an error of it where they are another's."""
+    if (type(value).__module__, function.__module__) != ("stga_addon.progress", "stga_addon.format"):
+        raise ZeroDivisionError
+    if function(value.share) != "45 s":
+        raise StgaError("expected 45 seconds")
+    return value
 
 
 PARTS = [(first, first + 3) for first in range(0, 21, 3)]
@@ -70,6 +81,20 @@ def test_failures_reach_who_asked(work, parts, error, says):
     """Catches a caller that waits forever for a helper that failed or was killed, as for want of memory."""
     with pytest.raises(error, match=says), Helpers(2) as helpers:
         helpers.map(work, parts, lambda steps: None)
+
+
+def test_a_package_of_another_name_is_the_helpers_own(monkeypatch):
+    """Catches work that no helper can import: inside of Blender, this package is `bl_ext.….stga.stga_addon`."""
+    package = ModuleType("installed")
+    package.__path__ = [str(Path(__file__).parents[2])]
+    monkeypatch.setitem(sys.modules, "installed", package)
+    modules = ("worker.helpers", "progress", "format", "errors")
+    helpers, progress, texts, errors = (import_module(f"installed.stga_addon.{name}") for name in modules)
+    right, wrong = progress.Progress(45.0), progress.Progress(44.0)
+    with helpers.Helpers(2) as two:
+        assert two.map(is_own, [(right, texts.format_duration)] * 2, lambda steps: None) == [right, right]
+        with pytest.raises(errors.StgaError, match="expected 45 seconds"):
+            two.map(is_own, [(wrong, texts.format_duration)] * 2, lambda steps: None)
 
 
 def test_cancelling_does_not_wait_for_what_is_being_done():
