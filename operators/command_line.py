@@ -18,14 +18,15 @@ from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.tracking_file import TRACKING
-from ..stga_addon.worker.environment import PYTHON_VARIABLE, missing_packages
+from ..stga_addon.worker.environment import PYTHON_VARIABLE
 from ..stga_addon.worker.launch import start_python
 from . import ids
 from .common import capture_of, capture_source, environment_folder, file_path, is_head, scene_settings
 from .training_python import preferred_python, training_python
 
 IN_BLENDER = ("select", "export", "demo", "environment")
-"""Commands that need none of the packages that Blender's Python may lack, or need Blender itself."""
+"""Commands that need none of the packages that Blender's Python may lack, or need Blender itself; all others run in the
+training environment, also where that is Blender's own Python: as `stga_addon`, whose kernels are compiled."""
 
 if TYPE_CHECKING:
     from ..stga_addon.requests.open_head import OpenHead
@@ -44,7 +45,7 @@ def _run(arguments: list[str]) -> int:
             _prepare_environment_command(options)
         if getattr(options, "download_detector", False) and not bpy.app.online_access:
             raise StgaError("Blender is offline: start it with --online-mode, or leave out --download-detector")
-        if command in IN_BLENDER or not missing_packages():
+        if command in IN_BLENDER:
             return main(arguments, head)
         if command == "avatar":
             return _make_avatar(arguments, options)
@@ -99,7 +100,7 @@ def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> in
 
 
 def _make_avatar(arguments: list[str], options: Any) -> int:
-    """Track and train in the training environment, which has no bpy, and write the .blend file here."""
+    """Track and train in the training environment, which needs no bpy, and write the .blend file here."""
     from ..stga_addon.cli.avatar import RUN, write_blend
 
     code = _delegate([*arguments, "--no-blend"], None, played=False)
@@ -109,7 +110,7 @@ def _make_avatar(arguments: list[str], options: Any) -> int:
 
     def apply_refined(head: Any) -> None:
         scene_settings(bpy.context).head = head
-        if refined.exists():  # PyTorch, which reads it into a capture, is not here
+        if refined.exists():  # PyTorch, which reads it into a capture, need not be here
             start = head[tags.TIMESTEPS][0]
             bpy.ops.stga.apply_motion(filepath=str(refined.resolve()), own_offsets=True, start=start)
 

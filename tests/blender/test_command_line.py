@@ -54,19 +54,19 @@ def test_without_a_head_everything_is_named(stga, folder, capsys):
     assert "CAPTURE" in capsys.readouterr().err
 
 
-def test_the_open_head_stands_in_for_the_capture(stga, folder, tmp_path, capsys):
+def test_the_open_head_stands_in_for_the_capture(stga, folder, tmp_path, capfd):
     """Catches a command that works on nothing, or on the open head although another capture is named."""
     bpy.ops.stga.import_capture(directory=str(folder))
     save_and_open(tmp_path / "head.blend")
     assert stga("select", "--threshold", 0.0005) == 0
-    assert "320 triangles" in capsys.readouterr().out
+    assert "320 triangles" in capfd.readouterr().out
     assert stga("info", write_mesh_capture(tmp_path / "other", timesteps=(0, 5))) == 0
-    assert "other" in capsys.readouterr().out
+    assert "other" in capfd.readouterr().out
     assert stga("info") == 0
-    assert "other" not in capsys.readouterr().out
+    assert "other" not in capfd.readouterr().out
     folder.rename(tmp_path / "elsewhere")
     assert stga("select") == 2
-    assert "is not a folder" in capsys.readouterr().err
+    assert "is not a folder" in capfd.readouterr().err
 
 
 def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
@@ -93,18 +93,15 @@ def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
 
 
 @pytest.fixture
-def bare(extension, monkeypatch):
-    """Call it, and Blender's Python lacks what commands need; the training environment is the Python of this test."""
-
-    def make_bare() -> None:
-        monkeypatch.setattr(extension.operators.command_line, "missing_packages", lambda: ["torch"])
-        monkeypatch.setattr(extension.operators.command_line, "training_python", lambda context: sys.executable)
-
-    return make_bare
+def here(extension):
+    """Run a command in this process, on the head of the open file; returns the exit code."""
+    command = import_module(f"{extension.__name__}.stga_addon.cli.main")
+    head = extension.operators.command_line._open_head
+    return lambda *arguments: command.main([str(argument) for argument in arguments], head())
 
 
 @pytest.mark.slow
-def test_render_of_the_open_head(stga, bare, tmp_path):
+def test_render_of_the_open_head(stga, here, tmp_path):
     """Catches a render verb that cannot find avatar or capture in the file, or draws another motion."""
     pytest.importorskip("numba")
     folder, model = write_flame_capture(tmp_path / "capture")
@@ -115,31 +112,43 @@ def test_render_of_the_open_head(stga, bare, tmp_path):
     head.data.shape_keys.key_blocks["expr_001"].value = 9.0
     save_and_open(tmp_path / "head.blend")
     cameras = folder / "transforms_val.json"
-    assert stga("render", "--cameras", cameras, "--out", tmp_path / "here") == 0
-    bare()
+    assert here("render", "--cameras", cameras, "--out", tmp_path / "here") == 0
     assert stga("render", "--cameras", cameras, "--out", tmp_path / "there") == 0
     assert stga("render", tmp_path / "a.npz", "--capture", folder, "--flame", model, "--cameras", cameras,
                 "--out", tmp_path / "tracked") == 0  # fmt: skip
-    here, there, tracked = (
+    pictures, there, tracked = (
         [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))] for name in ("here", "there", "tracked")
     )
-    assert len(here) == 2
-    assert here == there
-    assert here != tracked
+    assert len(pictures) == 2
+    assert pictures == there
+    assert pictures != tracked
 
 
 def test_missing_training_environment(stga, extension, folder, monkeypatch, capsys):
     """Catches a traceback, or success, where nothing can train."""
-    for module in (extension.operators.command_line, extension.stga_addon.worker.environment):
-        monkeypatch.setattr(module, "missing_packages", lambda: ["torch"])
+    monkeypatch.setattr(extension.stga_addon.worker.environment, "missing_packages", lambda: ["torch"])
     assert stga("train", folder, "--out", folder / "run") == 2
     assert "`blender --background --command stga environment use PATH`" in capsys.readouterr().err
     bpy.ops.stga.import_capture(directory=str(folder))
     assert stga("select") == 0  # needs none
 
 
+@pytest.mark.parametrize("command", ["train", "track", "avatar"])
+def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monkeypatch, command):
+    """Catches a command in Blender's own Python, which can train but perhaps not track, although another was chosen."""
+    chosen = tmp_path / "python"
+    chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
+    chosen.chmod(0o755)
+    monkeypatch.setenv(extension.stga_addon.worker.environment.PYTHON_VARIABLE, str(chosen))
+    arguments = [command, "FOOTAGE", *([] if command == "train" else ["--model", "HEAD"]), "--out", "OUT"]
+    more = ["--iterations", "2"] if command != "track" else []
+    assert stga(*arguments, *more) == 7
+    expected = ["-m", "stga_addon", *arguments, *more, *(["--no-blend"] if command == "avatar" else [])]
+    assert (tmp_path / "asked").read_text().split() == expected
+
+
 @pytest.mark.slow
-def test_training_is_the_panels(stga, bare, folder, tmp_path):
+def test_training_is_the_panels(stga, here, folder, tmp_path):
     """Catches a headless run, or a worker of the panel's, that ignores painted groups or settings: with the same seed,
     all give the same numbers."""
     pytest.importorskip("torch")
@@ -154,8 +163,7 @@ def test_training_is_the_panels(stga, bare, folder, tmp_path):
     by_worker = {"wait": True, "python": sys.executable}
     assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options) == {"FINISHED"}
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
-    assert stga("train", "--out", tmp_path / "headless", *arguments) == 0
-    bare()
+    assert here("train", "--out", tmp_path / "headless", *arguments) == 0
     assert stga("train", "--out", tmp_path / "environment", *arguments) == 0
     runs = ("panel", "headless", "environment")
     for run in runs:
@@ -194,11 +202,10 @@ def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_p
 
 
 @pytest.mark.slow
-def test_an_avatar_from_footage(stga, bare, take, tmp_path, capfd):
+def test_an_avatar_from_footage(stga, take, tmp_path, capfd):
     """Catches a .blend file that is missing because the training environment has no Blender, or one without links."""
     given = [take / "footage", "--model", take / "head.npz", "--landmarks", take / "points"]
     more = ["--iterations", "4", "--effect", "tracking=on"]
-    bare()
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0
     assert capfd.readouterr().out.splitlines()[-1] == f"blender: {tmp_path / 'out/avatar.blend'}"
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out/avatar.blend"))
