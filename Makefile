@@ -8,7 +8,7 @@ PARALLEL := -n auto --dist worksteal
 # assertions, anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo demo-footage test kernels test-fast test-gui lint lint-web fuzz extension extension-platform extension-complete repository clean
+.PHONY: demo demo-footage test kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-platform extension-complete repository clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -27,6 +27,10 @@ kernels: .venv/ready
 
 test-fast: .venv/ready
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+
+# What `make test` skips on a machine without a graphics driver, a browser, Node.js or SLURM
+test-tools: .venv/ready
+	$(BIN)/python -m pytest $(PARALLEL) -m needs
 
 # STGA_BLENDER: the command that starts a Blender with a window (docs/blender.md)
 test-gui: .venv/ready

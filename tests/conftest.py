@@ -2,9 +2,12 @@
 
 import gc
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 # Before OpenMP is loaded: its threads wait in a loop, and in tests, which run one per core, they would take the time of
@@ -14,6 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import kernels
 import pytest
 from capture import factory
+from export.web.browser import find_browser
 from filelock import FileLock
 
 from stga_addon.capture.model import Capture
@@ -49,6 +53,49 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_collection_finish() -> None:
     """Objects of modules and tests, which stay to the end, are no longer looked through for garbage."""
     gc.freeze()
+
+
+def has_adapter() -> bool:
+    if find_spec("wgpu") is None:
+        return False
+    from stga_addon.raster.gpu.adapters import adapters
+
+    return bool(adapters())
+
+
+def has_slurm() -> bool:
+    from batch.slurm_cluster import missing_programs
+
+    return not missing_programs()
+
+
+VALIDATION_LAYER = "vulkan/explicit_layer.d/VkLayer_khronos_validation.json"
+TOOLS: dict[str, tuple[Callable[[], object], str]] = {
+    "adapter": (has_adapter, "no WebGPU adapter (Debian's software Vulkan: mesa-vulkan-drivers)"),
+    "vulkan-validation": (
+        lambda: any(Path(root, VALIDATION_LAYER).exists() for root in ("/usr/share", "/usr/local/share", "/etc")),
+        "no Vulkan validation layers (Debian: vulkan-validationlayers)",
+    ),
+    "chromium": (find_browser, "no Chromium (Debian: chromium)"),
+    "node": (lambda: shutil.which("node"), "no Node.js (Debian: nodejs)"),
+    "slurm": (has_slurm, "no SLURM (Debian: slurm-wlm, munge)"),
+}
+"""What tests marked `needs` use beyond the README's requirements: whether it is there, and what is said where not."""
+
+
+@cache
+def missing(tool: str) -> str | None:
+    is_there, reason = TOOLS[tool]
+    return None if is_there() else reason
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Before any fixture, which might begin the work that the tool is for."""
+    for mark in item.iter_markers("needs"):
+        for tool in mark.args:
+            if reason := missing(tool):
+                pytest.skip(reason)
 
 
 # A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in one.
@@ -109,13 +156,10 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture(params=["cpu", "gpu"])
+@pytest.fixture(params=["cpu", pytest.param("gpu", marks=pytest.mark.needs("adapter"))])
 def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """The kernels that a test's `render_differentiable` runs: Numba's, and WebGPU's on the first adapter."""
     if request.param == "gpu":
-        from raster import gpu_device
-
-        gpu_device.device()  # or skip
         from raster.gpu_autograd import render_differentiable
 
         for module in (request.module, sys.modules["raster.test_kernels"]):

@@ -80,12 +80,10 @@ def test_openjd_steps(tmp_path: Path) -> None:
         openjd_template(plan, empty_jobs(tmp_path, 1, tables).jobs)
 
 
+@pytest.mark.needs("node")
 def test_flamenco_compiles(tmp_path: Path) -> None:
     """Catches JavaScript that the manager cannot read, tasks in another order than the plan's, and jobs that are
     finished already."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("Node is not installed")
     (tmp_path / "shot.blend").touch()
     film = {"request": "render-blend", "blend": "shot.blend", "frames": [1, 2], "after": ["look"]}
     plan = empty_jobs(tmp_path, 2, {"last": {"request": "analyze", "capture": "{look}"}, "film": film})
@@ -94,7 +92,7 @@ def test_flamenco_compiles(tmp_path: Path) -> None:
     path = emit("flamenco", Batch(plan))
     script = tmp_path / "run.js"
     script.write_text(path.read_text() + AUTHOR)
-    done = subprocess.run([node, "--use_strict", str(script)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(["node", "--use_strict", str(script)], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["settings"] == []

@@ -1,4 +1,4 @@
-"""The SLURM engine on a cluster of two nodes on this host; skipped by name where SLURM is not installed."""
+"""The SLURM engine on a cluster of two nodes on this host."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ from stga_addon.worker.status import LOCK_FILE
 
 from .conftest import TrainedHere
 from .simulated import carry_out, empty_jobs
-from .slurm_cluster import Cluster, missing_programs, running_cluster
+from .slurm_cluster import Cluster, running_cluster
 from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
 
 pytest.importorskip("torch")
@@ -26,8 +26,6 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    if missing_programs():
-        pytest.skip(f"SLURM is not installed ({', '.join(missing_programs())}): apt-get install slurm-wlm munge")
     with running_cluster(tmp_path_factory.mktemp("slurm")) as found:
         yield found
 
@@ -40,6 +38,7 @@ def on_cluster(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
     return cluster
 
 
+@pytest.mark.needs("slurm")
 def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere) -> None:
     """Catches jobs that begin before those they come after, or train something else than on this machine; and a killed
     worker whose job is lost."""
@@ -66,6 +65,7 @@ def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path, trained
         assert splats_of(there, f"train-seed{seed}") == splats_of(trained_here(), f"train-seed{seed}")
 
 
+@pytest.mark.needs("slurm")
 def test_jobs_of_a_dead_node_resume_elsewhere(
     on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,6 +96,7 @@ def test_jobs_of_a_dead_node_resume_elsewhere(
         assert splats_of(there, f"train-seed{seed}") == splats_of(trained_here(), f"train-seed{seed}")
 
 
+@pytest.mark.needs("slurm")
 def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Path) -> None:
     """Catches an array that one failed job takes down, and jobs after it that count as failed themselves."""
     plan = tiny_plan(tmp_path, iterations=3)
@@ -108,12 +109,14 @@ def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Pat
     assert (states[name], states["evaluate-seed1"]) == (JobState.FAILED, JobState.BLOCKED)
 
 
+@pytest.mark.needs("slurm")
 def test_ctrl_c_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
     """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they have saved."""
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "slurm"))
 
 
+@pytest.mark.needs("slurm")
 def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -> None:
     """Catches a batch that waits for ever for jobs that no machine of the cluster can take."""
     plan = empty_jobs(tmp_path, 2)

@@ -452,6 +452,7 @@ def _png(path: Path) -> np.ndarray:
     return pixels
 
 
+@pytest.mark.needs("adapter")
 def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
     """Catches F12 that renders on the CPU where the preferences say GPU, another picture, and a silent failure."""
     from raster import gpu_device

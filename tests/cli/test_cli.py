@@ -126,11 +126,9 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
     assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(factory.CY - 0.5, abs=1.5)
 
 
+@pytest.mark.needs("adapter")
 def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a device that renders something else, or is not asked."""
-    from raster import gpu_device
-
-    gpu_device.device()  # or skip
     from stga_addon.raster.gpu import compose as gpu
 
     rendered = Mock(side_effect=gpu.compose)

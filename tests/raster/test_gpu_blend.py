@@ -14,6 +14,8 @@ from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import HIDDEN, VIEW
 from stga_addon.raster.gpu.tiles import choose_tiles, list_pairs
 
+pytestmark = pytest.mark.needs("adapter")
+
 CAPACITY = 1 << 14
 BACKGROUND = np.float32([0.9, 0.2, 0.6])
 TOLERANCE = 1e-4

@@ -11,6 +11,8 @@ from stga_addon.raster.gpu import device as device_module
 from stga_addon.raster.gpu.adapters import adapters
 from stga_addon.raster.gpu.device import Device, Kernel, Readback
 
+pytestmark = pytest.mark.needs("adapter")
+
 NUMBERS = """
 override STEP: u32 = 1u;
 @group(0) @binding(0) var<storage, read_write> numbers: array<u32>;

@@ -17,6 +17,8 @@ from stga_addon.training.optimize.state import OffsetState
 
 from .test_gpu_optimizer import RATES, STRIDE
 
+pytestmark = pytest.mark.needs("adapter")
+
 NAME = "strain_position"
 TRIANGLES, SPLATS = 300, 900
 EPSILON, EMA_SHARE = np.float32(1e-3), 0.02

@@ -12,6 +12,8 @@ from stga_addon.raster.gpu.image_loss import image_loss, upload_target
 from stga_addon.raster.gpu.layout import VIEW
 from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
 
+pytestmark = pytest.mark.needs("adapter")
+
 SIZES = [(100, 70), (1, 1), (1, 40), (40, 1), (17, 33), (32, 16), (9, 11)]
 SSIM_WEIGHT = 0.2
 

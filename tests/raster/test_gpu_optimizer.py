@@ -20,6 +20,8 @@ from stga_addon.raster.gpu.layout import VIEW, splat_rows, split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
 
+pytestmark = pytest.mark.needs("adapter")
+
 RATES = {name: 0.01 * (n + 1) for n, name in enumerate((*Parameters._fields, "sh_rest"))}
 COEFFICIENTS, STRAINS = 4, 2
 STRIDE = 11 + 3 * COEFFICIENTS + 3 * STRAINS

@@ -24,6 +24,8 @@ from stga_addon.raster.gpu.frames import Embedding
 from stga_addon.raster.gpu.layout import HIDDEN, VIEW, splat_rows, split_rows
 from stga_addon.raster.gpu.project import mark_focus, project, project_backward, projected_tables
 
+pytestmark = pytest.mark.needs("adapter")
+
 FRAME_TOLERANCE = 2e-6
 """Of origins in meters and of rotations times scale: float32 at a few meters from the camera."""
 

@@ -23,12 +23,13 @@ from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import split_rows
 from stga_addon.raster.gpu.rasterize import Rasterizer, Rendering, ViewOptions, upload_frames, upload_splats
 
+pytestmark = pytest.mark.needs("adapter")
+
 
 class Raw:
     """Renders a scene of numpy arrays by `Rasterizer`, forward and backward; rows not written keep `fill`."""
 
     def __init__(self, scene: Scene, rasterizer: Rasterizer | None = None, antialiased: bool = False) -> None:
-        gpu_device.device()  # or skip
         self.rasterizer = rasterizer or Rasterizer(Device())
         self.device, self.scene, self.antialiased = self.rasterizer.device, scene, antialiased
         self.count = len(scene.splats["xyz"])

@@ -12,6 +12,8 @@ from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED, WORKGROUP
 from stga_addon.raster.gpu.tiles import INCLUDE, choose_tiles, counts_buffer, list_pairs, sort_keys
 
+pytestmark = pytest.mark.needs("adapter")
+
 TILES_X, TILES_Y = 9, 7
 CAPACITY = 1 << 16
 

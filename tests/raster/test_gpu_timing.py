@@ -12,6 +12,8 @@ from stga_addon.raster.gpu.layout import VIEW
 from stga_addon.raster.gpu.project import mark_focus
 from stga_addon.raster.gpu.timing import KernelTimes
 
+pytestmark = pytest.mark.needs("adapter")
+
 
 @pytest.fixture(scope="module")
 def device() -> Device:

@@ -10,10 +10,6 @@ import pytest
 from raster import gpu_device
 
 LAYER = "VK_LAYER_KHRONOS_validation"
-MANIFESTS = [
-    Path(root) / "vulkan/explicit_layer.d/VkLayer_khronos_validation.json"
-    for root in ("/usr/share", "/usr/local/share", "/etc")
-]
 SCRIPT = """
 import sys
 from pathlib import Path
@@ -38,10 +34,9 @@ assert "libVkLayer_khronos_validation" in Path("/proc/self/maps").read_text()
 
 
 @pytest.mark.slow
+@pytest.mark.needs("adapter", "vulkan-validation")
 def test_vulkan_validation_has_nothing_to_say(toy_root: Path, tmp_path: Path) -> None:
     """Catches a race between dispatches, or a buffer's use, that one driver forgives and another does not."""
-    if not sys.platform.startswith("linux") or not any(manifest.exists() for manifest in MANIFESTS):
-        pytest.skip("no Vulkan validation layers (Debian: vulkan-validationlayers)")
     device = gpu_device.device()
     log, settings = tmp_path / "validation.log", tmp_path / "vk_layer_settings.txt"
     log.touch()

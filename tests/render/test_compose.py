@@ -49,6 +49,7 @@ def assert_same_picture(got: ComposedImage, want: ComposedImage) -> None:
 @pytest.mark.parametrize(
     "layers", [scene(), [], [world(cloud(1).rows(np.zeros(1, bool)))]], ids=["three", "no", "empty"]
 )
+@pytest.mark.needs("adapter")
 def test_a_gpu_composes_the_same_picture(adapter: str, layers: list[PosedSplats], with_depth: bool) -> None:
     """Catches a layer drawn with another's frames, camera, degree or rows, and a depth that is a color."""
     want = compose(layers, CAMERA, with_depth)
@@ -59,6 +60,7 @@ def test_a_gpu_composes_the_same_picture(adapter: str, layers: list[PosedSplats]
         assert got.alpha.max() == got.rgb.max() == 0
 
 
+@pytest.mark.needs("adapter")
 def test_more_pairs_than_there_is_room_for(adapter: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches an empty picture where the pairs did not fit."""
     monkeypatch.setattr("stga_addon.raster.gpu.rasterize.INITIAL_PAIR_CAPACITY", 10)
@@ -98,6 +100,7 @@ def test_a_gpu_by_name_does_not_fall_back(monkeypatch: pytest.MonkeyPatch) -> No
         Composer("gpu").compose(scene(), CAMERA)
 
 
+@pytest.mark.needs("adapter")
 def test_a_lost_device_is_opened_again(adapter: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches images that all fail after the first one for which the driver was reset."""
     with monkeypatch.context() as broken:
@@ -107,6 +110,7 @@ def test_a_lost_device_is_opened_again(adapter: str, monkeypatch: pytest.MonkeyP
     assert not gpu._rasterizer.cache_info().currsize
 
 
+@pytest.mark.needs("adapter")
 def test_software_renders_by_name_only(adapter: str) -> None:
     """Catches a machine without a GPU whose pictures come from software Vulkan: they must be the CPU's, bit for bit."""
     if not gpu_device.device().is_software:
@@ -118,6 +122,7 @@ def test_software_renders_by_name_only(adapter: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.needs("adapter")
 def test_the_server_renders_on_the_wanted_device(adapter: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a server that renders on something else, or goes on with the device of before."""
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])

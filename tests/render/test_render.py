@@ -76,6 +76,7 @@ def test_background_and_values_are_clipped_display_values() -> None:
     assert image.max() == 1
 
 
+@pytest.mark.needs("adapter")
 def test_a_gpu_renders_the_same_picture() -> None:
     """Catches strain, frames, background or antialiasing that only the CPU draws."""
     from numerics.meshes import bent_ball

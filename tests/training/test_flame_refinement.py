@@ -369,7 +369,13 @@ def test_a_run_that_refines_nothing_leaves_nothing(lost: Made, run_folder: Path,
     assert not (tmp_path / "tracking.npz").exists()
 
 
-def test_where_it_cannot_work(toy: Capture, lost: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_it_cannot_work(
+    toy: Capture,
+    lost: Made,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Catches a traceback where there are no parameters, and a GPU that trains on while nothing is refined."""
     with pytest.raises(StgaError, match="is not tracked with FLAME"):
         Trainer(toy, quick_settings("global", tracking=True), {})
@@ -377,6 +383,7 @@ def test_where_it_cannot_work(toy: Capture, lost: Made, tmp_path: Path, capsys: 
         Trainer(lost[0], quick_settings("gaussian-avatars", tracking=True), {})
     with pytest.raises(StgaError, match=r"effect tracking=on: .* on the CPU only, not on gpu"):
         Trainer(lost[0], quick_settings("global", tracking=True), {}, device="gpu")
+    monkeypatch.setattr("stga_addon.perform.training.choose_device", lambda wanted: ("gpu:Card", "why"))
     root = lost[0].root
     train_on = ["train", str(root), "--flame", str(root / "model.npz"), "--device", "gpu", "--iterations", "2"]
     assert main([*train_on, "--out", str(tmp_path / "run"), "--effect", "tracking=on"]) == 2

@@ -32,6 +32,8 @@ from .test_run import make_run, stop_at
 from .test_trainer import large, view_of
 from .toys import bits, quick_settings
 
+pytestmark = pytest.mark.needs("adapter")
+
 
 def settings_of(**changes: Any) -> TrainingSettings:
     """Every term of the loss at work on most splats."""
@@ -53,7 +55,6 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
 
 def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
     """Both implementations with the same splats."""
-    gpu_device.device()  # or skip
     frames = FrameStore(capture, settings.convention, True)
     cpu = CpuBackend(settings, frames, disturbed(capture, settings))
     return cpu, GpuBackend(Device(), settings, frames, disturbed(capture, settings))
@@ -180,7 +181,6 @@ def test_an_iteration_is_one_submit(toy: Capture, part: str | None) -> None:
 
 def test_everything_is_compiled_before_the_first_iteration(toy: Capture) -> None:
     """Catches a kernel that is compiled in the time that is given to training."""
-    gpu_device.device()  # or skip
     settings, device = settings_of(), Device()
     device._kernels = {}  # instead of those that other tests have compiled
     frames = FrameStore(toy, settings.convention, True)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from raster import gpu_device
 
 from stga_addon.capture.model import Capture
 from stga_addon.raster.gpu import rasterize
@@ -25,6 +24,8 @@ from .test_gpu_backend import batch_of, disturbed, settings_of
 from .test_run import assert_same_state, make_run, stop_at
 from .test_trainer import view_of
 from .toys import bits
+
+pytestmark = pytest.mark.needs("adapter")
 
 WHITE = np.ones(3, np.float32)
 
@@ -49,7 +50,6 @@ def state_of(capture: Capture, settings: TrainingSettings) -> TrainState:
 
 def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuBackend]:
     """Both implementations with the same splats."""
-    gpu_device.device()  # or skip
     frames = FrameStore(capture, settings.convention, True)
     cpu = CpuBackend(settings, frames, state_of(capture, settings))
     return cpu, GpuBackend(Device(), settings, frames, state_of(capture, settings))
@@ -176,7 +176,6 @@ def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest
 
 def test_an_iteration_is_one_submit_of_compiled_kernels(toy: Capture) -> None:
     """Catches work that waits for the host, or a kernel compiled in the time that is given to training."""
-    gpu_device.device()  # or skip
     capture, settings, device = squeezed(toy), position_settings(), Device()
     device._kernels = {}  # instead of those that other tests have compiled
     frames = FrameStore(capture, settings.convention, True)
@@ -196,7 +195,6 @@ def test_an_iteration_is_one_submit_of_compiled_kernels(toy: Capture) -> None:
 def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, tmp_path: Path) -> None:
     """Catches coefficients, moments, averages or ages that a checkpoint of a GPU forgets, and sums in the order of
     chance: every bit must agree, across density control."""
-    gpu_device.device()  # or skip
     effects = {"driven_offsets": ("strain_position",), "strain_color": True}
     run = replace(make_run(squeezed(toy), "selective", iterations=14, **effects), device="gpu")
     broken, whole = tmp_path / "broken", tmp_path / "whole"

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from raster import gpu_device
 
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.model import Capture
@@ -21,6 +20,8 @@ from stga_addon.training.schedule import learning_rates
 
 from .test_trainer import view_of
 from .toys import quick_settings
+
+pytestmark = pytest.mark.needs("adapter")
 
 SETTINGS = quick_settings("global", scale_limit=0.2)
 Counts = tuple[int, int, int]
@@ -81,7 +82,6 @@ def per_item(measured: list[tuple[Counts, int]]) -> np.ndarray:
 
 def test_memory_is_the_cpus_and_as_documented(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a table added to the GPU's iterations, and figures in the documentation that no longer hold."""
-    gpu_device.device()  # or skip
     monkeypatch.setattr(rasterize, "INITIAL_PAIR_CAPACITY", 1)  # restored at the end
     small, wide = (320, 160), (640, 160)
     on_cpu = per_item(

@@ -31,10 +31,7 @@ READY = """new Promise((done) => {
 
 @pytest.fixture(scope="module")  # not longer: the page would go on playing, on software graphics, beside other tests
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    executable = find_browser()
-    if executable is None:
-        pytest.skip("no Chromium on this machine (apt-get install chromium)")
-    opened = Browser(executable, tmp_path_factory.mktemp("profile"), (500, 400))
+    opened = Browser(str(find_browser()), tmp_path_factory.mktemp("profile"), (500, 400))
     yield opened
     opened.close()
 

@@ -29,6 +29,8 @@ from stga_addon.training.settings import make_settings
 
 from .conftest import Head, make_head, show
 
+pytestmark = pytest.mark.needs("chromium")
+
 MIN_PSNR = 55.0
 MIN_QUANTIZED_PSNR = 58.0
 """Quantized against unquantized, of opaque splats with random colors. Trained heads reach 60 dB and more."""

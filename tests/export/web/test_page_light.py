@@ -23,6 +23,8 @@ from .conftest import Head, make_head, show
 from .test_page import difference, picture, snapshot
 from .web_data import read_web_data
 
+pytestmark = pytest.mark.needs("chromium")
+
 LASHES = 40
 MIN_PSNR = 55.0
 """Of relit pictures against the renderer's, which also lets the sun's shadow dim the light between skin and skin."""

@@ -26,6 +26,8 @@ from stga_addon.flame.forward import FlameFrame, flame_forward
 from .conftest import Head, show
 from .test_page import psnr
 
+pytestmark = pytest.mark.needs("chromium")
+
 ROOT = Path(__file__).resolve().parents[3]
 PLAY_S, PLAY_RATE = 600, 4
 """Length of the long play, and pictures drawn in each second of it."""

@@ -3,7 +3,6 @@
 import functools
 import gzip
 import json
-import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -22,15 +21,14 @@ from stga_addon.export.web.rig import baked_rig
 
 from .conftest import make_head
 
+pytestmark = pytest.mark.needs("node")
+
 
 def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
     """What evaluate.mjs makes of a data file."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("no Node.js on this machine")
     (folder / "a.stga").write_bytes(data)
     script = Path(__file__).with_name("evaluate.mjs")
-    done = subprocess.run([node, str(script), str(PLAYER), str(folder / "a.stga")], capture_output=True, timeout=120)
+    done = subprocess.run(["node", str(script), str(PLAYER), str(folder / "a.stga")], capture_output=True, timeout=120)
     assert not done.stderr, done.stderr.decode()
     return dict(json.loads(done.stdout))
 
