@@ -7,11 +7,15 @@ import numpy as np
 from ..open_motion import MotionOptions, corrected
 from ..packet import FacePacket
 from ..performance import Performance
-from ..read_performance import DEFAULT_FPS, MAX_ROWS
+from ..read_performance import DEFAULT_FPS, MAX_FPS, MAX_ROWS
 
 RESTING_PACKETS = 15
 """Whose mean is the resting face: a quarter of a second."""
-MIN_STEP_S = 1e-4
+MIN_STEP_S = 2 / MAX_FPS
+"""Between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
+MAX_LEAD_S = 5.0
+"""By which a source's clock may be ahead of the packets' arrival: a usual socket keeps packets for 4 s while Blender is
+busy. Beyond it, the clock was set, or is another's."""
 
 
 def row_of(packet: FacePacket) -> Performance:
@@ -42,7 +46,7 @@ def eased(before: Performance | None, row: Performance, step_s: float, smoothing
 
 @dataclass
 class Recording:
-    """Packets of a take with their times: of the source's clock, or of arrival where it has none.
+    """Packets of a take with their times: steps of the source's clock, or of arrival where it has none or jumps.
 
     start  Blender frame at which it began
     rest   the performer's resting face, which is taken off; None: nothing is
@@ -53,12 +57,21 @@ class Recording:
     exchange: tuple[str, ...] = ()
     _times: list[float] = field(default_factory=list)
     _packets: list[FacePacket] = field(default_factory=list)
+    _arrived: float = 0.0
 
     def add(self, packet: FacePacket, now: float) -> None:
-        """Take a packet; of more than a performance may have, the rest are left out."""
-        time = now if packet.time is None else packet.time
-        if len(self._times) >= MAX_ROWS or (self._times and time < self._times[-1] + MIN_STEP_S):
-            return
+        """Take a packet that arrived at `now`; of more than a performance may have, the rest are left out."""
+        time = now
+        if self._packets:
+            before, last, step = self._times[-1], self._packets[-1], now - self._arrived
+            if packet.time is not None:
+                own = -1.0 if last.time is None else packet.time - last.time
+                has_jumped = own <= 0 or before + own > now + MAX_LEAD_S or packet.subject != last.subject
+                step = max(step, MIN_STEP_S) if has_jumped else own
+            time = before + step
+            if step < MIN_STEP_S or len(self._times) >= MAX_ROWS:
+                return
+        self._arrived = now
         self._times.append(time)
         self._packets.append(packet)
 

@@ -17,12 +17,18 @@ HEAD_BONE = "head"
 
 @dataclass(frozen=True)
 class Received:
-    """What a sender said so far: values come one by one, and count when they are applied."""
+    """What a sender said so far: values come one by one, and count when they are applied.
+
+    time       its latest; applied: that of the last frame
+    has_clock  whether each frame had a new time: of some senders it stands still, or comes more seldom
+    """
 
     weights: np.ndarray = field(default_factory=lambda: np.zeros(COUNT))
     names: frozenset[str] = frozenset()
     head: tuple[float, float, float] | None = None
     time: float | None = None
+    applied: float | None = math.nan
+    has_clock: bool = True
 
 
 def decode(data: bytes, before: Received) -> tuple[FacePacket | None, Received] | None:
@@ -38,7 +44,10 @@ def decode(data: bytes, before: Received) -> tuple[FacePacket | None, Received] 
     for message in found:
         known = _with(known, message)
         if message[0] == APPLY and known.names:
-            packet = FacePacket(tuple(sorted(known.names)), known.weights, known.head, "", known.time)
+            moves = known.has_clock and known.time != known.applied
+            known = replace(known, applied=known.time, has_clock=moves)
+            time = known.time if moves else None
+            packet = FacePacket(tuple(sorted(known.names)), known.weights, known.head, "", time)
     return packet, known
 
 

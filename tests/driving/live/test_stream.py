@@ -1,18 +1,22 @@
 """Which packets of a source count, and what is said about them."""
 
 import socket
+import struct
 
 import numpy as np
 import pytest
 
+from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.live.receiver import Receiver, leaves_this_machine
 from stga_addon.driving.live.sources import SOURCES
 from stga_addon.driving.live.stream import MAX_SENDERS, Stream
 from stga_addon.driving.live.take import Recording, eased, resting, row_of
 from stga_addon.driving.names import COLUMN
+from stga_addon.driving.read_performance import read_performance
 from stga_addon.errors import StgaError
 
 from . import wire
+from .test_decoders import APPLY, blend, bundle, osc_text
 
 LINK = SOURCES["live_link_face"]
 
@@ -182,6 +186,40 @@ def test_recording():
     np.testing.assert_allclose(take.weights[:, COLUMN["mouthLeft"]], 0)
     np.testing.assert_allclose(take.head[:, 0], 0.3, atol=1e-6)
     assert Recording(0, None).performance() is None
+
+
+@pytest.mark.parametrize("jump", ["app restarted", "midnight", "another sender", "clock set forward"])
+def test_a_recording_goes_on_where_the_clock_jumps(jump, tmp_path):
+    """Catches packets that are left out, a take as long as two clocks are apart, and a CSV that cannot be read back.
+    Packets arrive two at once, and those around the jump while Blender is busy."""
+    stream, recording = Stream(LINK), Recording(1, None)
+    day = 24 * 3600 * 60
+    change = {"app restarted": -500_000, "midnight": -day}.get(jump, 79_001 * 60)
+    for number in range(60):
+        subject = "B" if jump == "another sender" and number >= 30 else "A"
+        stream.follow(("a", subject))
+        data = jaw(day - 30 + number + (change if number >= 30 else 0), number / 100, subject=subject)
+        now = 1000 + (40 if 20 < number < 40 else number | 1) / 60
+        recording.add(stream.receive("a", data, now), now)
+    write_performance(tmp_path / "take.csv", recording.performance())
+    take = read_performance(tmp_path / "take.csv")
+    np.testing.assert_allclose(take.weights[:, COLUMN["jawOpen"]], np.arange(60) / 100, atol=1e-6)
+    np.testing.assert_allclose(take.times, np.arange(60) / 60, atol=1 / 60)
+    assert take.fps == pytest.approx(60, rel=1e-3)
+
+
+@pytest.mark.parametrize("sent", ["every frame", "once"])
+def test_vmc_whose_clock_stands_still(sent):
+    """Catches a head that freezes with the sender's clock, and a take of one packet."""
+    stream, recording = Stream(SOURCES["vmc"]), Recording(1, None)
+    clock = osc_text("/VMC/Ext/T") + osc_text(",f") + struct.pack(">f", 12.5)
+    for number in range(60):
+        time = [clock] if sent == "every frame" or number == 0 else []
+        data = bundle(*time, blend("jawOpen", number / 100), APPLY)
+        packet = stream.receive("a", data, number / 60)
+        assert shown(stream) == pytest.approx(number / 100)
+        recording.add(packet, number / 60)
+    np.testing.assert_allclose(recording.performance().times, np.arange(60) / 60, atol=1e-6)
 
 
 def test_smoothing():
