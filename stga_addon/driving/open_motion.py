@@ -138,7 +138,7 @@ def performed(
     fps: float | None = None,
 ) -> Motion:
     """A performance on a person's head: one timestep per 1/fps seconds, from 0 on. `name` is what errors call it."""
-    prepared = prepared_performance(performance, options, fps)
+    prepared = prepared_performance(performance, replace(options, strength=1.0), fps)  # `frames_of` applies it
     frames, beyond = frames_of(head_map(person, name), prepared, options, trained)
     timesteps = tuple(range(len(frames)))
     return Motion(_with_frames(person, timesteps, frames), prepared.fps, performance.lost, beyond)
@@ -156,7 +156,7 @@ def adapted(
 
 
 def prepared_performance(performance: Performance, options: MotionOptions, fps: float | None = None) -> Performance:
-    """The performance at an even rate, relative to its neutral face, smoothed, amplified and mirrored."""
+    """The performance at an even rate, relative to its neutral face, smoothed, amplified, mirrored, at the strength."""
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
         raise StgaError(
             f"a performance cannot be resampled to {fps:g} frames per second, expected {MIN_FPS:g} to {MAX_FPS:g}"
@@ -168,7 +168,7 @@ def prepared_performance(performance: Performance, options: MotionOptions, fps: 
     if options.neutral in ("quiet", "first"):
         weights = quiet_weights(performance) if options.neutral == "quiet" else performance.weights[0]
         rest = replace(performance, weights=weights[None], head=None)
-    return smoothed(corrected(resampled(performance, fps), options, rest), options.smoothing)
+    return at_strength(smoothed(corrected(resampled(performance, fps), options, rest), options.smoothing), options)
 
 
 def corrected(performance: Performance, options: MotionOptions, rest: Performance | None = None) -> Performance:
@@ -181,11 +181,16 @@ def corrected(performance: Performance, options: MotionOptions, rest: Performanc
     return mirrored(changed) if options.mirror else changed
 
 
+def at_strength(performance: Performance, options: MotionOptions) -> Performance:
+    """Weights and head rotation times the strength, for what has no FLAME parameters, which `frames_of` strengthens."""
+    return amplified(performance, dict.fromkeys((*PARTS, "head"), options.strength))
+
+
 def frames_of(
     found: HeadMap, performance: Performance, options: MotionOptions, trained: TrainedRange | None = None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of a performance, as `corrected`, on the head of a map; and part -> (T,) how far they were outside the
-    trained range before they were led back (`transfer.outside`)."""
+    """Frames of a performance, as `corrected`, at the strength on the head of a map; and part -> (T,) how far they were
+    outside the trained range before they were led back (`transfer.outside`)."""
     return _finished(found.frames(performance), options, trained)
 
 

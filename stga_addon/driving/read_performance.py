@@ -111,8 +111,9 @@ def _has_face(row: list[str], count: int | None) -> bool:
 
 def _csv_times(path: Path, body: list[list[str]], plain: dict[str, int], header: list[str]) -> np.ndarray | None:
     code = next((plain[name] for name in TIMECODE_COLUMNS if name in plain), None)
-    if code is not None and any(":" in row[code] for row in body):
-        return seconds_of(str(path), [row[code] for row in body])
+    codes = [] if code is None else [row[code] if code < len(row) else "" for row in body]
+    if any(":" in text for text in codes):
+        return seconds_of(str(path), codes)
     at = code if code is not None else next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
     if at is None:
         return None

@@ -24,7 +24,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> dict[str, Path]:
-    """The demo's model, an avatar of another identity of it, and ten frames in which the jaw opens and turns left."""
+    """The demo's model, an avatar of another identity of it, and ten frames in which head and jaw turn left and the jaw
+    opens."""
     folder = tmp_path_factory.mktemp("drive")
     model = synthetic_flame(0)
     write_flame(model, folder / "flame.npz")
@@ -33,7 +34,8 @@ def files(tmp_path_factory) -> dict[str, Path]:
     weights = np.zeros((10, 52))
     weights[:, COLUMN["jawOpen"]] = np.linspace(0, 0.9, 10)
     weights[:, COLUMN["jawLeft"]] = np.linspace(0, 0.5, 10)
-    write_performance(folder / "take.csv", Performance(np.arange(10) / 30, weights, None, 30.0))
+    head = np.linspace([0, 0, 0], [0.4, 0, 0.2], 10)
+    write_performance(folder / "take.csv", Performance(np.arange(10) / 30, weights, head, 30.0))
     camera = look_at(np.array([0.0, 0.0, 0.8]), np.zeros(3), 64, 64, 130.0)
     world = np.linalg.inv(np.vstack([camera.world_to_camera, [0, 0, 0, 1]])[:4])
     world[:, 1:3] *= -1
@@ -44,7 +46,8 @@ def files(tmp_path_factory) -> dict[str, Path]:
 
 
 def test_convert_there_and_back(files, tmp_path, capsys):
-    """Catches a motion that `read_motion` refuses, another rate, and a mirror that does not exchange sides."""
+    """Catches a motion that `read_motion` refuses, another rate, a mirror that does not exchange sides, and a strength
+    that changes no CSV, or a motion twice."""
     out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
     assert (
         main(["drive", *map(str, (files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out))]) == 0
@@ -59,6 +62,14 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     weights = read_performance(back).weights
     np.testing.assert_allclose(weights[-1, COLUMN["jawOpen"]], 0.9, atol=0.01)
     np.testing.assert_allclose(weights[-1, COLUMN["jawRight"]], 0.5, atol=0.01)
+    weak = ["--flame", files["flame.npz"], "--strength", 0.5, "--out"]
+    for source, output in (("take.csv", "weak.csv"), ("take.csv", "weak.npz"), ("weak.npz", "weaker.csv")):
+        source = files.get(source, tmp_path / source)
+        assert main(["drive", *map(str, (source, *weak, tmp_path / output))]) == 0
+    for output, share in (("weak.csv", 0.5), ("weaker.csv", 0.25)):
+        found = read_performance(tmp_path / output)
+        np.testing.assert_allclose(found.weights[-1, COLUMN["jawOpen"]], 0.9 * share, atol=0.01)
+        np.testing.assert_allclose(found.head[-1], [0.4 * share, 0, 0.2 * share], atol=0.01)
     assert main(["drive", str(out), "--out", str(tmp_path / "x.npz")]) == 2
     assert "holds FLAME parameters already" in capsys.readouterr().err
     assert main(["drive", str(files["take.csv"]), "--out", str(tmp_path / "x.npz")]) == 2
@@ -68,7 +79,7 @@ def test_convert_there_and_back(files, tmp_path, capsys):
 def test_render_and_export_a_performance(files, tmp_path, capsys):
     """Catches a command that takes FLAME motions alone, or options that change nothing."""
     base = ["render", files["a.npz"], "--cameras", files["cameras.json"], "--motion", files["take.csv"]]
-    base += ["--flame", files["flame.npz"], "--device", "cpu", "--out"]
+    base += ["--flame", files["flame.npz"], "--gain", "head=0", "--device", "cpu", "--out"]
     assert main([str(a) for a in [*base, tmp_path / "full"]]) == 0
     assert main([str(a) for a in [*base, tmp_path / "less", "--gain", "jaw=0.2"]]) == 0
     full, less = (

@@ -1,6 +1,7 @@
 """Performances of every tool as the same weights."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,7 @@ def test_facial_mocap_lines(tmp_path):
         (lambda text: text.splitlines()[0], "has no row with a face"),
         (lambda text: text.replace("0.1", "91.1"), "beyond"),
         (lambda text: "", "is empty"),
+        (lambda text: re.sub("(?m)^([^,]*),(.*)$", r"\2,\1", text).rpartition(",")[0], "row 6: Timecode is ''"),
     ],
 )
 def test_mistakes_are_one_sentence(tmp_path, change, sentence):
