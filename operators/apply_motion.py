@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 
 from ..stga_addon.capture.open import open_capture
+from ..stga_addon.driving.head_map import head_turns
 from ..stga_addon.driving.open_motion import (
     MotionOptions,
     adapted,
@@ -23,6 +24,7 @@ from ..stga_addon.flame.motion import PARTS, retimed
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
+from ..stga_addon.scene.rig.live_pose import WEIGHT_RANGE
 from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
 from ..stga_addon.scene.rig.trained import store_range, stored_range
 from . import ids
@@ -243,13 +245,15 @@ class ApplyMotion(bpy.types.Operator, FileImport):
             self._report_range(motion.outside)
             apply_motion(head, frames, self.start, path.stem, parts, self.place == "strip", self._warn)
             return len(frames)
-        kept = tuple(
-            part for part, chosen in (("face", self.expression), ("jaw", self.jaw), ("eyes", self.eyes)) if chosen
-        )
-        prepared = prepared_performance(parts_kept(performance, kept), options, rate)
+        chosen = {"face": self.expression, "jaw": self.jaw, "eyes": self.eyes, "head": self.neck}
+        kept = parts_kept(performance, tuple(part for part in chosen if chosen[part]))
+        prepared = prepared_performance(kept, options, rate)
         owner, paths = (head.data.shape_keys, checked_shape_keys(head)) if rig is None else (rig, control_paths())
-        weights = np.clip(self.strength * prepared.weights, -1.0, 2.0)
-        apply_weights(owner, paths, weights, self.start, path.stem, self.place == "strip")
+        weights = np.clip(prepared.weights, *WEIGHT_RANGE)
+        neck = None
+        if rig is not None and self.neck:
+            neck = np.zeros((len(weights), 3)) if prepared.head is None else head_turns(prepared.head)
+        apply_weights(owner, paths, weights, self.start, path.stem, self.place == "strip", neck)
         return len(weights)
 
     def _options(self) -> MotionOptions:

@@ -16,7 +16,7 @@ from ..stga_addon.driving.inverse import write_performance
 from ..stga_addon.driving.live.receiver import REQUEST_INTERVAL_S, Receiver
 from ..stga_addon.driving.live.stream import Stream
 from ..stga_addon.driving.live.take import RESTING_PACKETS, Recording, eased, resting, row_of
-from ..stga_addon.driving.open_motion import MotionOptions, corrected, frames_of
+from ..stga_addon.driving.open_motion import MotionOptions, at_strength, corrected, frames_of
 from ..stga_addon.driving.packet import FacePacket
 from ..stga_addon.driving.performance import EXCHANGEABLE, Performance
 from ..stga_addon.driving.transfer import TrainedRange
@@ -138,8 +138,9 @@ class LiveSession:
             frames, _ = frames_of(target.map, row, options, target.trained)
             target.pose.set_frame(frames[0])
         else:
+            row = at_strength(row, options)
             turn = np.zeros(3) if row.head is None else head_turns(row.head)[0]
-            target.pose.set_weights(options.strength * row.weights[0], options.strength * turn)
+            target.pose.set_weights(row.weights[0], turn)
         for window in bpy.context.window_manager.windows:
             for area in window.screen.areas:
                 if area.type == "VIEW_3D":

@@ -67,7 +67,8 @@ def test_apply_a_performance(scene):
 
 
 def test_controls(scene):
-    """Catches a control that moves something else than the map says, needs Python at playback, or stays behind."""
+    """Catches a control that moves something else than the map says, needs Python at playback, or stays behind; and a
+    neck that loses the head's rotation, or turns where it was not chosen."""
     before = at(1)
     assert bpy.ops.stga.add_arkit_controls() == {"FINISHED"}
     head = the_head()
@@ -83,12 +84,16 @@ def test_controls(scene):
         rig.update_tag()
         bpy.context.view_layer.update()
         np.testing.assert_allclose(at(1), expected(scene, row, False), atol=2 * TOLERANCE_M)
-    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1) == {"FINISHED"}
+    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1, neck=False) == {"FINISHED"}
     np.testing.assert_allclose(at(4), expected(scene, 3, False), atol=2 * TOLERANCE_M)
     assert rig["jawOpen"] == pytest.approx(scene.weights[3, COLUMN["jawOpen"]], abs=1e-5)
     assert bpy.ops.stga.remove_arkit_controls() == {"FINISHED"}
     assert not any(name in rig for name in ARKIT_SHAPES)
     np.testing.assert_allclose(at(1), before, atol=1e-7)
+    bpy.ops.stga.add_arkit_controls()
+    for start, place in ((10, "action"), (20, "strip")):
+        assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=start, place=place) == {"FINISHED"}
+        np.testing.assert_allclose(at(start + 3), expected(scene, 3, True), atol=2 * TOLERANCE_M)
 
 
 def test_curves_come_back_from_an_action(scene, tmp_path):

@@ -11,7 +11,7 @@ from ...driving.shapes import MOUTH_CLOSE
 from ...errors import StgaError
 from ..animation import add_driver, write_curve
 from ..compat import action_curves, push_down_action
-from .keyframes import start_action
+from .keyframes import check_keyable, key_turns, start_action
 from .names import expression_key, key_value_path, property_path, rotation_path
 
 SUMS = "stga_arkit_sums"
@@ -111,16 +111,28 @@ def key_weights(owner: Any, paths: dict[int, str], numbers: Sequence[int], weigh
 
 
 def apply_weights(
-    owner: Any, paths: dict[int, str], weights: np.ndarray, start: int, name: str, as_strip: bool = False
+    owner: Any,
+    paths: dict[int, str],
+    weights: np.ndarray,
+    start: int,
+    name: str,
+    as_strip: bool = False,
+    neck: np.ndarray | None = None,
 ) -> None:
     """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T, 52), one row per
-    Blender frame from `start` on. The previous animation is kept as `rig.motion.apply_motion` keeps it. Raises
-    StgaError where the owner is in tweak mode."""
-    if owner.animation_data is not None and owner.animation_data.use_tweak_mode:
-        raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
-    replaced = set(paths.values())
+    Blender frame from `start` on.
+
+    neck  (T, 3) axis-angle of the neck, where the owner is a rig; None: it keeps its own animation
+    The previous animation is kept as `rig.motion.apply_motion` keeps it. Raises StgaError as `check_keyable` does.
+    """
+    bones = [] if neck is None else ["neck"]
+    check_keyable(owner, bones)
+    replaced = {*paths.values(), *map(rotation_path, bones)}
     start_action(owner, f"{owner.name} {name}", lambda path: path in replaced, as_strip)
-    key_weights(owner, paths, range(start, start + len(weights)), weights)
+    numbers = range(start, start + len(weights))
+    key_weights(owner, paths, numbers, weights)
+    if neck is not None:
+        key_turns(owner, "neck", numbers, neck)
     owner.animation_data.action.use_fake_user = True
     if as_strip:
         push_down_action(owner, extrapolation="NOTHING")

@@ -6,6 +6,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...errors import StgaError
 from ...flame.forward import FlameFrame, joint_positions
 from ...flame.model import JOINTS
 from ...flame.motion import PARTS
@@ -50,16 +51,30 @@ def key_motion(
     bones = [bone for part in parts for bone in PART_JOINTS.get(part, ())]
     if not bones:
         return
-    curves, at = action_curves(rig), np.asarray(numbers)
     poses = np.stack([frame.pose for frame in frames])
     for bone in bones:
-        quaternions = continuous(from_axis_angle(poses[:, JOINTS.index(bone)]))
-        for element in range(4):
-            write_curve(curves, rotation_path(bone), element, at, quaternions[:, element])
+        key_turns(rig, bone, numbers, poses[:, JOINTS.index(bone)])
     if "head" in parts:
+        curves, at = action_curves(rig), np.asarray(numbers)
         translations = np.stack([frame.translation for frame in frames])
         for axis in range(3):
             write_curve(curves, ROOT_LOCATION, axis, at, translations[:, axis])
+
+
+def key_turns(rig: Any, bone: str, numbers: Sequence[int], turns: np.ndarray) -> None:
+    """Add keyframes of a bone's rotation, axis-angle (T, 3), at the frames `numbers` to the rig's active action."""
+    curves, at = action_curves(rig), np.asarray(numbers)
+    for element, values in enumerate(continuous(from_axis_angle(turns)).T):
+        write_curve(curves, rotation_path(bone), element, at, values)
+
+
+def check_keyable(owner: Any, bones: Sequence[str] = ()) -> None:
+    """Raise StgaError where keyframes of a data-block, or of rotations of a rig's bones, would have no effect."""
+    if owner.animation_data is not None and owner.animation_data.use_tweak_mode:
+        raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
+    for name in bones:
+        if owner.pose.bones[name].rotation_mode != "QUATERNION":
+            raise StgaError(f"{owner.name}: the rotation mode of bone {name} must be Quaternion (WXYZ)")
 
 
 def start_action(owner: Any, name: str, replaces: Callable[[str], bool], as_strip: bool) -> None:

@@ -18,7 +18,7 @@ from ..compat import push_down_action
 from ..objects import Warn, log_warning
 from ..timeline import iterate_frames
 from .flame_rig import rig_of
-from .keyframes import animated_by, key_motion, key_tracked_offsets, key_zero_offsets, start_action
+from .keyframes import animated_by, check_keyable, key_motion, key_tracked_offsets, key_zero_offsets, start_action
 from .names import EXPRESSION_KEY, expression_key, is_of_parts, offset_keys, parent_bone, slider_components
 
 MESH_TOLERANCE = 1e-4
@@ -70,12 +70,8 @@ def _for_all_sliders(head: Any, expr: np.ndarray) -> np.ndarray:
 
 
 def _check_rig(head: Any, rig: Any, frames: Sequence[FlameFrame], parts: Sequence[str]) -> None:
-    for owner in (rig, head.data.shape_keys):
-        if owner.animation_data is not None and owner.animation_data.use_tweak_mode:
-            raise StgaError(f"{owner.name}: is in tweak mode in the NLA editor; leave tweak mode first")
-    for name in JOINTS:
-        if rig.pose.bones[name].rotation_mode != "QUATERNION":
-            raise StgaError(f"{rig.name}: the rotation mode of bone {name} must be Quaternion (WXYZ)")
+    check_keyable(rig, JOINTS)
+    check_keyable(head.data.shape_keys)
     used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
     for component in np.flatnonzero(used).tolist():
         if expression_key(component) not in head.data.shape_keys.key_blocks:
