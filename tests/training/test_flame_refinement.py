@@ -22,6 +22,7 @@ from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.evaluate.metrics import psnr
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.flame_refinement import (
+    TRANSLATION_RATE_M,
     Tracking,
     frame_gradient,
     refinable_tracking,
@@ -181,6 +182,22 @@ def test_the_gradient_points_where_the_image_gets_worse(finished: Trainer, name:
     trainer.frames.clear()
     assert slope > 0
     assert 0.7 < found @ away / slope < 1.2
+
+
+def test_a_timestep_moves_only_by_its_own_views(right: Made) -> None:
+    """Catches timesteps that a run has not come to yet and that move with those it has, and a decay that draws a
+    timestep to minus what others moved by: against Adam's first step, which is the rate, and the tracked values."""
+    tracking = refinable_tracking(right[0], "stga")
+    still = np.zeros_like(tracking.mesh(0))
+    tracking.step(0, still + [1.0, 0.0, 0.0], 1.0)
+    tracking.step(2, still, 1.0)
+    moved = (tracking.parameters() - tracking.tracked) / TRANSLATION_RATE_M
+    np.testing.assert_allclose(moved[:, GROUPS["translation"].start], [-0.5, 0.5, 0.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(moved[2:], 0.0)
+    for _ in range(500):
+        tracking.step(2, still, 1.0)
+    moved = tracking.parameters() - tracking.tracked
+    assert np.abs(moved[:, GROUPS["translation"].start]).max() < 1e-3 * TRANSLATION_RATE_M
 
 
 def millimeters(trainer: Trainer, true: dict[int, np.ndarray]) -> float:

@@ -74,11 +74,13 @@ class Tracking:
     def parameters(self) -> np.ndarray:
         """(T, P) refined parameters.
 
-        The mean change of all refined timesteps is removed: the splats' local positions can express it as well, and
-        timesteps that are not refined would not follow it.
+        The mean change of the timesteps that were stepped is removed: the splats' local positions can express it as
+        well, and all other timesteps, which stay as tracked, would not follow it.
         """
-        mean = self.state.change[self.trained].mean(0)
-        return np.asarray(self.tracked + np.where(self.trained[:, None], self.state.change - mean, 0.0))
+        stepped, refined = self.state.steps > 0, self.tracked.copy()
+        if stepped.any():
+            refined[stepped] += self.state.change[stepped] - self.state.change[stepped].mean(0)
+        return refined
 
     def frame(self, timestep: int) -> FlameFrame:
         return frame_of(self.parameters()[self._row[timestep]], self._source(timestep).dynamic_offset)
@@ -93,6 +95,7 @@ class Tracking:
         vertex_gradient (V, 3): of the loss, with respect to the timestep's vertices.
         """
         row, state = self._row[timestep], self.state
+        refined = self.parameters()[row] - self.tracked[row]
         gradient = self.gradient(timestep, vertex_gradient)
         state.steps[row] += 1
         state.first[row] += (1 - BETA1) * (gradient - state.first[row])
@@ -100,7 +103,7 @@ class Tracking:
         first = state.first[row] / (1 - BETA1 ** int(state.steps[row]))
         second = state.second / (1 - BETA2 ** int(state.steps.sum()))
         step = self._rates * first / (np.sqrt(second) + EPSILON)
-        state.change[row] -= share * (step + DECAY_PER_STEP * state.change[row])
+        state.change[row] -= share * (step + DECAY_PER_STEP * refined)
 
     def gradient(self, timestep: int, vertex_gradient: np.ndarray) -> np.ndarray:
         """(P,) gradient with respect to the timestep's parameters, from that with respect to its vertices (V, 3)."""
