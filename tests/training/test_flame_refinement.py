@@ -189,7 +189,7 @@ def test_a_timestep_moves_only_by_its_own_views(right: Made) -> None:
     timestep to minus what others moved by: against Adam's first step, which is the rate, and the tracked values."""
     tracking = refinable_tracking(right[0], "stga")
     still = np.zeros_like(tracking.mesh(0))
-    tracking.step(0, still + [1.0, 0.0, 0.0], 1.0)
+    tracking.step(0, still + np.eye(3)[0], 1.0)
     tracking.step(2, still, 1.0)
     moved = (tracking.parameters() - tracking.tracked) / TRANSLATION_RATE_M
     np.testing.assert_allclose(moved[:, GROUPS["translation"].start], [-0.5, 0.5, 0.0, 0.0, 0.0], atol=1e-6)
