@@ -49,7 +49,7 @@ class Head:
 
     def __init__(self, model: FlameModel, seed: int) -> None:
         shape = np.random.default_rng(seed).normal(0, 1.0, model.n_identity)
-        self.sequence = FlameSequence(model, shape, None, (), {}.__getitem__)
+        self.sequence = FlameSequence(model, shape, None, (), dict[int, FlameFrame]().__getitem__)
         started = perf_counter()
         self.map: HeadMap = head_map(self.sequence, f"identity {seed}")
         self.seconds = perf_counter() - started

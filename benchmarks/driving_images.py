@@ -50,6 +50,8 @@ Frames = Mapping[int, FlameFrame]
 def driven(capture: Capture, other: Capture, way: str) -> Frames:
     """Timestep -> the capture's frame with the other's face, jaw and eyes."""
     own, theirs, options = capture.flame, other.flame, WAYS[way]
+    assert own is not None
+    assert theirs is not None
     seen = sorted({view.timestep for view in capture.views["train"]})
     trained = None if BARE in way else trained_range([own.frame(timestep) for timestep in seen])
     frames = [theirs.frame(timestep) for timestep in theirs.timesteps]
@@ -69,6 +71,7 @@ def driven(capture: Capture, other: Capture, way: str) -> Frames:
 
 def scores(capture: Capture, avatar: Avatar, frames: Frames, pictures: Path | None = None) -> list[float]:
     """PSNR inside the head mask of each left-out view."""
+    assert capture.flame is not None
     sequence, found = replace(capture.flame, frame=frames.__getitem__), []
     for view in capture.views.get("test") or capture.views["val"]:
         truth = read_evaluation_view(capture, view)
@@ -91,6 +94,7 @@ def main() -> None:
     options = parser.parse_args()
     capture, other = open_capture(options.capture, options.flame), open_capture(options.other, options.flame)
     avatar = read_avatar(options.run / "avatar.npz")
+    assert capture.flame is not None
     own = {timestep: capture.flame.frame(timestep) for timestep in capture.flame.timesteps}
     best = np.mean(scores(capture, avatar, own))
     print(f"| driven by | PSNR dB | below its own |\n|---|---|---|\n| own parameters | {best:.2f} | 0 |", flush=True)

@@ -33,16 +33,17 @@ from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 REPORTS = 10
 
 
-def extension():
-    """The checkout as an extension, registered."""
+def register_extension() -> None:
+    """Register the checkout as an extension."""
     spec = importlib.util.spec_from_file_location(
         "stga_checkout", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
     )
+    assert spec is not None
+    assert spec.loader is not None
     package = importlib.util.module_from_spec(spec)
     sys.modules["stga_checkout"] = package
     spec.loader.exec_module(package)
     package.register()
-    return package
 
 
 def set_up(folder: Path) -> int:
@@ -52,7 +53,7 @@ def set_up(folder: Path) -> int:
     bpy.ops.stga.import_motion(filepath=str(folder / "own.npz"), flame=str(folder / "flame.npz"))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+        port: int = probe.getsockname()[1]
     bpy.context.scene.stga.drive.port = port
     bpy.ops.stga.drive_live()
     return port
@@ -70,7 +71,7 @@ def main() -> None:
     parser.add_argument("--malformed", type=int, default=10_000)
     parser.add_argument("--realtime", action="store_true")
     options = parser.parse_args()
-    extension()
+    register_extension()
     session_module = sys.modules["stga_checkout.operators.live_session"]
     with tempfile.TemporaryDirectory() as folder:
         port = set_up(Path(folder))

@@ -134,7 +134,7 @@ def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Pat
 
 def trained(take: Path, options: argparse.Namespace, seed: int) -> Path:
     """The run of the first take."""
-    folder = options.folder / options.capture.name / f"base_{options.base}_{seed}"
+    folder: Path = options.folder / options.capture.name / f"base_{options.base}_{seed}"
     if not (folder / "residuals.npz").exists():
         capture = open_capture(take, options.flame)
         settings = make_settings(iterations=options.base, seed=seed, effects={"tracking": "off"})
@@ -149,8 +149,8 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     assert prepared.selection is not None
     settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
     parent = read_run(continuation.parent).settings
-    before = {"strain_color": parent.strain_color, "driven_offsets": parent.driven_offsets}
-    now = {"strain_color": settings.strain_color, "driven_offsets": settings.driven_offsets}
+    before: dict[str, Any] = {"strain_color": parent.strain_color, "driven_offsets": parent.driven_offsets}
+    now: dict[str, Any] = {"strain_color": settings.strain_color, "driven_offsets": settings.driven_offsets}
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]
@@ -205,9 +205,9 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     exposure = known_exposure(rows, capture.views["train"]) if rows else None
     spent, due, budget = 0.0, 0.0, options.seconds * (ANEW_BUDGET if arm.anew else 1)
     lines: list[Line] = []
-    background = tuple(round(255 * level) for level in arm.settings.background)
+    red, green, blue = (round(255 * level) for level in arm.settings.background)
     prepare = image_preparation(capture, arm.settings)
-    with ViewLoader(arm.views, background=background, prepare=prepare, mesh=capture.mesh) as loader:
+    with ViewLoader(arm.views, background=(red, green, blue), prepare=prepare, mesh=capture.mesh) as loader:
         while True:
             if spent >= due:
                 share = min(1.0, spent / budget) if arm.anew else 1.0
@@ -230,7 +230,7 @@ def arm_region(prepared: Prepared) -> np.ndarray | None:
     if prepared.run.settings.strategy != "refine":
         return None
     assert prepared.selection is not None
-    return np.any(list(prepared.selection.values()), axis=0)
+    return np.asarray(np.any(list(prepared.selection.values()), axis=0))
 
 
 def describe(line: dict[str, float]) -> str:

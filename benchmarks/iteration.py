@@ -234,7 +234,7 @@ def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: floa
     """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `share` of the splats."""
     center = mesh[faces].mean(1)
     away = np.minimum(*(np.linalg.norm(center - p, axis=1) for p in REGIONS[head]))
-    return away <= np.quantile(away[splats.face], share)
+    return np.asarray(away <= np.quantile(away[splats.face], share))
 
 
 def main() -> None:
@@ -269,6 +269,9 @@ def main() -> None:
     else:
         import gpu_kernels  # needs wgpu
 
+        from stga_addon.training.optimize.gpu_backend import GpuBackend
+
+        assert isinstance(backend, GpuBackend)
         measure = partial(gpu_kernels.queued_ms, backend, options.repeats)
         found = gpu_kernels.kernel_table(backend, batch, options.repeats)
     whole = measure(batch)
@@ -292,7 +295,8 @@ def instruction_set() -> str:
     """The processor that the kernels are compiled for, as LLVM calls it, and its vector instructions."""
     features = get_host_cpu_features().split(",")
     vectors = [f[1:] for f in features if f.startswith(("+avx", "+neon", "+sve", "+fma"))]
-    return f"{config.CPU_NAME or get_host_cpu_name()}: {' '.join(vectors)}"
+    cpu = config.CPU_NAME  # type: ignore[attr-defined]  # read from the environment
+    return f"{cpu or get_host_cpu_name()}: {' '.join(vectors)}"
 
 
 def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]) -> dict[str, float]:

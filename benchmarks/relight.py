@@ -14,6 +14,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -81,7 +82,7 @@ def gray_ball(spec: dict) -> np.ndarray:
     sky = even_directions(600)
     cosine = np.maximum(BALL @ sky.T, 0) * 4 * np.pi / len(sky)
     arriving = lamps.irradiance(np.zeros_like(BALL), BALL) + cosine @ world_radiance(spec, sky)
-    return CARD_REFLECTANCE * arriving / np.pi
+    return np.asarray(CARD_REFLECTANCE * arriving / np.pi)
 
 
 class Bench:
@@ -111,7 +112,9 @@ class Bench:
         """Mean PSNR in the mask, LPIPS, PSNR of eyes and mouth."""
         found = []
         for view, image in self.images(name, relighter, **options):
-            target, mask = read_image(view), read_mask(view) > 127
+            target, levels = read_image(view), read_mask(view)
+            assert levels is not None
+            mask = levels > 127
             distance = np.nan
             if self.network is not None:
                 distance = self.network.distance(image, target.transpose(2, 0, 1) / np.float32(255))
@@ -128,7 +131,7 @@ def small_parts(capture: Capture, view: View) -> np.ndarray:
     """(H, W) bool: pixels of eyes and mouth."""
     triangle, _ = rasterize(capture.mesh(view.timestep), capture.faces, view.camera)
     parts = np.logical_or.reduce([capture.regions[name] for name in SMALL_PARTS])
-    return (triangle >= 0) & parts[np.maximum(triangle, 0)]
+    return np.asarray((triangle >= 0) & parts[np.maximum(triangle, 0)])
 
 
 def trained(capture: Path, run: Path, seconds: str) -> Avatar:
@@ -160,7 +163,7 @@ def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> Non
     even = estimate_light(capture, Known(radiance=uniform(ball.mean(0) / CARD_REFLECTANCE)))
     print(f"{folder.name}: {len(avatar.splats)} splats; residual {light.residual:.3f}, damping {light.damping:.2f}")
     relighter = Relighter(replace(avatar, light=light))
-    rows = {
+    rows: dict[str, tuple[Relighter | None, dict[str, Any]]] = {
         "as trained": (None, {}),
         "studio taken as even": (Relighter(replace(avatar, light=even)), {}),
         "  undamped": (Relighter(replace(avatar, light=replace(even, damping=0.0))), {}),

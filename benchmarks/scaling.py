@@ -20,6 +20,7 @@ import heapq
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter, sleep, thread_time
 from typing import Any
@@ -86,12 +87,12 @@ def series(repeats: int) -> dict[str, list[Point]]:
     """What was varied -> its measurements."""
     counts = (10_000, 30_000, 60_000, 100_000, 200_000, 500_000, 1_000_000)
     plans: dict[str, list[Callable[[], Point]]] = {
-        "splats": [lambda n=n: measure(n, repeats if n < 200_000 else max(3, repeats // 5), splats=n) for n in counts],
-        "pixels": [lambda z=z: measure(z * z * WIDTH * HEIGHT, repeats, zoom=z) for z in (0.25, 0.5, 1.0, 1.5, 2.0)],
-        "selected share": [lambda s=s: measure(s, repeats, share=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)],
-        "threads": [lambda n=n: on_threads(n, repeats) for n in range(1, threads() + 1)],
+        "splats": [partial(measure, n, repeats if n < 200_000 else max(3, repeats // 5), n) for n in counts],
+        "pixels": [partial(measure, z * z * WIDTH * HEIGHT, repeats, zoom=z) for z in (0.25, 0.5, 1.0, 1.5, 2.0)],
+        "selected share": [partial(measure, s, repeats, share=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)],
+        "threads": [partial(on_threads, n, repeats) for n in range(1, threads() + 1)],
     }
-    found = {}
+    found: dict[str, list[Point]] = {}
     for name, measurements in plans.items():
         found[name] = []
         for work in measurements:
