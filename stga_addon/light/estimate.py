@@ -1,6 +1,7 @@
 """The light of a capture, from its images and meshes."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -45,17 +46,19 @@ MIN_VERTICES = 24
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of a capture's light.
+    """What is known of a capture's light and cameras.
 
     radiance   (9, 3) harmonics in the capture's axes; None: estimated
     card       (K, 3) linear colors of a gray card of 18 % at the face that faces `toward`, or of a gray ball where that
                is its normal; None: the level is unknown
     toward     (K, 3) unit vectors
+    exposure   camera's index -> gain and offset (2, 3), in levels, of its images; none of other cameras
     """
 
     radiance: np.ndarray | None = None
     card: np.ndarray | None = None
     toward: np.ndarray | None = None
+    exposure: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 def estimate_light(capture: Capture, known: Known = Known(), report: Report = ignore) -> AvatarLight:
@@ -63,7 +66,7 @@ def estimate_light(capture: Capture, known: Known = Known(), report: Report = ig
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, from which its light could be estimated")
     transfer, occlusion = transfer_of(capture.neutral, capture.faces)
-    observed = observe(capture, report)
+    observed = observe(capture, known.exposure, report)
     posed = np.stack(
         [transfer_of(capture.mesh(time), capture.faces, POSED_DIRECTIONS)[0] for time in views_by_time(capture)]
     )

@@ -1,5 +1,6 @@
 """Colors of a capture's triangles: what the light of a recording is estimated from."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,24 +44,26 @@ def views_by_time(capture: Capture) -> dict[int, list[View]]:
     return {time: evenly_spread(found[time], MAX_CAMERAS) for time in evenly_spread(sorted(found), MAX_TIMESTEPS)}
 
 
-def observe(capture: Capture, report: Report = ignore) -> Observed:
+def observe(capture: Capture, exposure: Mapping[int, np.ndarray], report: Report = ignore) -> Observed:
     """Mean color of each triangle in the darker half of the cameras that face it, which have the fewest highlights.
 
-    T are those of `views_by_time`, in its order; reads all their images.
+    T are those of `views_by_time`, in its order; reads all their images. exposure: as in `estimate.Known`.
     """
     by_time = views_by_time(capture)
     colors, cameras = [], []
     for n, (time, views) in enumerate(by_time.items()):
         report(Progress(n / max(len(by_time), 1), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
-        seen = np.stack([_view_colors(capture, mesh, view) for view in views])
+        seen = np.stack([_view_colors(capture, mesh, view, exposure.get(view.camera_index)) for view in views])
         colors.append(_darker_half(seen))
         cameras.append(np.isfinite(seen[..., 0]).sum(0))
     return Observed(np.stack(colors), np.stack(cameras))
 
 
-def _view_colors(capture: Capture, mesh: np.ndarray, view: View) -> np.ndarray:
-    """(F, 3) linear mean color of each triangle at POINTS; NaN where it is hidden or seen aslant."""
+def _view_colors(capture: Capture, mesh: np.ndarray, view: View, exposure: np.ndarray | None) -> np.ndarray:
+    """(F, 3) linear mean color of each triangle at POINTS, without its camera's exposure (2, 3); NaN where it is hidden
+    or seen aslant."""
+    gain, offset = np.eye(2)[:, :1] if exposure is None else exposure
     scale = min(1.0, MAX_SIDE_PX / max(view.camera.width, view.camera.height))
     view, image, mask = read_view(view, scale)
     level = image.max(2)
@@ -81,7 +84,8 @@ def _view_colors(capture: Capture, mesh: np.ndarray, view: View) -> np.ndarray:
         inside = facing & (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
         column, row = np.where(inside, column, 0), np.where(inside, row, 0)
         inside &= usable[row, column]
-        total += np.where(inside[:, None], srgb_to_linear(image[row, column] / 255), 0)
+        color = np.clip((image[row, column] - offset) / gain, 0, 255)
+        total += np.where(inside[:, None], srgb_to_linear(color / 255), 0)
         count += inside[:, None]
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 

@@ -16,6 +16,7 @@ from ..light.estimate import Known, estimate_light
 from ..progress import Report, Say, ignore
 from ..requests.results import Written
 from ..requests.values import Relight
+from ..training.evaluate.match_exposure import known_exposure
 from ..training.run.folder import AVATAR, locked
 from ..training.run.open_run import open_refined
 
@@ -42,7 +43,8 @@ def add_light(avatar_file: Path, capture: Capture, known: Known = Known(), repor
     """
     with locked(avatar_file.parent):
         avatar = read_avatar(avatar_file)
-        light = estimate_light(capture, known, report)
+        exposure = known_exposure(avatar.settings.get("exposure") or (), ())
+        light = estimate_light(capture, replace(known, exposure=exposure), report)
         write_avatar(avatar_file, replace(avatar, light=light))
     return describe_light(light)
 

@@ -12,11 +12,13 @@ from PIL import Image
 
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.color import srgb_to_linear
+from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.light.estimate import estimate_light
 from stga_addon.light.relight import Relighter, albedo_avatar
+from stga_addon.perform.relighting import add_light
 from stga_addon.training.run.folder import locked
 
 LIGHTS = """
@@ -109,6 +111,27 @@ def test_a_running_trainings_avatar_is_kept(
     light = read_avatar(copy / "avatar.npz").light
     assert light is not None
     assert light.source == "gray_card"
+
+
+def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> None:
+    """Catches a light that is estimated from images without the exposure correction that the avatar's colors have: a
+    camera of another gain, offset and white balance changes nothing, against images without any."""
+    gain, offset = np.array([0.7, 0.8, 0.6]), np.array([12.0, 5.0, 8.0])
+    shutil.copytree(root, tmp_path / "capture")
+    for path in (tmp_path / "capture/images").glob("*_02.png"):
+        with Image.open(path) as image:
+            levels = np.asarray(image)
+        Image.fromarray(np.round(gain * levels + offset).astype(np.uint8)).save(path)
+    shutil.copytree(run, tmp_path / "run")
+    avatar_file = tmp_path / "run/avatar.npz"
+    avatar = read_avatar(avatar_file)
+    settings = {**avatar.settings, "exposure": [[2.0, *gain, *offset]]}
+    write_avatar(avatar_file, replace(avatar, settings=settings))
+    assert avatar.light is not None
+    add_light(avatar_file, open_capture(tmp_path / "capture"))
+    light = read_avatar(avatar_file).light
+    assert light is not None
+    np.testing.assert_allclose(light.irradiance, avatar.light.irradiance, rtol=0.05)  # images are rounded to levels
 
 
 def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
