@@ -77,7 +77,7 @@ class Tracking:
         The mean change of the timesteps that were stepped is removed: the splats' local positions can express it as
         well, and all other timesteps, which stay as tracked, would not follow it.
         """
-        stepped, refined = self.state.steps > 0, self.tracked.copy()
+        stepped, refined = self.state.steps > 0, np.array(self.tracked)
         if stepped.any():
             refined[stepped] += self.state.change[stepped] - self.state.change[stepped].mean(0)
         return refined
