@@ -23,8 +23,8 @@ JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
 class JobRecord:
     """Content of job.json.
 
-    digest    of `job_digest`
-    forecast_s, seconds   how long the job was expected to take, and took over all its processes; 0: unknown
+    digest    of `job_digests`
+    forecast_s, seconds   how long the job was expected to take, and all its workers worked; 0: unknown
     machine   that carried it out last
     """
 

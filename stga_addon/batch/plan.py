@@ -23,6 +23,7 @@ Paths are relative to the plan's folder; where a request writes, to the job's ow
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from graphlib import CycleError, TopologicalSorter
@@ -82,9 +83,24 @@ def plan_of_captures(
     captures: Sequence[Path], out: Path, settings: Mapping[str, Any], fields: Mapping[str, Any]
 ) -> Plan:
     """A training of each capture. settings: of `make_settings`; fields: further ones of `Train`. Raises StgaError."""
-    cases = [{"name": _slug(path.resolve().name), "capture": str(path.resolve())} for path in captures]
+    folders = [path.resolve() for path in captures]
+    cases = [{"name": name, "capture": str(path)} for name, path in zip(_names(folders), folders, strict=True)]
     table = {"request": "train", "settings": dict(settings), "cases": cases, **fields}
     return make_plan({"out": str(out.resolve()), "job": {"train": table}}, Path.cwd(), "CAPTURES")
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """What a case of each folder is called: the folder's name; with that above it where several have it; and numbered
+    where these are the same in ASCII."""
+    names = [_case_name(path.name) for path in folders]
+    shared = Counter(names)
+    names = [_case_name("-".join(p.parts[-2:])) if shared[n] > 1 else n for n, p in zip(names, folders, strict=True)]
+    earlier = [names[:number].count(name) for number, name in enumerate(names)]
+    return [name if not count else f"{name}_{count + 1}" for name, count in zip(names, earlier, strict=True)]
+
+
+def _case_name(text: str) -> str:
+    return _slug(text).lstrip("_-.") or "x"
 
 
 def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
@@ -399,6 +415,9 @@ def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
         after = list(job.after)
         for name, paths in input_paths(job.request).items():
             for path in paths:
+                if path == job.folder.parent:
+                    cure = "is the batch's own folder; choose another 'out'"
+                    raise StgaError(f"{source}: [job.{job.table}]: {name}: {path} {cure}")
                 maker = next((by_folder[folder] for folder in (path, *path.parents) if folder in by_folder), None)
                 if maker is not None and maker is not job:
                     after.append(maker.name)

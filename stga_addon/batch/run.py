@@ -9,7 +9,7 @@ from ..errors import StgaError
 from ..worker.status import WorkerState, WorkerStatus, read_status, request_cancel
 from .engine import Engine
 from .folder import is_done, is_running, prepare, read_record, write_record
-from .identity import job_digest
+from .identity import job_digests
 from .job import Job
 from .lease import Lease
 from .plan import Plan
@@ -49,7 +49,7 @@ class Entry:
     """A job and what is known of it.
 
     status      the worker's latest; error: why it failed, or was not started
-    began_s     when it was started, by the monotonic clock; seconds: that its processes have taken
+    seconds     that its ended workers have worked
     forecast_s  how long it was expected to take; 0: unknown
     """
 
@@ -59,16 +59,16 @@ class Entry:
     status: WorkerStatus = field(default_factory=WorkerStatus)
     error: str = ""
     machine: str = ""
-    began_s: float = 0.0
     seconds: float = 0.0
     forecast_s: float = 0.0
     retries: int = 0
 
-    def left_s(self, now: float) -> float | None:
+    @property
+    def left_s(self) -> float | None:
         """Seconds until it is finished, from its share done, else from its forecast; None: unknown."""
         if self.state.is_over:
             return 0.0
-        spent = now - self.began_s if self.state == JobState.RUNNING else 0.0
+        spent = self.status.seconds if self.state == JobState.RUNNING else 0.0
         if self.state == JobState.RUNNING and self.status.progress > 0.05:
             return spent * (1 / self.status.progress - 1)
         return max(self.forecast_s - spent, 0.0) if self.forecast_s else None
@@ -81,10 +81,9 @@ class Batch:
         """Find out what is finished already. Raises StgaError where an input cannot be read."""
         self.plan = plan
         self.entries = {job.name: Entry(job) for job in plan.jobs}
-        jobs = {job.name: job for job in plan.jobs}
-        digests: dict[str, str] = {}
-        for name, entry in self.entries.items():
-            entry.digest = digests[name] = job_digest(entry.job, jobs, digests)
+        for name, digest in job_digests(plan).items():
+            entry = self.entries[name]
+            entry.digest = digest
             kept = all(self.entries[other].state.is_done for other in entry.job.after)
             if kept and is_done(entry.job, entry.digest):
                 entry.state = JobState.KEPT
@@ -231,7 +230,7 @@ class _Loop:
 
     def _mark_running(self, entry: Entry) -> None:
         self._ready.pop(entry.job.name, None)
-        entry.state, entry.began_s, entry.status = JobState.RUNNING, time.monotonic(), WorkerStatus()
+        entry.state, entry.status = JobState.RUNNING, WorkerStatus()
 
     def _collect(self, retry: bool = True) -> bool:
         """Take note of what has ended; whether something has."""
@@ -254,14 +253,13 @@ class _Loop:
         return bool(ended)
 
     def _add_seconds(self, entry: Entry) -> None:
-        """Add the time since the job began to its record."""
+        """Add the time that the job's worker has worked to its record."""
         record = read_record(entry.job)
         if record is None:
             return
-        seconds = record.seconds + time.monotonic() - entry.began_s
-        entry.seconds = seconds
+        entry.seconds = record.seconds + entry.status.seconds
         try:
-            write_record(entry.job, replace(record, seconds=round(seconds, 3), machine=entry.machine))
+            write_record(entry.job, replace(record, seconds=entry.seconds, machine=entry.machine))
         except StgaError as error:
             self._say(f"warning: {error}")
 

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from time import monotonic
 from typing import TextIO
 
 from ..errors import one_line
@@ -27,7 +26,7 @@ class LiveTable:
         if not self._is_terminal:
             return
         self._erase()
-        lines = table_lines(batch, monotonic())
+        lines = table_lines(batch)
         self._stream.write("".join(line[: self._width - 1] + "\n" for line in lines))
         self._stream.flush()
         self._drawn = len(lines)
@@ -44,45 +43,45 @@ class LiveTable:
         self._drawn = 0
 
 
-def table_lines(batch: Batch, now: float) -> list[str]:
+def table_lines(batch: Batch) -> list[str]:
     """A line on the whole batch, and one for each job that runs or has failed."""
     shown = [entry for entry in batch.entries.values() if entry.state == JobState.RUNNING]
     shown += [entry for entry in batch.entries.values() if entry.state in (JobState.FAILED, JobState.BLOCKED)]
     width = max((len(entry.job.name) for entry in shown[:MAX_ROWS]), default=0)
-    lines = [summary_line(batch, now), *(_row(entry, width, now) for entry in shown[:MAX_ROWS])]
+    lines = [summary_line(batch), *(_row(entry, width) for entry in shown[:MAX_ROWS])]
     return lines if len(shown) <= MAX_ROWS else [*lines, f"… and {len(shown) - MAX_ROWS} more"]
 
 
-def summary_line(batch: Batch, now: float) -> str:
+def summary_line(batch: Batch) -> str:
     """ "3 of 8 jobs finished, 2 running, 1 failed; about 4 min left"."""
     counts = Counter(entry.state for entry in batch.entries.values())
     done = counts[JobState.FINISHED] + counts[JobState.KEPT]
     parts = [f"{done} of {len(batch.entries)} jobs finished"]
     for state in (JobState.RUNNING, JobState.FAILED, JobState.BLOCKED, JobState.CANCELLED):
         parts += [f"{counts[state]} {state}"] if counts[state] else []
-    left = seconds_left(batch.entries.values(), now)
+    left = seconds_left(batch.entries.values())
     return ", ".join(parts) + (f"; about {format_duration(left)} left" if left else "")
 
 
-def seconds_left(entries: Iterable[Entry], now: float) -> float | None:
+def seconds_left(entries: Iterable[Entry]) -> float | None:
     """Seconds until the batch is done, if as many jobs run at once as now; None where that is unknown."""
     open_ones = [entry for entry in entries if not entry.state.is_over]
-    each = [entry.left_s(now) for entry in open_ones]
+    each = [entry.left_s for entry in open_ones]
     known = [seconds for seconds in each if seconds is not None]
     if not known:
         return None
-    running = max(1, sum(entry.state == JobState.RUNNING for entry in open_ones))
+    running = max(1, sum(entry.status.seconds > 0 for entry in open_ones))  # others wait in an engine's queue
     total = sum(known) * len(each) / len(known)
     return max(total / running, *known)
 
 
-def _row(entry: Entry, width: int, now: float) -> str:
+def _row(entry: Entry, width: int) -> str:
     name = f"  {entry.job.name:<{width}}"
     if entry.state != JobState.RUNNING:
         return f"{name}  {entry.state}: {entry.error}"
     full = round(BAR_WIDTH * entry.status.progress)
     psnr = entry.status.figures.get("psnr")
-    left = entry.left_s(now)
+    left = entry.left_s
     parts = [
         f"{entry.machine:<12}",
         f"[{'#' * full}{'.' * (BAR_WIDTH - full)}] {entry.status.progress:4.0%}",

@@ -163,7 +163,7 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
             run_batch(batch, engine, lease, table, table.say)
         finally:
             path = write_report(batch)
-            print(f"{summary_line(batch, 0.0)}\nreport: {path}")
+            print(f"{summary_line(batch)}\nreport: {path}")
     failures = batch.failures
     if failures:
         first = failures[0]

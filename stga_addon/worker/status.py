@@ -65,6 +65,7 @@ class WorkerStatus:
     error     one sentence, and the traceback where a bug caused it
     figures   named numbers that depend on the kind of work
     machine   name of the computer
+    seconds   of work so far
     """
 
     state: str = WorkerState.WORKING
@@ -75,6 +76,7 @@ class WorkerStatus:
     traceback: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)
     machine: str = ""
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None)
     status = status or WorkerStatus()
     if state == WorkerState.LOST:
         error = describe_lost_worker(folder, code)
-        status = WorkerStatus(WorkerState.LOST, status.progress, error=error, figures=status.figures)
+        status = replace(status, state=WorkerState.LOST, message="", detail="", error=error)
     return WorkerSnapshot(state, status, tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ())
 
 
@@ -140,11 +142,11 @@ def read_status(folder: Path) -> WorkerStatus | None:
         states = (WorkerState.WORKING, WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
         if status.state not in states or not all(isinstance(text, str) for text in (*texts, machine)):
             return None
-        if not 0 <= status.progress <= 1:
+        if not 0 <= status.progress <= 1 or not 0 <= status.seconds < math.inf:
             return None
     except (StgaError, TypeError, ValueError, AttributeError):
         return None
-    return WorkerStatus(status.state, float(status.progress), *texts, figures, machine)
+    return WorkerStatus(status.state, float(status.progress), *texts, figures, machine, float(status.seconds))
 
 
 def log_lines(folder: Path, count: int) -> list[str]:
@@ -213,6 +215,7 @@ class StatusWriter:
         self.folder = folder
         self.cancel_requested = False
         self._status, self._written_s = WorkerStatus(machine=platform.node()), -math.inf
+        self._began_s = time.monotonic()
 
     def update(
         self, progress: float, message: str, detail: str = "", figures: Callable[[], Mapping[str, float]] = dict
@@ -228,8 +231,9 @@ class StatusWriter:
             progress = min(max(progress, 0.0), 1.0)
             working = WorkerState.WORKING
             self._status = replace(
-                self._status, state=working, progress=progress, message=message, detail=detail, figures=finite
-            )
+                self._status, state=working, progress=progress, message=message, detail=detail, figures=finite,
+                seconds=self._seconds(),
+            )  # fmt: skip
             self._written_s = now
             with suppress(StgaError):  # a missing status stops no work; the work itself reports a full disk
                 write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=0.0)  # the next one comes soon
@@ -237,9 +241,12 @@ class StatusWriter:
 
     def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:
         """Write the final status."""
-        final = replace(self._status, state=state, error=error, traceback=trace)
+        final = replace(self._status, state=state, error=error, traceback=trace, seconds=self._seconds())
         with suppress(StgaError):  # `inspect_worker` reports a worker that is gone
             write_json(self.folder / STATUS_FILE, asdict(final))
+
+    def _seconds(self) -> float:
+        return round(time.monotonic() - self._began_s, 3)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch.identity import _input_digest, job_digest
+from stga_addon.batch.identity import job_digests
 from stga_addon.batch.plan import Plan, make_plan, plan_of_captures, read_plan
 from stga_addon.driving.open_motion import MotionOptions
 from stga_addon.errors import StgaError
@@ -107,6 +107,18 @@ def test_captures_make_a_plan(base: Path) -> None:
     assert (request.run, request.capture, request.device) == (base / "out/train-ben", captures[1], "cpu")
 
 
+def test_names_of_captures(base: Path) -> None:
+    """Catches captures that cannot be trained together because of how their folders are called."""
+    folders = ["anna/take", "ben/take", "_anna", "_é_ben", "film/東京", "film/大阪", "c 1"]
+    for name in folders:
+        (base / name).mkdir(parents=True)
+    plan = plan_of_captures([base / name for name in folders], base / "out", {"preset": "draft"}, {})
+    names = ["anna-take", "ben-take", "anna", "ben", "film", "film_2", "c-1"]
+    assert {job.name: job.request.capture for job in plan.jobs} == {
+        f"train-{name}": base / folder for name, folder in zip(names, folders, strict=True)
+    }
+
+
 ONE = '[job.one]\nrequest = "train"\ncapture = "footage/anna"\nsettings = { iterations = 3 }\n'
 MISTAKES = {
     "out = 3\n" + ONE: "out: expected the batch's folder",
@@ -121,6 +133,7 @@ MISTAKES = {
     'out = "r"\n' + ONE + 'device = "abacus"\n': r"\[job.one\]: device: expected auto, cpu, gpu",
     'out = "r"\n' + ONE + "flame = 3\n": r"\[job.one\]: flame: expected a path",
     'out = "r"\n' + ONE + "flame = 1979-05-27\n": r"\[job.one\]: flame: expected a path",
+    'out = "footage/anna"\n' + ONE: r"\[job.one\]: capture: .*anna is the batch's own folder; choose another 'out'",
     'out = "r"\n' + ONE + 'flame = "none.pkl"\n': r"\[job.one\]: flame: .*none.pkl does not exist",
     'out = "r"\n' + ONE.replace("iterations = 3", "iterations = 0"): r"\[job.one\]: settings.iterations: expected",
     'out = "r"\n' + ONE.replace("iterations = 3", "iterations = inf"): r"\[job.one\]: settings.iterations",
@@ -161,14 +174,6 @@ def test_jobs_that_wait_for_each_other_by_path(base: Path) -> None:
         plan_of(base, 'out = "r"\n' + table.format("a", "b") + table.format("b", "a"))
 
 
-def digests(plan: Plan) -> dict[str, str]:
-    _input_digest.cache_clear()
-    jobs, found = {job.name: job for job in plan.jobs}, dict[str, str]()
-    for job in plan.jobs:
-        found[job.name] = job_digest(job, jobs, found)
-    return found
-
-
 def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
     assert before.keys() == after.keys()
     return {name for name in before if before[name] != after[name]}
@@ -176,15 +181,15 @@ def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
 
 def test_what_changed_is_done_again(base: Path) -> None:
     """Catches work that is repeated although nothing changed, and results of old inputs or settings that are kept."""
-    before = digests(plan_of(base))
-    assert changed(before, digests(plan_of(base, PLAN.replace("threads = 2", "threads = 1")))) == set()
+    before = job_digests(plan_of(base))
+    assert changed(before, job_digests(plan_of(base, PLAN.replace("threads = 2", "threads = 1")))) == set()
     (base / "footage/ben/take.mp4").write_text("new")
     bens = {name for name in before if "ben" in name}
-    assert changed(before, digests(plan_of(base))) == bens
+    assert changed(before, job_digests(plan_of(base))) == bens
     (base / "footage/ben/take.mp4").unlink()
     (base / "footage/anna/.cache").touch()  # hidden
-    assert changed(before, digests(plan_of(base))) == set()
-    after = digests(plan_of(base, PLAN.replace("iterations = 5", "iterations = 6")))
+    assert changed(before, job_digests(plan_of(base))) == set()
+    after = job_digests(plan_of(base, PLAN.replace("iterations = 5", "iterations = 6")))
     assert changed(before, after) == {name for name in before if name.startswith("smile")}
 
 
@@ -195,11 +200,11 @@ def test_a_run_counts_by_its_content(base: Path) -> None:
     for name in ("run.json", "avatar.npz"):
         (run / name).write_text("1")
     values: dict[str, Any] = {"out": "r", "job": {"a": {"request": "evaluate", "run": "run"}}}
-    before = digests(make_plan(values, base, "plan"))
+    before = job_digests(make_plan(values, base, "plan"))
     (run / "quality_val.json").touch()
-    assert changed(before, digests(make_plan(values, base, "plan"))) == set()
+    assert changed(before, job_digests(make_plan(values, base, "plan"))) == set()
     (run / "avatar.npz").write_text("2")
-    assert changed(before, digests(make_plan(values, base, "plan"))) == {"a"}
+    assert changed(before, job_digests(make_plan(values, base, "plan"))) == {"a"}
 
 
 def test_texts_that_name_files(base: Path) -> None:
@@ -223,10 +228,10 @@ sweep = { region = ["mouth", "brow.JSON"] }
     jobs = {job.name: job.request for job in plan_of(base, text).jobs}
     assert [jobs[f"track-{name}"].mattes for name in ("none", "mattes")] == ["none", str(base / "mattes")]
     assert [jobs[f"refine-{name}"].region for name in ("mouth", "brow.JSON")] == ["mouth", str(base / "brow.JSON")]
-    before = digests(plan_of(base, text))
+    before = job_digests(plan_of(base, text))
     (base / "brow.JSON").write_text("{ }")
     (base / "mattes/0.png").touch()
-    assert changed(before, digests(plan_of(base, text))) == {"track-mattes", "refine-brow.JSON"}
+    assert changed(before, job_digests(plan_of(base, text))) == {"track-mattes", "refine-brow.JSON"}
     (base / "brow.JSON").unlink()
     with pytest.raises(StgaError, match=r"\[job.refine\]: region: .*brow.JSON does not exist"):
         plan_of(base, text)

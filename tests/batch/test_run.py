@@ -14,16 +14,18 @@ from typing import Any
 import pytest
 
 from stga_addon.batch import lease as leases
+from stga_addon.batch.engine import Ended
+from stga_addon.batch.engines import local
 from stga_addon.batch.engines.local import LocalEngine
-from stga_addon.batch.folder import is_done
+from stga_addon.batch.folder import is_done, prepare, read_record
 from stga_addon.batch.job import Job, Resources
 from stga_addon.batch.lease import LEASE, hold_folder
 from stga_addon.batch.plan import make_plan
 from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.batch.table import plan_lines, table_lines
 from stga_addon.errors import StgaError
-from stga_addon.requests.values import RenderBlend
-from stga_addon.worker.status import WorkerState
+from stga_addon.requests.values import ConvertMotion, RenderBlend
+from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, inspect_worker
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
 
@@ -55,15 +57,34 @@ def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) ->
     carry_out(plan, third)
     assert third.submitted == ["look-00001", "again-00001", "last"]
     (tmp_path / "capture/new.png").touch()
-    from stga_addon.batch.identity import _input_digest
-
-    _input_digest.cache_clear()
     fourth = SimulatedEngine(takes_all=takes_all)
     _, said = carry_out(plan, fourth)
     assert len(fourth.submitted) == len(plan.jobs)
     moved = tmp_path / "runs/replaced/look-00001"
     assert f"look-00001: has changed; what it wrote before is in {moved}" in said
     assert (moved / "job/request.json").exists()
+
+
+def test_a_batch_that_writes_into_what_it_reads(tmp_path: Path) -> None:
+    """Catches jobs that are never finished, because what they write changes what they read."""
+
+    def outcome(job: Job) -> tuple[WorkerState, str]:
+        if isinstance(job.request, ConvertMotion):
+            job.request.output.touch()
+        return WorkerState.FINISHED, ""
+
+    (tmp_path / "capture").mkdir()
+    look = {"request": "analyze", "capture": "capture"}
+    face = {"request": "convert-motion", "source": "capture", "output": str(tmp_path / "capture/face.csv")}
+    plan = make_plan({"out": "capture/runs", "job": {"look": look, "face": face}}, tmp_path, "plan")
+    for submitted in (["look", "face"], [], ["look", "face"]):
+        if not submitted:
+            assert (tmp_path / "capture/face.csv").exists()
+        elif (tmp_path / "capture/runs").exists():
+            (tmp_path / "capture/new.png").touch()
+        engine = SimulatedEngine(outcome)
+        carry_out(plan, engine)
+        assert engine.submitted == submitted
 
 
 def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
@@ -126,6 +147,31 @@ def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
     assert states(batch)["look-00001"] == JobState.FAILED
     assert "Worker exited unexpectedly" in batch.entries["look-00001"].error
     assert Counter(engine.submitted) == {"look-00000": 3, "look-00001": 1 + MAX_RETRIES, "look-00002": 1}
+
+
+@pytest.mark.parametrize("takes_all", [False, True])
+def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
+    """Catches times and forecasts that grow with a cluster's queue, and with the pauses of a batch."""
+    queue_s, work_s, waited = 0.8, 0.2, []
+
+    class Queued(SimulatedEngine):
+        def running(self) -> dict[str, str]:
+            return {}
+
+        def end(self, job: Job) -> Ended:
+            waited.append(time.sleep(queue_s))
+            writer = StatusWriter(job.request_folder)
+            time.sleep(work_s)
+            writer.update(0.5, "Working")
+            writer.finish(WorkerState.FINISHED)
+            return Ended(inspect_worker(job.request_folder))
+
+    batch, _ = carry_out(empty_jobs(tmp_path, 1), Queued(takes_all=takes_all))
+    (entry,) = batch.entries.values()
+    record = read_record(entry.job)
+    assert record is not None
+    assert len(waited) == 1
+    assert work_s <= record.seconds == round(entry.seconds, 3) < queue_s
 
 
 def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
@@ -191,6 +237,28 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
     assert not engine.has_room(job("b", gpu=True))
 
 
+@pytest.mark.parametrize(
+    ("windows", "ending", "is_lost"),
+    [(False, "kill -9 $$", True), (False, "exit 1", False), (True, "exit 1", True), (True, "exit 2", False)],
+)
+def test_a_killed_worker_is_told_from_a_mistake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, windows: bool, ending: str, is_lost: bool
+) -> None:
+    """Catches a killed worker that is not tried again on Windows, where a kill is an exit status like others."""
+    monkeypatch.setattr(local, "IS_WINDOWS", windows)
+    python = tmp_path / "python"
+    python.write_text(f"#!/bin/sh\n{ending}\n")
+    python.chmod(0o755)
+    (job,) = empty_jobs(tmp_path, 1).jobs
+    prepare(job, "digest", 0.0)
+    engine = LocalEngine(1, 1.0, str(python))
+    engine.submit([job])
+    while not (ended := engine.ended()):
+        time.sleep(0.01)
+    assert ended[job.name].snapshot.state == WorkerState.LOST
+    assert ended[job.name].is_lost == is_lost
+
+
 def test_tables(tmp_path: Path) -> None:
     """Catches a table whose counts, shares or minutes are not those of the jobs."""
     plan = empty_jobs(tmp_path, 30)
@@ -200,10 +268,11 @@ def test_tables(tmp_path: Path) -> None:
     entries = list(batch.entries.values())
     for number, entry in enumerate(entries):
         entry.state = JobState.FINISHED if number < 20 else JobState.RUNNING if number < 24 else JobState.FAILED
+        entry.status = WorkerStatus(seconds=10.0)
     running = entries[20]
-    running.began_s, running.machine = 100.0, "node7"
-    running.status = type(running.status)(progress=0.25, message="Training", figures={"psnr": 31.25})
-    lines = table_lines(batch, 130.0)
+    running.machine = "node7"
+    running.status = WorkerStatus(progress=0.25, message="Training", figures={"psnr": 31.25}, seconds=30.0)
+    lines = table_lines(batch)
     assert lines[0].startswith("20 of 30 jobs finished, 4 running, 6 failed; about 90 s left")
     assert "node7" in lines[1]
     assert "[#####...............]  25%  31.25 dB  90 s left  Training" in lines[1]

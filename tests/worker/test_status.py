@@ -9,7 +9,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -291,13 +293,18 @@ def test_damaged_status_is_ignored(tmp_path, text):
     assert inspect_worker(tmp_path).state == WorkerState.NONE
 
 
-def test_status_round_trip(tmp_path):
+def test_status_round_trip(tmp_path, monkeypatch):
     """Catches a field that is lost between worker and panel."""
-    expected = WorkerStatus(WorkerState.WORKING, 0.25, "training", "enough", "", "", {"psnr": 30.5}, platform.node())
+    figures, machine = {"psnr": 30.5}, platform.node()
+    expected = WorkerStatus(WorkerState.WORKING, 0.25, "training", "enough", "", "", figures, machine, 0.25)
+    now = 100.0
+    monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))
     with status_writer(tmp_path) as writer:
-        writer.update(0.25, "training", "enough", lambda: {"psnr": 30.5})
+        now += 0.25
+        writer.update(0.25, "training", "enough", lambda: figures)
         assert read_status(tmp_path) == expected
-    assert read_status(tmp_path) == WorkerStatus(**{**vars(expected), "state": WorkerState.FINISHED})
+        now += 1
+    assert read_status(tmp_path) == replace(expected, state=WorkerState.FINISHED, seconds=1.25)
 
 
 def test_status_is_written_rarely(tmp_path, monkeypatch):

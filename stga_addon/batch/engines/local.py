@@ -1,6 +1,7 @@
 """Engine of this machine: as many workers at once as its processors and memory allow."""
 
 import math
+import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,8 @@ MEMORY_SHARE = 0.9
 """Share of the memory that is free at the start that workers may use."""
 GPUS = 1
 """Jobs at once that need a GPU to themselves."""
+IS_WINDOWS = os.name == "nt"
+"""There, a kill is an exit status like others: 1 by the task manager."""
 
 
 class LocalEngine:
@@ -63,7 +66,7 @@ class LocalEngine:
             snapshot = inspect_worker(job.request_folder, process)
             if not snapshot.state.is_alive:
                 del self._jobs[name]
-                found[name] = Ended(snapshot, process is None or (process.returncode or -1) < 0)
+                found[name] = Ended(snapshot, process is None or _is_kill(process.returncode))
         return found
 
     def withdraw(self) -> Sequence[str]:
@@ -71,6 +74,11 @@ class LocalEngine:
 
     def close(self) -> None:
         """Workers go on; nothing is held."""
+
+
+def _is_kill(code: int | None) -> bool:
+    """Whether an exit status, of a worker without a final status, is that of a kill; a mistake's is 2, a bug's 1."""
+    return not code or code < 0 or (IS_WINDOWS and code != 2)
 
 
 def make_local(address: str) -> LocalEngine:
