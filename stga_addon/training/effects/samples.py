@@ -15,7 +15,7 @@ from ...capture.model import Capture, View, evenly_spread
 MAX_VIEWS = 48
 MAX_TIMESTEPS = 12
 MAX_FACES = 3000
-"""More of each would change no decision, and take more than a few seconds."""
+"""More of each would change no decision, and take more than a few seconds; of more cameras, each gives one view."""
 SAMPLED_HEIGHT_PIXELS = 400
 """Images at least half as high again are shrunk to this height: triangles are then two or three pixels wide."""
 MIN_NEAR_DEPTH_M = 0.01
@@ -75,21 +75,22 @@ class Samples:
 
 
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
-    """At most MAX_VIEWS of them: timesteps evenly spread, cameras about equally often."""
+    """MAX_VIEWS of them, or one of each camera where that is more: timesteps evenly spread, cameras equally often."""
     timesteps = evenly_spread(sorted({view.timestep for view in views}), MAX_TIMESTEPS)
     rng = np.random.default_rng(seed)
     left: dict[int, list[View]] = {t: [view for view in views if view.timestep == t] for t in timesteps}
     used = dict.fromkeys((view.camera_index for view in views), 0)
     chosen: list[View] = []
-    while len(chosen) < MAX_VIEWS and any(left.values()):
+    count = max(MAX_VIEWS, len(used))
+    while len(chosen) < count and any(left.values()):
         for timestep in rng.permutation(timesteps).tolist():
-            if left[timestep] and len(chosen) < MAX_VIEWS:
+            if left[timestep] and len(chosen) < count:
                 shuffled = [left[timestep][n] for n in rng.permutation(len(left[timestep]))]
                 view = min(shuffled, key=lambda view: used[view.camera_index])
                 left[timestep].remove(view)
                 used[view.camera_index] += 1
                 chosen.append(view)
-    return chosen
+    return [*chosen, *{view.camera_index: view for view in views if not used[view.camera_index]}.values()]
 
 
 def take_samples(capture: Capture, seed: int = 0) -> Samples:

@@ -412,6 +412,18 @@ def test_views_are_spread():
     assert len(sample_views(few)) == 3
 
 
+def test_every_camera_is_sampled(painted):
+    """Catches cameras without exposure: those beyond the sampled views, and one that films where no timestep is."""
+    views = [SimpleNamespace(timestep=t, camera_index=c) for t in range(20) for c in range(3 * MAX_VIEWS)]
+    late = [view for view in views if view.camera_index != 7 or view.timestep == 4]
+    for given in (views, late):
+        chosen = [view.camera_index for view in sample_views(given)]
+        assert set(chosen) == set(range(3 * MAX_VIEWS))
+        assert len(chosen) <= 3 * MAX_VIEWS + 1
+    capture = painted(cameras=MAX_VIEWS + 12, timesteps=1, deformed=0.0)
+    assert len(CaptureFacts(capture, make_settings(iterations=5)).camera_colors.camera) == MAX_VIEWS + 12
+
+
 def test_two_cameras_that_are_alike(painted):
     """Catches a fit that explains noise by cameras."""
     samples = take_samples(painted())
