@@ -269,6 +269,15 @@ def test_the_benchmark_shows_what_the_old_take_pays(benchmark: Any) -> None:
     assert rows[3] == ["anew", "+4.00", "+6.00", "-0.50", "-2.00"]
 
 
+def test_the_benchmark_shows_what_there_is(benchmark: Any) -> None:
+    """Catches a measurement that is lost after its trainings, where nothing moves and where only `anew` was asked."""
+    first = {"psnr": 30.0, "psnr_take_1": 30.0, "psnr_take_2": 30.0, "seconds": 0.0, "iterations": 0}
+    ends = [first, {"psnr": 40.0, "psnr_take_1": 40.0, "psnr_take_2": 40.0, "seconds": 2.0, "iterations": 9}]
+    assert benchmark.table({"extend": [ends], "all-in-turn": [ends]})[2] == "| before |  |  | 30.00 | 30.00 |  |"
+    assert "| extend | +10.00 | +10.00 |" in benchmark.differences({"extend": [ends]})
+    assert [row.split()[1] for row in benchmark.table({"anew": [ends]})] == ["arm", "---", "anew"]
+
+
 def in_millimeters(root: Path, cameras: bool, meshes: bool = False) -> Path:
     """The take with its cameras, and its tracked but not its neutral meshes, in millimeters."""
     for path in sorted(root.glob("transforms_*.json")) if cameras else ():
