@@ -69,8 +69,8 @@ repository: .venv/ready
 .venv/ready: pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --editable '.[dev]'
-	# Without dependencies: most are for other tasks than landmarks, and its OpenCV needs a display's libraries.
-	$(BIN)/pip install --quiet --no-deps "mediapipe==0.10.21; python_version < '3.13'"
+	# Without dependencies: it lists numpy 2, and runs with numpy 1.26 too.
+	$(BIN)/pip install --quiet --no-deps opencv-python-headless==4.14.0.94
 	touch $@
 
 clean:

@@ -43,8 +43,6 @@ def _run(arguments: list[str]) -> int:
         command = options.command
         if command == "environment":
             _prepare_environment_command(options)
-        if getattr(options, "download_detector", False) and not bpy.app.online_access:
-            raise StgaError("Blender is offline: start it with --online-mode, or leave out --download-detector")
         if command in IN_BLENDER:
             return main(arguments, head)
         if command == "avatar":

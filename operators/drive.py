@@ -79,7 +79,6 @@ class DriveOptions:
     mirror: bpy.props.BoolProperty(name="Mirror", description="Exchange left and right, as a mirror does")
     exchange_jaw: exchange_property("jaw")
     exchange_mouth: exchange_property("mouth")
-    detector: path_property("Detector", "Google's face_landmarker.task, which detects the shapes in a video")
     takes: path_property(
         "Takes",
         "Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",

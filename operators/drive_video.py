@@ -10,7 +10,7 @@ from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import ConvertMotion
 from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES, is_video
 from . import ids
-from .common import FileImport, file_filter, file_path, needs_rig_or_shapes, reporting, scene_settings
+from .common import FileImport, file_filter, file_path, needs_rig_or_shapes, reporting
 from .drive import takes_folder
 from .request import needs_idle, start
 from .training_python import training_python
@@ -35,17 +35,9 @@ class DriveVideo(bpy.types.Operator, FileImport):
         video = file_path(self.filepath, "video")
         if not is_video(video):
             raise StgaError(f"{video}: is no video; expected {', '.join(VIDEO_SUFFIXES)}")
-        task = scene_settings(context).drive.detector
-        if not task:
-            raise StgaError(
-                "Drive from Video: needs Google's face_landmarker.task, which `stga drive --download-detector` "
-                "downloads; give the file in the Drive panel"
-            )
         folder, _ = takes_folder(context)
         output = _free_path(folder, video.stem)
-        start(
-            context.scene, ConvertMotion(video, output, detector=file_path(task, "detector")), training_python(context)
-        )
+        start(context.scene, ConvertMotion(video, output), training_python(context))
         return {"FINISHED"}
 
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.environment_make import PYPI_SIZE_GB, SIZE_GB, TRACKING_GB, make_arguments
+from ..stga_addon.requests.environment_make import PYPI_SIZE_GB, SIZE_GB, make_arguments
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.worker.own_python import own_python
 from . import ids
@@ -27,11 +27,6 @@ class MakeEnvironment(bpy.types.Operator):
     wheels: path_property(
         "Wheels", "Folder of wheel files to install from without a network; empty: download them", "DIR_PATH"
     )
-    tracking: bpy.props.BoolProperty(
-        name="Tracking",
-        description="With the landmark detector that tracks heads in footage: MediaPipe. Python 3.11 or 3.12 brings "
-        "its network; newer ones need Google's face_landmarker.task",
-    )
     python: bpy.props.StringProperty(
         name="Python",
         description="Python 3.11 or newer to make the environment from; empty: Blender's own",
@@ -50,10 +45,10 @@ class MakeEnvironment(bpy.types.Operator):
     def draw(self, context: Any) -> None:
         layout = self.layout
         layout.use_property_split = True
-        for name in ("tracking", "wheels", "python"):
+        for name in ("wheels", "python"):
             layout.prop(self, name)
         column = layout.column(align=True)
-        column.label(text=f"Takes about {SIZE_GB + self.tracking * TRACKING_GB:.1f} GB in")
+        column.label(text=f"Takes about {SIZE_GB:.1f} GB in")
         column.label(text=str(environment_folder()))
         if not self.wheels and sys.platform == "linux":
             column.label(text=f"Where pytorch.org cannot be reached: {PYPI_SIZE_GB:.1f} GB")
@@ -71,4 +66,4 @@ class MakeEnvironment(bpy.types.Operator):
             raise StgaError(f"{wheels}: is not a folder; expected one of wheel files")
         folder = environment_folder(create=True)
         base = bpy.path.abspath(self.python) if self.python else own_python()
-        return run_environment_worker(self, folder, make_arguments(folder, base, wheels, self.tracking))
+        return run_environment_worker(self, folder, make_arguments(folder, base, wheels))

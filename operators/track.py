@@ -30,7 +30,6 @@ class TrackOptions:
         "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb); empty: the active object's shape keys",
     )
     directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
-    detector: path_property("Detector", "Google's face_landmarker.task; empty: the network that comes with mediapipe")
     focal: bpy.props.FloatProperty(
         name="Focal Length", description="In pixels, of a single camera without calibration; 0: a guess", min=0.0
     )
@@ -89,7 +88,6 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
             out,
             optional(self.cameras, "cameras"),
             optional(self.landmarks, "landmarks"),
-            optional(self.detector, "detector"),
             self.focal or None,
             self.start,
             self.stop or None,

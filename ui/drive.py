@@ -48,7 +48,6 @@ class DrivePanel(SidebarPanel, bpy.types.Panel):
         layout.prop(settings, "takes")
         if not draw_running(layout, context, Kind.PERFORMANCE):
             layout.operator(ids.DRIVE_VIDEO, text="From a Video of a Face", icon="FILE_MOVIE")
-            layout.prop(settings, "detector")
 
 
 def _draw_source(layout: Any, context: Any, settings: Any) -> None:

@@ -52,7 +52,7 @@ class TrackOptionsPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         settings = scene_settings(context).track
-        for name in ("start", "stop", "step", "focal", "detector", "mattes"):
+        for name in ("start", "stop", "step", "focal", "mattes"):
             self.layout.prop(settings, name)
         if settings.mattes == "folder":
             self.layout.prop(settings, "matte_folder")

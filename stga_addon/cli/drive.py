@@ -6,7 +6,6 @@ from ..requests.open_head import OpenHead
 from ..requests.values import ConvertMotion
 from .arguments import frame_rate, usable_path
 from .carry_out import carry_out
-from .inputs import add_detector, provide_detector
 from .motion import add_motion_options, motion_options
 
 NAME, HELP = "drive", "convert a face performance (ARKit's 52 shapes) to a FLAME motion, or a motion to a CSV of shapes"
@@ -32,13 +31,9 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         "--head", type=usable_path, metavar="CAPTURE", dest="of", help="whose identity (default: average)"
     )
     parser.add_argument("--fps", type=frame_rate, help="frames per second of the result (default: as recorded)")
-    add_detector(parser)
     add_motion_options(parser)
 
 
 def run(options: Namespace) -> None:
-    provide_detector(options)
     chosen = motion_options(options)
-    carry_out(
-        ConvertMotion(options.source, options.out, options.flame, options.of, options.fps, chosen, options.detector)
-    )
+    carry_out(ConvertMotion(options.source, options.out, options.flame, options.of, options.fps, chosen))

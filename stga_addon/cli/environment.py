@@ -41,7 +41,6 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 def _add_make(actions: Any) -> None:
     make = actions.add_parser("make", help="make an environment with PyTorch, and use it")
     make.add_argument("--wheels", type=usable_path, metavar="FOLDER", help="wheel files, to install without a network")
-    make.add_argument("--tracking", action="store_true", help="with the landmark detector that `stga track` needs")
     make.add_argument("--python", default=sys.executable, metavar="PATH", help="Python 3.11 or newer to make it from")
 
 
@@ -81,7 +80,7 @@ def _make(folder: Path, options: Namespace) -> str:
     wheels = options.wheels and options.wheels.absolute()
     from ..requests.environment_make import make_arguments  # which not every edition has
 
-    making = make_arguments(folder, options.python, wheels, options.tracking)
+    making = make_arguments(folder, options.python, wheels)
     worker = start_worker(status, sys.executable, making)
     try:
         while worker.poll() is None:

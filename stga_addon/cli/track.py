@@ -9,7 +9,6 @@ from ..requests.open_head import OpenHead
 from ..requests.values import MATTES, SYNC, WORLDS, Track
 from .arguments import real_number, usable_path, whole_number
 from .carry_out import carry_out
-from .inputs import add_detector, provide_detector
 
 NAME, HELP = "track", "track a head through footage, and write a capture"
 
@@ -30,9 +29,7 @@ def add_footage(parser: ArgumentParser) -> None:
         help="FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb)",
     )
     parser.add_argument("--cameras", type=usable_path, metavar="FILE", help="calibration that is not in FOOTAGE")
-    points = parser.add_mutually_exclusive_group()
-    points.add_argument("--landmarks", type=usable_path, metavar="FOLDER", help="landmark files of another detector")
-    add_detector(parser, points)
+    parser.add_argument("--landmarks", type=usable_path, metavar="FOLDER", help="landmark files of another detector")
     parser.add_argument("--focal", type=real_number, metavar="PIXELS", help="focal length of a single camera")
     parser.add_argument("--start", type=whole_number(0), default=0, help="first timestep")
     parser.add_argument("--stop", type=whole_number(1), help="timestep to stop before")
@@ -73,11 +70,9 @@ def run(options: Namespace) -> None:
 
 
 def tracking_request(options: Namespace, out: Path) -> Track:
-    """What `add_footage`'s options ask for, into the folder `out`. Raises StgaError where the detector that is to be
-    downloaded has no file."""
-    provide_detector(options)
+    """What `add_footage`'s options ask for, into the folder `out`."""
     return Track(
-        options.footage, options.model, out, options.cameras, options.landmarks, options.detector, options.focal,
+        options.footage, options.model, out, options.cameras, options.landmarks, options.focal,
         options.start, options.stop, options.step, dict(options.offset), options.meshes,
         options.world, options.sync, options.mattes,
     )  # fmt: skip

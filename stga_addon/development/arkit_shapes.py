@@ -1,7 +1,6 @@
 """Makes `driving/arkit_shapes.npz`: what ARKit's shapes do to 478 points of ICT-FaceKit's face.
 
-python -m stga_addon.development.arkit_shapes ict_facekit_light.npz, where mediapipe 0.10.21 is installed. The input
-holds the light model's neutral (V, 3) in centimeters, tris (F, 3), expr (57, V, 3) with expr_names, ident (20, V, 3).
+python -m stga_addon.development.arkit_shapes ict_facekit_light.npz. The input holds the light model's neutral (V, 3) in centimeters, tris (F, 3), expr (57, V, 3) with expr_names, ident (20, V, 3).
 """
 
 import sys
@@ -13,7 +12,7 @@ from ..driving.names import ARKIT_SHAPES, OPTIONAL
 from ..driving.shapes import SHAPES_FILE
 from ..files import read_npz, write_npz
 from ..tracking.correspondence import calibrate
-from ..tracking.detectors import make_detector
+from ..tracking.face_networks import FaceNetworks
 from ..tracking.head_model import linear_model
 
 METERS_PER_UNIT = 0.01
@@ -26,7 +25,7 @@ def main(source: Path) -> None:
     arrays = read_npz(source)
     neutral, faces = METERS_PER_UNIT * arrays["neutral"].astype(np.float64), arrays["tris"]
     model = linear_model(source, {"mean": neutral, "faces": faces, "expression": np.zeros((*neutral.shape, 1))})
-    places, reliable = calibrate(model, make_detector(), str(source))
+    places, reliable = calibrate(model, FaceNetworks(), str(source))
 
     def at_points(values: np.ndarray) -> np.ndarray:
         return places.on(METERS_PER_UNIT * values.astype(np.float64), faces)

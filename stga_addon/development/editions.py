@@ -12,7 +12,6 @@ from typing import Any
 from .wheels import Target
 
 INSTALLER_FILES = ("/operators/make_environment.py", "/stga_addon/requests/environment_make.py")
-DOWNLOADER_FILES = ("/stga_addon/tracking/detector_file.py",)
 DEMO_FOLDER = "demo_capture"
 
 
@@ -35,12 +34,11 @@ class Edition:
 FILES_PERMISSION = "Read captures and FLAME models, write avatars and renderings"
 LIVE_PERMISSION = "Receive faces live, only when asked to"
 DOWNLOAD_PERMISSION = "Receive faces live, download PyTorch; only when asked to"
-DETECTOR_PERMISSION = "Receive faces live, download a face detector; only when asked to"
 
 SMALL = Edition(permissions={"files": FILES_PERMISSION, "network": DOWNLOAD_PERMISSION})
 PLATFORM = Edition(
     suffix="-platform",
-    left_out=(*INSTALLER_FILES, *DOWNLOADER_FILES),
+    left_out=INSTALLER_FILES,
     permissions={"files": FILES_PERMISSION, "network": LIVE_PERMISSION},
 )
 
@@ -50,7 +48,7 @@ def complete(target: Target) -> Edition:
     return Edition(
         suffix=f"-{target.name}",
         left_out=INSTALLER_FILES,
-        permissions={"files": FILES_PERMISSION, "network": DETECTOR_PERMISSION},
+        permissions={"files": FILES_PERMISSION, "network": LIVE_PERMISSION},
         target=target,
     )
 

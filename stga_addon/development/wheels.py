@@ -54,6 +54,7 @@ PINS = {
     "": (
         "filelock==4.2.11", "trimesh==5.2.0", "tqdm==4.70.1", "torch==2.13.0", "numba==0.68.1", "llvmlite==0.50.0",
         "pillow==13.0.0", "platformdirs==4.14.7", "av==18.1.0", "wgpu==0.32.0",
+        "opencv-python-headless==4.14.0.94",
     ),
     # The last that run with numpy 1.24, which Blender 4.2 and 4.3 bring.
     "3.11": ("scipy==1.15.3", "matplotlib==3.10.8", "contourpy==1.3.2"),

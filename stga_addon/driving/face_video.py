@@ -1,4 +1,4 @@
-"""A performance from a video of a face: the blend shapes of MediaPipe's face landmarker, frame by frame."""
+"""A performance from a video of a face: the scores of the face networks, frame by frame."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,14 +8,18 @@ import numpy as np
 from ..errors import StgaError
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..progress import Cancelled, Progress, Report
-from ..tracking.detectors import FaceLandmarker
+from ..tracking.face_networks import FaceNetworks
 from ..tracking.footage.video import VideoFrames, read_video
 from .inverse import head_angles
 from .names import COLUMN, COUNT, arkit_name
 from .performance import Performance
+from .shapes import face_shapes
+
+CAMERA_FIELD_OF_VIEW_DEG = 63.0
+"""Vertical, of a camera of which nothing is known, as MediaPipe supposes it."""
 
 
-def watched_performance(path: Path, scorer: FaceLandmarker, report: Report) -> Performance:
+def watched_performance(path: Path, report: Report) -> Performance:
     """The performance of the face in a video; frames without a face leave gaps.
 
     The head's rotation is relative to that of the first frame with a face, since the camera may look from anywhere.
@@ -26,16 +30,18 @@ def watched_performance(path: Path, scorer: FaceLandmarker, report: Report) -> P
     if not video.fps > 0:
         raise StgaError(f"{path}: states no frame rate")
     frames = VideoFrames(video, dict(zip(video.timesteps, range(len(video.timesteps)), strict=True)))
+    networks = FaceNetworks()
     times, rows, rotations = [], [], []
     for number, timestep in enumerate(frames.timesteps):
         if report(Progress(number / len(frames.timesteps), "Detecting the face")):
             frames.close()
             raise Cancelled(f"{path}: cancelled")
-        found = scorer.score(frames.image(timestep))
+        image = frames.image(timestep)
+        found = networks.score(image)
         if found is not None:
             times.append(timestep / video.fps)
             rows.append(_weights(found.weights))
-            rotations.append(found.rotation)
+            rotations.append(head_rotation(found.points, (image.shape[0], image.shape[1])))
     if not rows:
         raise StgaError(f"{path}: no face was found in any of its {len(frames.timesteps)} frames")
     turned = np.stack(rotations) @ rotations[0].T
@@ -51,3 +57,21 @@ def _weights(scores: Mapping[str, float]) -> np.ndarray:
         if known is not None:
             weights[COLUMN[known]] = score
     return weights
+
+
+def head_rotation(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """The head's rotation (3, 3) from landmarks (478, 3) in pixels of an image of `size` (H, W).
+
+    It takes a face that looks along +z, with y up and its own left at +x, to the camera's x right,
+    y up and z towards the face: the least-squares rotation of the average face onto the landmarks,
+    which a camera of CAMERA_FIELD_OF_VIEW_DEG spreads with their distance.
+    """
+    shapes = face_shapes()
+    height, width = size
+    focal = height / 2 / np.tan(np.radians(CAMERA_FIELD_OF_VIEW_DEG) / 2)
+    distance = focal + points[:, 2] - points[:, 2].mean()
+    offset = (points[:, :2] - [width / 2, height / 2]) * (distance / focal)[:, None]
+    seen = np.column_stack([offset * [1, -1], -distance])[shapes.reliable]
+    face = shapes.points[shapes.reliable]
+    left, _, right = np.linalg.svd((seen - seen.mean(0)).T @ (face - face.mean(0)))
+    return np.asarray(left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right)

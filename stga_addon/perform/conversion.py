@@ -10,7 +10,6 @@ from ..driving.face_video import watched_performance
 from ..driving.head_map import person_of
 from ..driving.inverse import captured_performance, write_performance
 from ..driving.open_motion import NEEDS_FLAME, MotionOptions, adapted, performed, prepared_performance
-from ..driving.performance import Performance
 from ..driving.read_performance import is_performance, read_performance
 from ..errors import StgaError
 from ..export.playback import playback_fps
@@ -20,7 +19,6 @@ from ..flame.teeth import flame_model
 from ..progress import Progress, Report, Say
 from ..requests.results import Written
 from ..requests.values import SHAPES_SUFFIX, ConvertMotion
-from ..tracking.detectors import make_face_scorer
 from ..tracking.footage.file_types import is_video
 from .motion import findings
 
@@ -29,7 +27,7 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     """Write the motion or the performance. Raises StgaError."""
     report(Progress(stage="Converting"))
     if is_video(request.source):
-        performance = _watched(request, report)
+        performance = watched_performance(request.source, report)
     elif is_performance(request.source):
         performance = read_performance(request.source)
     else:
@@ -42,15 +40,6 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     write_motion(request.output, motion.sequence)
     written = f"{request.output}: {len(motion.sequence.timesteps)} timesteps at {motion.fps:g} frames per second"
     return Written(request.output, (*findings(motion), written))
-
-
-def _watched(request: ConvertMotion, report: Report) -> Performance:
-    if request.detector is None:
-        raise StgaError(
-            f"{request.source}: is a video, which needs Google's face_landmarker.task: give it with --detector, or "
-            "download it with --download-detector; or track the video with `stga track` and convert the capture"
-        )
-    return watched_performance(request.source, make_face_scorer(request.detector), report)
 
 
 def _write_shapes(request: ConvertMotion) -> None:

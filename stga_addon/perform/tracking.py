@@ -37,7 +37,7 @@ def perform_tracking(request: Track, report: Report, say: Say) -> Written:
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
     found = track(
-        footage, request.model, request.out, request.landmarks, request.detector, request.meshes, request.world,
+        footage, request.model, request.out, request.landmarks, request.meshes, request.world,
         request.mattes == "auto", steps,
     )  # fmt: skip
     error = f"Reprojection error {found.median_px:.1f} px (median)"

@@ -4,14 +4,13 @@ import importlib
 import json
 import os
 import platform
-from importlib.util import find_spec
 
 from ..worker.requirements import REQUIREMENTS
 
 
 def main() -> None:
     versions, failures = {}, {}
-    for name in (*REQUIREMENTS, *(["mediapipe"] if find_spec("mediapipe") else [])):
+    for name in REQUIREMENTS:
         try:
             versions[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
         except Exception as error:  # a library that fails to load raises what it likes

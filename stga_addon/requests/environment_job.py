@@ -75,9 +75,7 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
         why = next((text for text in failures.values() if not text.startswith("ModuleNotFoundError")), "")
         failed = f" ({why})" if why else ""
         raise StgaError(f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that there")
-    detector = f", mediapipe {versions['mediapipe']}" if "mediapipe" in versions else ""
-    detector = f", mediapipe fails ({failures['mediapipe']})" if "mediapipe" in failures else detector
-    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}{detector}, {report['device']}"
+    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"
 
 
 def check_in_worker(folder: Path, python: str) -> str:

@@ -18,15 +18,13 @@ from pathlib import Path
 from ..errors import StgaError, exit_code
 from ..worker.environment import environment_number, environments, status_folder, venv_python
 from ..worker.environment_use import READY
-from ..worker.requirements import DETECTOR_REQUIREMENTS, GPU_REQUIREMENT, REQUIREMENTS, TRACKING_REQUIREMENTS
+from ..worker.requirements import GPU_REQUIREMENT, REQUIREMENTS
 from ..worker.status import StatusWriter, log_lines, status_writer
 from . import environment_job
 from .environment_job import MIN_PYTHON, remove_unused
 
 SIZE_GB, PYPI_SIZE_GB = 1.5, 6.0
 """Measured size of an environment; and with the CUDA build of torch that PyPI has for Linux."""
-TRACKING_GB = 0.3
-"""Measured size of what tracking needs in addition."""
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 """PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which PyPI has for Linux,
 takes gigabytes. Everything else comes from PyPI, or the mirror that pip is configured for."""
@@ -41,10 +39,9 @@ COMMAND_PREFIX = "$ "
 POLL_INTERVAL_S = 0.2
 
 
-def make_arguments(folder: Path, python: str, wheels: Path | None, tracking: bool = False) -> list[str]:
+def make_arguments(folder: Path, python: str, wheels: Path | None) -> list[str]:
     """What a worker runs after `python -m` for `make_environment`."""
     more = ["--wheels", str(wheels)] if wheels else []
-    more += ["--tracking"] if tracking else []
     return ["stga_addon.requests.environment_make", str(folder), "--python", python, *more]
 
 
@@ -57,12 +54,10 @@ class InstallStep:
     optional: bool = False
 
 
-def install_steps(
-    venv: Path, python: str, wheels: Path | None, system: str = sys.platform, tracking: bool = False
-) -> list[InstallStep]:
+def install_steps(venv: Path, python: str, wheels: Path | None, system: str = sys.platform) -> list[InstallStep]:
     """The commands that make an environment; `wheels` is a folder to install from without a network."""
     pip = [str(venv_python(venv)), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
-    packages = [*REQUIREMENTS.values(), *(TRACKING_REQUIREMENTS if tracking else ())]
+    packages = [*REQUIREMENTS.values()]
     too_old = f"sys.version_info < {MIN_PYTHON} and 'ERROR: Python %d.%d is too old' % sys.version_info[:2]"
     first = [
         InstallStep("Checking the Python version", [python, "-c", f"import sys; sys.exit({too_old})"]),
@@ -73,8 +68,6 @@ def install_steps(
     # A wheel or nothing: its source would have to be built.
     gpu = [*pip, "--only-binary", "wgpu", GPU_REQUIREMENT]
     last = [InstallStep("Installing GPU support", gpu, optional=True)]
-    if tracking:
-        last.append(InstallStep("Installing the landmark detector", [*pip, "--no-deps", *DETECTOR_REQUIREMENTS]))
     if wheels is not None:
         return [*first, InstallStep("Installing from the folder of wheels", [*pip, *packages]), *last]
     torch = [*pip, "--no-deps", "--index-url", TORCH_CPU_INDEX, REQUIREMENTS["torch"]]
@@ -84,22 +77,20 @@ def install_steps(
     return [*first, InstallStep("Installing PyTorch's CPU build", torch, optional=True), rest, *last]
 
 
-def make_environment(folder: Path, python: str, wheels: Path | None = None, tracking: bool = False) -> str:
+def make_environment(folder: Path, python: str, wheels: Path | None = None) -> str:
     """Make an environment in `folder` from the interpreter `python`; returns the line of `check_python`.
-
-    tracking: with what `stga track` needs, the landmark detector included.
 
     It replaces earlier ones once it has passed the check; those that processes run in stay until the next time.
     Cancelled, it leaves nothing behind and returns "". Raises StgaError with the step that failed.
     """
     with status_writer(status_folder(folder)) as writer:
         free = shutil.disk_usage(folder).free / 1e9
-        needed = SIZE_GB + (TRACKING_GB if tracking else 0)
+        needed = SIZE_GB
         if free < needed:
             raise StgaError(f"{folder}: has {free:.1f} GB free, the environment needs {needed:.1f} GB")
         numbers = [environment_number(venv) for venv in environments(folder)]
         venv = folder / f"venv-{max(numbers, default=0) + 1}"
-        steps = install_steps(venv, python, wheels, sys.platform, tracking)
+        steps = install_steps(venv, python, wheels, sys.platform)
         try:
             for number, step in enumerate(steps):
                 if not _run(writer, number / (len(steps) + 1), step):
@@ -155,7 +146,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     top.add_argument("folder", type=Path)
     top.add_argument("--python", default=sys.executable)
     top.add_argument("--wheels", type=Path)
-    top.add_argument("--tracking", action="store_true")
     options = vars(top.parse_args(arguments))
     return exit_code(lambda: print(make_environment(**options)))
 

@@ -149,7 +149,6 @@ class Track:
     out             folder of the capture
     cameras         calibration that is not in the footage's folder
     landmarks       folder of landmark files of another detector
-    detector        MediaPipe's face_landmarker.task
     focal           focal length of a single camera, in pixels
     start, stop, step   timesteps, `stop` excluded
     offset          camera -> frames by which its recording is later
@@ -167,7 +166,6 @@ class Track:
     out: Path
     cameras: Path | None = None
     landmarks: Path | None = None
-    detector: Path | None = None
     focal: float | None = setting(None, above=0)
     start: int = setting(0, 0)
     stop: int | None = setting(None, 1)
@@ -346,7 +344,6 @@ class ConvertMotion:
     flame    FLAME model file of the head
     head     folder of the capture whose identity a performance moves; None: the model's average head
     fps      frames per second of the result; None: as recorded
-    detector MediaPipe's face_landmarker.task, for videos
     """
 
     source: Path
@@ -355,7 +352,6 @@ class ConvertMotion:
     head: Path | None = None
     fps: float | None = setting(None, above=0)
     options: MotionOptions = field(default_factory=MotionOptions)
-    detector: Path | None = None
 
     @property
     def writes_shapes(self) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from ..capture.camera import Camera, look_at
 from ..errors import StgaError
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
-from .detectors import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
+from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
 from .fit import MIN_LANDMARKS
 from .mesh_image import shaded_image
 from .posed_points import SurfacePoints

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..files import read_npz, write_npz
-from .detectors import Detector
+from .face_networks import Detector
 from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera

@@ -1,19 +1,17 @@
 """Mattes of a take: those of its footage, or found in its frames once the head is tracked."""
 
-import os
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from ..errors import StgaError
 from ..files import read_json, replacing, write_json
+from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
@@ -26,42 +24,6 @@ MIN_HEAD_PROBABILITY = 0.5
 
 HeadPixels = Callable[[int, FootageCamera], np.ndarray]
 """(timestep, camera) -> (H, W) bool: the pixels of the tracked head."""
-
-
-class PersonSegmenter(Protocol):
-    """Tells people from what is behind them."""
-
-    def probability(self, image: np.ndarray) -> np.ndarray:
-        """(H, W) float32 in 0…1 of an image (H, W, 3) uint8: how likely each pixel shows a person."""
-
-
-class SelfieSegmentation:
-    """MediaPipe's network of 250 kB (versions before 0.10.30), which sees 256×256 pixels: no download."""
-
-    def __init__(self, solutions: Any) -> None:
-        self._network = solutions.selfie_segmentation.SelfieSegmentation(model_selection=0)
-
-    def probability(self, image: np.ndarray) -> np.ndarray:
-        return np.asarray(self._network.process(np.ascontiguousarray(image)).segmentation_mask, np.float32)
-
-
-def make_segmenter() -> PersonSegmenter:
-    """Raises StgaError, in one sentence, where mediapipe or its network is not available."""
-    os.environ.setdefault("GLOG_minloglevel", "2")  # its C++ part reports its own progress on stderr
-    try:
-        import mediapipe
-    except ImportError as error:
-        raise StgaError(_needs(f"which {sys.executable} lacks")) from error
-    if not hasattr(mediapipe, "solutions"):
-        raise StgaError(_needs(f"and {mediapipe.__version__} has no network in its wheel"))
-    return SelfieSegmentation(mediapipe.solutions)
-
-
-def _needs(what: str) -> str:
-    return (
-        f"mattes need mediapipe==0.10.21 (Python 3.11 or 3.12), {what}: give a folder of mattes with --mattes, a clean "
-        "plate of each camera, or masks beside the images"
-    )
 
 
 @dataclass(frozen=True)
@@ -81,45 +43,32 @@ def with_mattes(
 
     Frames that have one keep it. For the others, mattes are written into the folder of the capture's masks and, where
     an interrupted call with the same `source` wrote them, read from there. A camera's clean plate tells the person from
-    the backdrop, else `make_segmenter`; without either, its frames stay as they are, and a warning says so.
+    the backdrop, else the network.
     """
     path, total = out / MATTES_FILE, len(list(footage.views()))
     continues = path.exists() and read_json(path) == source
     write_json(path, source)
-    segmenter, warnings = _segmenter(footage)
+    network = PersonNetwork()
     unseen: list[str] = []
     cameras, done = [], 0
     for number, camera in enumerate(footage.cameras):
         written: dict[int, Path] = {}
-        if camera.plate is None and segmenter is None:
-            cameras.append(camera)
-            continue
-        frames = _frames(camera, number, head_pixels, out, segmenter, continues, written, unseen)
+        frames = _frames(camera, number, head_pixels, out, network, continues, written, unseen)
         with ThreadPoolExecutor() as pool:  # OpenCV works without Python's lock
             while some := list(islice(frames, AT_ONCE)):
                 list(pool.map(_write, some))
                 report("Mattes", done + len(written), total)
         done += len(camera.timesteps)
         cameras.append(replace(camera, mattes=written))
-    if unseen:
-        listed = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
-        warnings += (f"no person was recognized in {len(unseen)} frames, whose mattes follow the head alone: {listed}",)
-    return replace(footage, cameras=tuple(cameras)), warnings
-
-
-def _segmenter(footage: Footage) -> tuple[PersonSegmenter | None, tuple[str, ...]]:
-    """The network where a camera needs it, and a warning where that is not available."""
-    lacking = [camera for camera in footage.cameras if camera.plate is None]
-    if all(camera.mask(camera.timesteps[0]) is not None for camera in lacking):
-        return None, ()
-    try:
-        return make_segmenter(), ()
-    except StgaError as error:
-        return None, (f"no mattes were made: {error}",)
+    found = replace(footage, cameras=tuple(cameras))
+    if not unseen:
+        return found, ()
+    listed = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
+    return found, (f"no person was recognized in {len(unseen)} frames, whose mattes follow the head alone: {listed}",)
 
 
 def _frames(
-    camera: FootageCamera, number: int, head_pixels: HeadPixels, out: Path, segmenter: PersonSegmenter | None,
+    camera: FootageCamera, number: int, head_pixels: HeadPixels, out: Path, network: PersonNetwork,
     continues: bool, written: dict[int, Path], unseen: list[str],
 ) -> Iterator[_Frame]:  # fmt: skip
     """The frames whose matte is to be found; fills `written`, timestep -> file, and the names of `unseen` frames."""
@@ -132,11 +81,7 @@ def _frames(
         if camera.mask(timestep) is not None:
             continue
         image, head = camera.image(timestep), head_pixels(timestep, camera)
-        if plate is not None:
-            probability = probability_by_plate(image, plate)
-        else:
-            assert segmenter is not None
-            probability = segmenter.probability(image)
+        probability = network.probability(image) if plate is None else probability_by_plate(image, plate)
         if head.any() and float(np.median(probability[head])) < MIN_HEAD_PROBABILITY:
             unseen.append(f"{camera.name} at timestep {timestep}")
         written[timestep] = path

@@ -23,7 +23,7 @@ from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .dense import fit_dense
 from .dense_head import REGIONS
-from .detectors import make_detector
+from .face_networks import FaceNetworks
 from .fit import (
     MAX_HEAD_SCALE,
     MIN_FACE_M,
@@ -94,7 +94,6 @@ def track(
     head_file: Path,
     out: Path,
     landmarks: Path | None = None,
-    task: Path | None = None,
     meshes: bool = False,
     world: str = "auto",
     mattes: bool = True,
@@ -102,7 +101,7 @@ def track(
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
-    landmarks: folder of landmark files in place of a detector; task: MediaPipe's .task file (`make_detector`).
+    landmarks: folder of landmark files in place of the networks'.
     mattes: whether they are made for frames without a mask (`with_mattes`).
     What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks: called again after an interruption, those
     cameras and frames are not worked on again. world: "head": meters as the head's size says, y up, the head near the
@@ -120,10 +119,10 @@ def track(
         places_file = landmarks / PLACES_FILE
         places, reliable = read_places(places_file, len(head.model.faces))
     else:
-        detector = make_detector(task)
+        detector = FaceNetworks()
         report("Head model", 0, 1)
         places, reliable = calibrate(head.model, detector, str(head_file))
-        _begin(out, _source(footage, head_file, task))
+        _begin(out, _source(footage, head_file))
         places_file = out / LANDMARKS_FOLDER / PLACES_FILE
         write_places(places_file, places, reliable)
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
@@ -155,7 +154,7 @@ def track(
         def head_pixels(timestep: int, camera: FootageCamera) -> np.ndarray:
             return silhouette(posed_mesh(fit, parameters[timestep]), fit.head.model.faces, cameras[camera.name])
 
-        source = _source(footage, head_file, task if landmarks is None else landmarks)
+        source = _source(footage, head_file, landmarks)
         footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
     torso = follow_torso(fit, parameters, footage, report)
     result = TrackingReport(
@@ -240,14 +239,14 @@ def reprojection_errors(
     return errors
 
 
-def _source(footage: Footage, head_file: Path, detector: Path | None) -> dict[str, Any]:
-    """What landmarks and mattes are of; detector: file of the network, or folder of its landmarks."""
+def _source(footage: Footage, head_file: Path, landmarks: Path | None = None) -> dict[str, Any]:
+    """What landmarks and mattes are of; landmarks: the folder that they were read from."""
     return {
         "footage": str(footage.root),
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
         "head_model": str(head_file.resolve()),
-        "detector": None if detector is None else realpath(detector),
+        "landmarks": None if landmarks is None else realpath(landmarks),
     }
 
 
@@ -255,7 +254,7 @@ def _begin(out: Path, source: dict[str, Any]) -> None:
     """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other footage."""
     path = out / LANDMARKS_FOLDER / "footage.json"
     if path.exists() and read_json(path) != source:
-        raise StgaError(f"{out}: holds landmarks of other footage or detector; give another --out, or delete it")
+        raise StgaError(f"{out}: holds landmarks of other footage; give another --out, or delete it")
     write_json(path, source)
 
 

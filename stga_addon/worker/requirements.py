@@ -1,4 +1,4 @@
-"""Packages that training needs, with bounds; `pyproject.toml` repeats them, which a test compares."""
+"""Packages that tracking and training need, with bounds; `pyproject.toml` repeats them, which a test compares."""
 
 REQUIREMENTS = {
     "numpy": "numpy>=1.26,<3",
@@ -12,21 +12,9 @@ REQUIREMENTS = {
     "filelock": "filelock>=4,<5",
     "matplotlib": "matplotlib>=3.8,<4",
     "av": "av>=14,<19",
+    "cv2": "opencv-python-headless>=4.12,<5",
 }
 """Imported module -> requirement."""
-TRACKING_REQUIREMENTS = (
-    "numpy>=1.26,<2; python_version < '3.13'",
-    "opencv-python-headless>=4.9,<5",
-    "absl-py>=2.3,<3",
-    "flatbuffers>=25.9,<26",
-    "attrs>=23,<27; python_version < '3.13'",
-    "certifi>=2024; python_version >= '3.13'",
-    "protobuf>=4.25.3,<5; python_version < '3.13'",
-)
-"""What tracking needs besides: OpenCV for distorted lenses, and what the landmark detector imports."""
-DETECTOR_REQUIREMENTS = ("mediapipe==0.10.21; python_version < '3.13'", "mediapipe>=1,<2; python_version >= '3.13'")
-"""Installed without dependencies: most of what MediaPipe lists, 600 MB, it imports for other tasks only. 0.10.21 is the
-last version with the network in its wheel; newer ones need the user's `face_landmarker.task`."""
 GPU_REQUIREMENT = "wgpu>=0.32,<1"
 """Trains on a GPU; without it, or where it has no driver, the CPU trains."""
 

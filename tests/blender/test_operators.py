@@ -126,7 +126,6 @@ SET_BY_PANEL = {
         "model",
         "directory",
         "cameras",
-        "detector",
         "focal",
         "start",
         "stop",

@@ -23,7 +23,7 @@ NATIVE = {
 
 
 def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: str) -> Path:
-    path = folder / f"{name}-{version}-{tag}.whl"
+    path = folder / f"{name.replace('-', '_')}-{version}-{tag}.whl"
     text = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
     text += "".join(f"Requires-Dist: {requirement}\n" for requirement in requirements)
     with zipfile.ZipFile(path, "w") as archive:

@@ -1,4 +1,4 @@
-"""ARKit's shapes on a head of any mesh, against its own masks, mediapipe, and a nonlinear solver."""
+"""ARKit's shapes on a head of any mesh, against its own masks, the face networks, and a nonlinear solver."""
 
 from dataclasses import replace
 
@@ -76,14 +76,14 @@ def test_points_lie_where_the_masks_are(demo):
 
 @pytest.mark.slow
 def test_points_agree_with_the_detector(shared_data):
-    """Catches a registration that slides along the face: mediapipe's own landmarks on pictures of the same head."""
-    pytest.importorskip("mediapipe")
+    """Catches a registration that slides along the face: the networks' landmarks on pictures of the same head."""
+    pytest.importorskip("cv2")
     from stga_addon.tracking.correspondence import calibrate
-    from stga_addon.tracking.detectors import make_detector
+    from stga_addon.tracking.face_networks import FaceNetworks
 
     model = generated_flame(shared_data, 1)
     places, used = face_points(model, "open FLAME")
-    detected, reliable = calibrate(model, make_detector(), "open FLAME")
+    detected, reliable = calibrate(model, FaceNetworks(), "open FLAME")
     apart = places.on(model.v_template, model.faces) - detected.on(model.v_template, model.faces)
     distance = np.linalg.norm(apart, axis=1)[used & reliable]
     assert np.median(distance) < 0.002

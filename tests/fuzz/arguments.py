@@ -191,7 +191,7 @@ def track(rng: random.Random, case: Path) -> list[str]:
         "--model",
         some_path(rng, case, "flame/model.npz"),
     ]
-    for name in ("--landmarks", "--cameras", "--detector"):
+    for name in ("--landmarks", "--cameras"):
         arguments += option(rng, 0.3, name, some_path(rng, case, "mesh", "mesh/transforms.json"))
     for name in ("--start", "--stop", "--step", "--focal"):
         arguments += option(rng, 0.2, name, "1", *NUMBERS)

@@ -31,7 +31,7 @@ from stga_addon.worker.environment import (
 )
 from stga_addon.worker.environment_use import environment_users
 from stga_addon.worker.launch import prepare_status_folder, start_worker
-from stga_addon.worker.requirements import DETECTOR_REQUIREMENTS, GPU_REQUIREMENT, REQUIREMENTS, TRACKING_REQUIREMENTS
+from stga_addon.worker.requirements import GPU_REQUIREMENT, REQUIREMENTS
 from stga_addon.worker.status import LOG_FILE, WorkerState, inspect_worker, log_lines, read_status
 
 FOUND = {
@@ -63,16 +63,6 @@ def test_install_steps(tmp_path):
     assert set(offline.command) >= set(REQUIREMENTS.values())
 
 
-def test_install_steps_of_tracking(tmp_path):
-    """Catches an environment that cannot detect landmarks, or 600 MB that the detector never imports."""
-    *_, rest, _, detector = install_steps(tmp_path, "/python", None, "linux", tracking=True)
-    assert set(rest.command) >= {*REQUIREMENTS.values(), *TRACKING_REQUIREMENTS}
-    assert detector.command[-3:] == ["--no-deps", *DETECTOR_REQUIREMENTS]
-    assert not detector.optional
-    *_, offline = install_steps(tmp_path, "/python", tmp_path / "wheels", "linux", tracking=True)
-    assert {"--no-index", "--no-deps", str(tmp_path / "wheels")} < set(offline.command)
-
-
 @pytest.mark.parametrize(("newest", "status"), [((3, 11), 0), ((99, 0), 1)])
 def test_old_python_is_refused_first(newest, status, tmp_path, monkeypatch):
     """Catches gigabytes downloaded for a Python that cannot use them."""
@@ -86,10 +76,6 @@ def test_old_python_is_refused_first(newest, status, tmp_path, monkeypatch):
 def test_check_is_described():
     """Catches an interpreter reported as usable that cannot train."""
     assert describe_check("p", FOUND) == "Python 3.11.7, torch 1.0, numba 1.0, CPU with 4 threads"
-    tracking = {**FOUND, "versions": {**FOUND["versions"], "mediapipe": "0.10.21"}}
-    assert describe_check("p", tracking) == "Python 3.11.7, torch 1.0, numba 1.0, mediapipe 0.10.21, CPU with 4 threads"
-    broken = {**FOUND, "failures": {"mediapipe": "ImportError: no GL"}}
-    assert "mediapipe fails (ImportError: no GL)" in describe_check("p", broken)
     old = {**FOUND, "python": "3.9.1"}
     with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
         describe_check("p", old)
@@ -102,7 +88,9 @@ def test_bare_interpreter_is_checked(tmp_path):
     """Catches a check that itself needs a package: this interpreter has none."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
     python = str(venv_python(tmp_path / "venv"))
-    with pytest.raises(StgaError, match=r"lacks numpy, torch, numba, scipy, .*matplotlib, av; install"):
+    with pytest.raises(
+        StgaError, match=r"lacks numpy, torch, numba, scipy, .*matplotlib, av, opencv-python-headless; install"
+    ):
         check_python(python)
 
 

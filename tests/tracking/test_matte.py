@@ -7,8 +7,8 @@ from scipy.ndimage import gaussian_filter, shift
 from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.mesh_raster import silhouette
 from stga_addon.capture.open import open_capture
+from stga_addon.tracking.face_networks import PersonNetwork
 from stga_addon.tracking.matte import find_matte, probability_by_plate
-from stga_addon.tracking.mattes import make_segmenter
 
 pytest.importorskip("cv2")
 
@@ -94,9 +94,8 @@ def test_a_network_that_sees_nobody_or_everybody(likely):
 @pytest.mark.slow
 def test_a_rendered_head_before_a_wall(shared_data, tmp_path):
     """Catches a network that is asked wrongly: true masks of a path-traced head before generated walls."""
-    pytest.importorskip("mediapipe")
     capture = open_capture(shared_data / "studio_head")
-    network, found = make_segmenter(), []
+    network, found = PersonNetwork(), []
     for number, view in enumerate(capture.views["train"][2:80:13]):
         image, mask = with_a_body(read_image(view), read_mask(view))
         alpha = mask[..., None] / 255

@@ -32,7 +32,7 @@ class Halves:
 @pytest.fixture
 def halves(monkeypatch):
     segmenter = Halves()
-    monkeypatch.setattr(mattes, "make_segmenter", lambda: segmenter)
+    monkeypatch.setattr(mattes, "PersonNetwork", lambda: segmenter)
     return segmenter
 
 
@@ -85,19 +85,25 @@ def test_masks_of_the_footage_stay(tmp_path, halves):
     assert found.cameras[0].mask(0).max() == 90
 
 
-def test_clean_plate_of_a_camera(tmp_path, monkeypatch):
+def test_frames_after_the_first_that_lack_a_mask(tmp_path, halves):
+    """Catches a camera of which only the first frame is asked for its mask, so that the others get no matte."""
+    for number in (0, 2):
+        write_image(tmp_path / f"footage/masks/left/{number:04d}.png", 90)
+    footage = take(tmp_path, 4)
+    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    assert [int(found.cameras[0].mask(timestep).max()) for timestep in range(4)] == [90, 255, 90, 255]
+    assert (halves.asked, warnings) == (2, ())
+
+
+def test_clean_plate_of_a_camera(tmp_path, halves):
     """Catches a plate that is taken for a camera, or not found; no network is asked."""
 
-    def refuse():
-        raise AssertionError("asked for the network")
-
-    monkeypatch.setattr(mattes, "make_segmenter", refuse)
     (tmp_path / "footage/plates").mkdir(parents=True)
     Image.new("RGB", (WIDTH, HEIGHT), (220, 220, 220)).save(tmp_path / "footage/plates/left.png")
     footage = take(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["left"]
     found, warnings = with_mattes(footage, head, tmp_path / "out", {}, silent)
-    assert warnings == ()
+    assert (halves.asked, warnings) == (0, ())
     assert found.cameras[0].mask(2)[:, : WIDTH // 2 - 2].min() == 255
     assert found.cameras[0].mask(2)[:, WIDTH // 2 + 2 :].max() == 0
 
@@ -107,19 +113,6 @@ def test_a_plate_of_another_size(tmp_path):
     write_image(tmp_path / "footage/plates/left.png", size=(7, 5))
     with pytest.raises(StgaError, match=r"left\.png: the image has 7 x 5 pixels"):
         with_mattes(take(tmp_path), head, tmp_path / "out", {}, silent)
-
-
-def test_without_the_network(tmp_path, monkeypatch):
-    """Catches tracking that fails, or says nothing, where mediapipe is missing or has no network."""
-    monkeypatch.setitem(__import__("sys").modules, "mediapipe", None)
-    with pytest.raises(
-        StgaError, match="give a folder of mattes with --mattes, a clean plate of each camera, or masks"
-    ):
-        mattes.make_segmenter()
-    found, warnings = with_mattes(take(tmp_path), head, tmp_path / "out", {}, silent)
-    assert found.cameras[0].mask(0) is None
-    assert len(warnings) == 1
-    assert "no mattes were made: mattes need mediapipe==0.10.21" in warnings[0]
 
 
 def test_a_folder_of_mattes(tmp_path):

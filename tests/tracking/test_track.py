@@ -1,4 +1,4 @@
-"""`stga track` from footage to a capture that opens, with landmark files and with the real detector."""
+"""`stga track` from footage to a capture that opens, with landmark files and with the networks."""
 
 import re
 import shutil
@@ -134,13 +134,6 @@ def test_offsets_that_are_none(recorded, capsys, offset):
     with pytest.raises(SystemExit, match="2"):
         command(recorded[0], "--offset", offset)
     assert "expected a camera and a number of frames, as in left=-3" in capsys.readouterr().err
-
-
-def test_landmark_files_and_a_detector(recorded, capsys):
-    """Catches a detector that is silently ignored beside landmark files."""
-    with pytest.raises(SystemExit, match="2"):
-        command(recorded[0], "--detector", "face_landmarker.task")
-    assert "--detector: not allowed with argument --landmarks" in capsys.readouterr().err
 
 
 def test_offsets_of_listed_frames(recorded, capsys):
@@ -381,7 +374,7 @@ def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
     places, rng = places_on(head, LANDMARKS), np.random.default_rng(0)
     exact = [camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes]
     detector = Remembering([points + rng.normal(0, 0.1, points.shape) for points in exact])
-    monkeypatch.setattr("stga_addon.tracking.track.make_detector", lambda task: detector)
+    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: detector)
     monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
 
     def cancel(stage, done, total):
@@ -425,7 +418,7 @@ def test_landmarks_of_another_offset_are_not_used_again(tmp_path, head, monkeypa
     write_folders(tmp_path / "footage", (6, 8))
     write_flame(head.model, tmp_path / "head.npz")
     places = places_on(head, LANDMARKS)
-    monkeypatch.setattr("stga_addon.tracking.track.make_detector", lambda task: Counting([]))
+    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: Counting([]))
     monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
     for offset, message in ((1, "shows no face"), (1, "shows no face"), (2, "holds landmarks of other footage")):
         footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset}))
@@ -441,9 +434,9 @@ def test_two_faces_are_reported_with_camera_and_frame(recorded):
         detect_landmarks(open_footage(folder / "footage"), Counting([two, two + 30]), folder / "found", lambda *_: None)
 
 
-def test_mediapipe_tracks_pictures_of_a_head(tmp_path, head):
+def test_pictures_of_a_head_are_tracked(tmp_path, head):
     """Catches a correspondence or a detector's convention that is off: everything from pixels, nothing given."""
-    pytest.importorskip("mediapipe", reason="mediapipe is not installed")
+    pytest.importorskip("cv2")
     shape = np.random.default_rng(1).normal(0, 0.5, head.model.n_identity)
     meshes = [
         flame_forward(head.model, shape, replace(frame_at(head, t), expr=np.zeros(head.model.n_expression)))
@@ -463,9 +456,9 @@ def test_mediapipe_tracks_pictures_of_a_head(tmp_path, head):
         assert np.median(np.linalg.norm(pixels - expected, axis=1)) < 5  # of a face of 120 pixels
 
 
-def test_mediapipe_finds_no_face_on_the_back_of_a_head(recorded, capsys, head):
+def test_no_face_is_found_on_the_back_of_a_head(recorded, capsys, head):
     """Catches a head model without a face that is fitted all the same."""
-    pytest.importorskip("mediapipe", reason="mediapipe is not installed")
+    pytest.importorskip("cv2")
     folder, _ = recorded
     write_flame(replace(head.model, v_template=head.model.v_template * [-1, 1, -1]), folder / "turned.npz")
     words = ["track", str(folder / "footage"), "--model", str(folder / "turned.npz"), "--out", str(folder / "out")]

@@ -4,13 +4,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from stga_addon.worker.requirements import (
-    DETECTOR_REQUIREMENTS,
-    GPU_REQUIREMENT,
-    REQUIREMENTS,
-    TRACKING_REQUIREMENTS,
-    package_name,
-)
+from stga_addon.worker.requirements import GPU_REQUIREMENT, REQUIREMENTS, package_name
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
 
@@ -20,8 +14,6 @@ def test_environment_and_project_require_the_same():
     extras = PROJECT["optional-dependencies"]
     assert sorted(REQUIREMENTS.values()) == sorted([*PROJECT["dependencies"], *extras["train"]])
     assert GPU_REQUIREMENT in extras["gpu"]
-    assert set(extras["track"]) < set(TRACKING_REQUIREMENTS)
-    assert extras["landmarks"] == [DETECTOR_REQUIREMENTS[0]]
 
 
 def test_requirements_are_bounded():

@@ -72,7 +72,7 @@ def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | Non
 def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
     """Make an avatar in OUT/footage from the images and cameras of the demo's capture, without its meshes.
 
-    Needs the landmark detector. Raises StgaError.
+    Raises StgaError.
     """
     from ...cli import avatar
 

@@ -1,0 +1,432 @@
+"""Google's face and person networks (Apache-2.0), run by OpenCV: landmarks, ARKit scores, segmentation.
+
+What stands around the networks follows the graphs that MediaPipe publishes: anchors and decoding of
+the detector, the crop of the landmarks' network.
+"""
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..errors import StgaError
+
+FOLDER = Path(__file__).with_name("networks")
+FACE_FILE, PERSON_FILE = FOLDER / "face_landmarker.task", FOLDER / "selfie_segmentation.tflite"
+MIN_DETECTION_SCORE = 0.3
+"""MediaPipe's default, 0.5, misses near-profile views."""
+MIN_PRESENCE = 0.5
+"""Of a face in the crop, as the landmarks' network sees it."""
+MAX_FACES = 2
+"""Faces that are looked for: a second one in a frame is reported."""
+MAX_BOX_OVERLAP = 0.5
+"""Intersection over union beyond which two detected boxes are of one face."""
+CROP_SCALE = 1.5
+"""Side of the landmarks' crop, in sides of the detected box."""
+DETECTOR_SIZE_PX, CROP_SIZE_PX, PERSON_SIZE_PX = 128, 256, 256
+ANCHOR_GRIDS = ((16, 2), (8, 6))
+"""Cells along a side of the detector's grids, and anchors of a cell; an anchor is its cell's center."""
+IRIS_CENTERS = (468, 473)
+FIRST_IRIS_POINT, MESH_POINTS = 468, 478
+"""Landmarks: 468 of the skin, and five an iris of which the first is its center."""
+SCORE_POINTS = np.array(
+    [
+        "0",
+        "1",
+        "4",
+        "5",
+        "6",
+        "7",
+        "8",
+        "10",
+        "13",
+        "14",
+        "17",
+        "21",
+        "33",
+        "37",
+        "39",
+        "40",
+        "46",
+        "52",
+        "53",
+        "54",
+        "55",
+        "58",
+        "61",
+        "63",
+        "65",
+        "66",
+        "67",
+        "70",
+        "78",
+        "80",
+        "81",
+        "82",
+        "84",
+        "87",
+        "88",
+        "91",
+        "93",
+        "95",
+        "103",
+        "105",
+        "107",
+        "109",
+        "127",
+        "132",
+        "133",
+        "136",
+        "144",
+        "145",
+        "146",
+        "148",
+        "149",
+        "150",
+        "152",
+        "153",
+        "154",
+        "155",
+        "157",
+        "158",
+        "159",
+        "160",
+        "161",
+        "162",
+        "163",
+        "168",
+        "172",
+        "173",
+        "176",
+        "178",
+        "181",
+        "185",
+        "191",
+        "195",
+        "197",
+        "234",
+        "246",
+        "249",
+        "251",
+        "263",
+        "267",
+        "269",
+        "270",
+        "276",
+        "282",
+        "283",
+        "284",
+        "285",
+        "288",
+        "291",
+        "293",
+        "295",
+        "296",
+        "297",
+        "300",
+        "308",
+        "310",
+        "311",
+        "312",
+        "314",
+        "317",
+        "318",
+        "321",
+        "323",
+        "324",
+        "332",
+        "334",
+        "336",
+        "338",
+        "356",
+        "361",
+        "362",
+        "365",
+        "373",
+        "374",
+        "375",
+        "377",
+        "378",
+        "379",
+        "380",
+        "381",
+        "382",
+        "384",
+        "385",
+        "386",
+        "387",
+        "388",
+        "389",
+        "390",
+        "397",
+        "398",
+        "400",
+        "402",
+        "405",
+        "409",
+        "415",
+        "454",
+        "466",
+        "468",
+        "469",
+        "470",
+        "471",
+        "472",
+        "473",
+        "474",
+        "475",
+        "476",
+        "477",
+    ],
+    np.int64,
+)
+"""Landmarks that the scores' network takes."""
+SCORE_NAMES = [
+    "_neutral",
+    "browDownLeft",
+    "browDownRight",
+    "browInnerUp",
+    "browOuterUpLeft",
+    "browOuterUpRight",
+    "cheekPuff",
+    "cheekSquintLeft",
+    "cheekSquintRight",
+    "eyeBlinkLeft",
+    "eyeBlinkRight",
+    "eyeLookDownLeft",
+    "eyeLookDownRight",
+    "eyeLookInLeft",
+    "eyeLookInRight",
+    "eyeLookOutLeft",
+    "eyeLookOutRight",
+    "eyeLookUpLeft",
+    "eyeLookUpRight",
+    "eyeSquintLeft",
+    "eyeSquintRight",
+    "eyeWideLeft",
+    "eyeWideRight",
+    "jawForward",
+    "jawLeft",
+    "jawOpen",
+    "jawRight",
+    "mouthClose",
+    "mouthDimpleLeft",
+    "mouthDimpleRight",
+    "mouthFrownLeft",
+    "mouthFrownRight",
+    "mouthFunnel",
+    "mouthLeft",
+    "mouthLowerDownLeft",
+    "mouthLowerDownRight",
+    "mouthPressLeft",
+    "mouthPressRight",
+    "mouthPucker",
+    "mouthRight",
+    "mouthRollLower",
+    "mouthRollUpper",
+    "mouthShrugLower",
+    "mouthShrugUpper",
+    "mouthSmileLeft",
+    "mouthSmileRight",
+    "mouthStretchLeft",
+    "mouthStretchRight",
+    "mouthUpperUpLeft",
+    "mouthUpperUpRight",
+    "noseSneerLeft",
+    "noseSneerRight",
+]
+
+
+class Detector(Protocol):
+    """Finds faces in an image; every face has the same N landmarks."""
+
+    def detect(self, image: np.ndarray) -> list[np.ndarray]:
+        """Landmarks (N, 2) in pixels of each face in an image (H, W, 3) uint8; centers lie at .5."""
+
+
+@dataclass(frozen=True)
+class FaceScores:
+    """What the networks say of a face: its blend shapes by name, 0 to 1, and its landmarks.
+
+    points  (478, 3) pixels; depth, in pixels too, grows away from the camera
+    """
+
+    weights: Mapping[str, float]
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Crop:
+    """A square of an image: center (2,) and side in pixels, turned by an angle, clockwise as seen."""
+
+    center: np.ndarray
+    side: float
+    angle: float
+
+    def matrix(self, size: int) -> np.ndarray:
+        """(2, 3) from pixels of the crop, resampled to `size`, to the image's."""
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        turn = self.side / size * np.array([[cos, -sin], [sin, cos]])
+        return np.column_stack([turn, self.center - turn @ [size / 2, size / 2]])
+
+
+class FaceNetworks:
+    """Detector, landmarks and scores, each read when it is first needed."""
+
+    def detect(self, image: np.ndarray) -> list[np.ndarray]:
+        """Landmarks (478, 2) in pixels of at most two faces; see `Detector`."""
+        return [points[:, :2] for points in self._landmarks(image, MAX_FACES)]
+
+    def score(self, image: np.ndarray) -> FaceScores | None:
+        """The scores of the clearest face in an image (H, W, 3) uint8; None where none is found."""
+        found = self._landmarks(image, 1)
+        if not found:
+            return None
+        self._scores.setInput(found[0][SCORE_POINTS, :2].astype(np.float32)[None])
+        scores = np.ravel(self._scores.forward())
+        weights = dict(zip(SCORE_NAMES, map(float, scores), strict=True))
+        return FaceScores(weights, found[0])
+
+    def _landmarks(self, image: np.ndarray, most: int) -> list[np.ndarray]:
+        """(478, 3) of each face: pixels, and depth in pixels, which grows away from the camera."""
+        found = []
+        for crop in self._crops(image)[:most]:
+            self._mesh.setInput(_blob(_resampled(image, crop.matrix(CROP_SIZE_PX), CROP_SIZE_PX)))
+            points, presence = self._mesh.forward(["Identity", "Identity_1"])
+            if _sigmoid(float(np.ravel(presence)[0])) < MIN_PRESENCE:
+                continue
+            points = np.reshape(points, (MESH_POINTS, 3)).astype(np.float64)
+            matrix, scale = crop.matrix(CROP_SIZE_PX), crop.side / CROP_SIZE_PX
+            flat = points[:, :2] @ matrix[:, :2].T + matrix[:, 2]
+            found.append(np.column_stack([flat, points[:, 2] * scale]))
+        return found
+
+    def _crops(self, image: np.ndarray) -> list[_Crop]:
+        """Around each detected face, the clearest first."""
+        height, width = image.shape[:2]
+        whole = _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
+        matrix = whole.matrix(DETECTOR_SIZE_PX)
+        small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
+        self._faces.setInput(_blob(small, low=-1.0))
+        boxes, scores = self._faces.forward(["regressors", "classificators"])
+        scale = whole.side / DETECTOR_SIZE_PX
+        crops = []
+        for box in _faces_of(np.reshape(boxes, (-1, 16)), np.ravel(scores)):
+            center, side, (right_eye, left_eye) = box[:2], box[2:4].max(), box[4:8].reshape(2, 2)
+            angle = np.arctan2(*(left_eye - right_eye)[::-1])
+            center = center @ matrix[:, :2].T + matrix[:, 2]
+            crops.append(_Crop(center, CROP_SCALE * scale * side, float(angle)))
+        return crops
+
+    @cached_property
+    def _faces(self) -> Any:
+        return _network(_face_part("face_detector.tflite"))
+
+    @cached_property
+    def _mesh(self) -> Any:
+        return _network(_face_part("face_landmarks_detector.tflite"))
+
+    @cached_property
+    def _scores(self) -> Any:
+        return _network(_face_part("face_blendshapes.tflite"))
+
+
+class PersonNetwork:
+    """Segmentation of people, in 256×256 pixels of the whole image."""
+
+    def probability(self, image: np.ndarray) -> np.ndarray:
+        """(H, W) float32 in 0…1 of an image (H, W, 3) uint8: how likely each pixel shows a person."""
+        import cv2
+
+        size = PERSON_SIZE_PX, PERSON_SIZE_PX
+        self._network.setInput(_blob(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
+        small = np.reshape(self._network.forward(), size)
+        return np.clip(cv2.resize(small, image.shape[1::-1], interpolation=cv2.INTER_LINEAR), 0, 1)
+
+    @cached_property
+    def _network(self) -> Any:
+        return _network(PERSON_FILE.read_bytes())
+
+
+def _network(data: bytes) -> Any:
+    import cv2
+
+    return cv2.dnn.readNetFromTFLite(np.frombuffer(data, np.uint8))
+
+
+def _face_part(name: str) -> bytes:
+    """Raises StgaError where the file was damaged or removed."""
+    try:
+        with zipfile.ZipFile(FACE_FILE) as archive:
+            return archive.read(name)
+    except (OSError, KeyError, zipfile.BadZipFile) as error:
+        raise StgaError(f"{FACE_FILE}: {name} cannot be read ({error}); install again") from error
+
+
+def _resampled(image: np.ndarray, matrix: np.ndarray, size: int, black_border: bool = False) -> np.ndarray:
+    """(size, size, 3) of an image by the matrix (2, 3) from its pixels to the image's.
+
+    Pixels are sampled at their upper left corners, as MediaPipe does: at their centers, landmarks
+    lie 0.5 pixels away from MediaPipe's (median, images of 512²) instead of 0.01.
+    """
+    import cv2
+
+    border = cv2.BORDER_CONSTANT if black_border else cv2.BORDER_REPLICATE
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
+    return np.asarray(warped)
+
+
+def _blob(image: np.ndarray, low: float = 0.0) -> np.ndarray:
+    """(1, 3, H, W) float32 from `low` to 1 of an image (H, W, 3) uint8."""
+    values = image.astype(np.float32).transpose(2, 0, 1)[None]
+    return np.ascontiguousarray(values * ((1.0 - low) / 255) + low)
+
+
+def _faces_of(boxes: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
+    """Detected faces, the clearest first: (16,) center, size and six points, in the detector's pixels.
+
+    Boxes that overlap are one face, their mean weighted by score.
+    """
+    share = _sigmoid(np.clip(scores, -100, 100))
+    boxes = boxes.copy()
+    boxes[:, :2] += _anchors()
+    boxes[:, 4:] += np.tile(_anchors(), 6)
+    left = np.argsort(-share, kind="stable")
+    left = left[share[left] >= MIN_DETECTION_SCORE]
+    faces = []
+    while len(left):
+        same = _overlaps(boxes[left[0]], boxes[left]) > MAX_BOX_OVERLAP
+        same[0] = True
+        weights = share[left[same]]
+        faces.append(weights @ boxes[left[same]] / weights.sum())
+        left = left[~same]
+    return faces
+
+
+@cache
+def _anchors() -> np.ndarray:
+    """(896, 2) centers in the detector's pixels."""
+    rows = []
+    for cells, count in ANCHOR_GRIDS:
+        centers = (np.arange(cells) + 0.5) * (DETECTOR_SIZE_PX / cells)
+        y, x = np.meshgrid(centers, centers, indexing="ij")
+        rows.append(np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), count, axis=0))
+    return np.concatenate(rows)
+
+
+def _overlaps(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """(N,) intersection over union of a box with others, given as center and size."""
+    low = np.maximum(box[:2] - box[2:4] / 2, boxes[:, :2] - boxes[:, 2:4] / 2)
+    high = np.minimum(box[:2] + box[2:4] / 2, boxes[:, :2] + boxes[:, 2:4] / 2)
+    common = np.maximum(high - low, 0).prod(axis=1)
+    union = box[2:4].prod() + boxes[:, 2:4].prod(axis=1) - common
+    return np.asarray(common / np.maximum(union, 1e-9))
+
+
+def _sigmoid(value: Any) -> Any:
+    return 1 / (1 + np.exp(-np.asarray(value, np.float64)))
