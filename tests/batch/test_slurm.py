@@ -13,7 +13,7 @@ from stga_addon.batch.engines.table import make_engine
 from stga_addon.batch.run import JobState
 from stga_addon.errors import StgaError
 from stga_addon.worker.lock import lock_owner
-from stga_addon.worker.status import LOCK_FILE
+from stga_addon.worker.status import LOCK_FILE, StatusWriter, WorkerState
 
 from .conftest import TrainedHere
 from .simulated import carry_out, empty_jobs
@@ -125,6 +125,56 @@ def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -
     batch, _ = carry_out(plan, SlurmEngine())
     assert batch.entries["huge"].state == JobState.FAILED
     assert "sbatch: " in batch.entries["huge"].error
+
+
+def test_what_waits_in_the_queue_is_submitted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a batch that ends because squeue failed once, and jobs that the next start submits again while they wait.
+
+    Programs of the names of SLURM's stand in for it: a queue in which nothing begins, and which is down at first.
+    """
+    queue, down, calls = tmp_path / "queue", tmp_path / "down", tmp_path / "calls"
+    programs = {
+        "sbatch": f'echo "$@" >>{calls}; n=$(wc -l <{calls}); '
+        f'for i in 0 1 2; do echo "${{n}}_$i|PENDING|" >>{queue}; done; echo $n',
+        "squeue": f"if [ -e {down} ]; then echo unreachable >&2; exit 1; fi; cat {queue}",
+        "scancel": "exit 1",
+    }
+    for name, text in programs.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(SlurmEngine, "interval_s", 0.01)
+    monkeypatch.setattr(slurm, "GRACE_S", 0.0)
+    asked = 0
+
+    class Killed(SlurmEngine):
+        def ended(self):  # type: ignore[no-untyped-def]
+            nonlocal asked
+            asked += 1
+            (down.touch if asked < 3 else down.unlink)() if asked < 4 else None
+            if asked == 5:
+                raise MemoryError
+            return super().ended()
+
+    class Emptied(SlurmEngine):
+        def ended(self):  # type: ignore[no-untyped-def]
+            if self._jobs:
+                assert super().ended() == {}
+            for job in plan.jobs:
+                StatusWriter(job.request_folder).finish(WorkerState.FINISHED)
+            queue.write_text("")
+            return super().ended()
+
+    plan = empty_jobs(tmp_path, 3)
+    with pytest.raises(MemoryError):
+        carry_out(plan, Killed())
+    batch, _ = carry_out(plan, Emptied())
+    assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}
+    assert len(calls.read_text().splitlines()) == 1
+    down.touch()
+    monkeypatch.setattr(slurm, "MAX_SILENCE_S", -1.0)
+    with pytest.raises(StgaError, match="squeue: unreachable"):
+        SlurmEngine().ended()
 
 
 def test_without_slurm(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Engine of a SLURM cluster: one sbatch array per table of the plan and needs, with dependencies between the arrays.
 
 https://slurm.schedmd.com/sbatch.html. The jobs of a machine that dies are put back into the queue (--requeue), and
-continue from their checkpoints. Liveness is squeue's, state and figures are those of the jobs' folders.
+continue from their checkpoints. Liveness is squeue's, state and figures are those of the jobs' folders. The batch's
+folder `slurm` has the scripts, and SUBMITTED: what the next start watches in the queue and does not submit again.
 """
 
 import re
@@ -10,10 +11,11 @@ import shutil
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from ...errors import StgaError
-from ...files import replacing
+from ...files import read_json, replacing, write_json
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, WorkerState, inspect_worker
 from ..engine import Ended, job_command
@@ -27,6 +29,9 @@ QUEUE_FORMAT = "%i|%T|%N"
 ON_MACHINE = ("RUNNING", "COMPLETING", "CONFIGURING", "STAGE_OUT")
 GRACE_S = 10.0
 """Seconds after its submission in which a job that squeue does not list yet is not gone."""
+MAX_SILENCE_S = 600.0
+"""How long squeue may fail, as while the controller is started anew, before the batch ends; its jobs go on."""
+FOLDER, SUBMITTED = "slurm", "submitted.json"
 
 
 @dataclass
@@ -49,22 +54,43 @@ class SlurmEngine:
         if missing is not None:
             raise StgaError(f"--engine slurm: the program {missing} was not found; start it where SLURM is installed")
         self._jobs: dict[str, _Submitted] = {}
-        self._arrays: dict[str, str] = {}
-        self._machines: dict[str, str] = {}
+        self._names: dict[str, str] | None = None
+        self._states: dict[str, tuple[str, str]] | None = None
+        self._answered_s = time.monotonic()
 
     def has_room(self, job: Job) -> bool:
         return True
 
     def submit(self, jobs: Sequence[Job]) -> None:
-        """Raises StgaError with sbatch's words where it refuses an array."""
-        for group in _ordered(alike(jobs, MAX_ARRAY)):
+        """Submit the jobs but those that are in the queue since an earlier start.
+
+        Raises StgaError with the words of sbatch where it refuses an array, and where squeue does not answer.
+        """
+        names = {job.name: self._name(job) for job in jobs}
+        if self._states is None and any(names.values()):
+            self._states = _queue()
+        queued = self._states or {}
+        for job in jobs:
+            if names[job.name] in queued:
+                self.adopt(job)
+        for group in _ordered(alike([job for job in jobs if names[job.name] not in queued], MAX_ARRAY)):
             self._submit_array(group)
 
+    def _name(self, job: Job) -> str:
+        """The job's name in SLURM when it was submitted last; "" where it never was."""
+        if self._names is None:
+            self._names = {}
+            with suppress(StgaError):
+                values = read_json(job.folder.parent / FOLDER / SUBMITTED)
+                self._names |= values if isinstance(values, dict) else {}
+        return str(self._names.get(job.name, ""))
+
     def _submit_array(self, jobs: Sequence[Job]) -> None:
-        script = jobs[0].folder.parent / "slurm" / f"{jobs[0].table}-{time.time_ns()}.sh"
+        script = jobs[0].folder.parent / FOLDER / f"{jobs[0].table}-{time.time_ns()}.sh"
         with replacing(script) as partial:
             partial.write_text(_script(jobs), encoding="utf-8")
-        waits = sorted({self._arrays[other] for job in jobs for other in job.after if other in self._jobs})
+        names = {self._jobs[other].name for job in jobs for other in job.after if other in self._jobs}
+        waits = sorted({_array(name) for name in names if name})
         needs = jobs[0].resources
         command = [
             "sbatch", "--parsable", "--requeue", f"--job-name=stga-{jobs[0].table}", f"--array=0-{len(jobs) - 1}",
@@ -76,19 +102,31 @@ class SlurmEngine:
         array = _call(command).strip().partition(";")[0]
         for index, job in enumerate(jobs):
             self._jobs[job.name] = _Submitted(job, f"{array}_{index}", time.monotonic())
-            self._arrays[job.name] = array
+        self._names = {**(self._names or {}), **{job.name: self._jobs[job.name].name for job in jobs}}
+        write_json(script.with_name(SUBMITTED), self._names)
 
     def adopt(self, job: Job) -> None:
-        """A worker that is alive by its lock; its place in SLURM's queue is not known."""
-        self._jobs[job.name] = _Submitted(job, "", time.monotonic())
+        self._jobs[job.name] = _Submitted(job, self._name(job), time.monotonic())
 
     def running(self) -> Mapping[str, str]:
-        return {name: self._machines[one.name] for name, one in self._jobs.items() if one.name in self._machines}
+        found = {name: (self._states or {}).get(one.name, ("", "")) for name, one in self._jobs.items()}
+        return {name: machine for name, (state, machine) in found.items() if state in ON_MACHINE}
+
+    def _ask(self) -> bool:
+        """Ask what is in the queue; False where squeue does not answer. Raises StgaError after MAX_SILENCE_S."""
+        try:
+            self._states = _queue()
+        except StgaError:
+            if time.monotonic() - self._answered_s > MAX_SILENCE_S:
+                raise
+            return False
+        self._answered_s = time.monotonic()
+        return True
 
     def ended(self) -> Mapping[str, Ended]:
-        states = _queue()
-        self._machines = {name: machine for name, (state, machine) in states.items() if state in ON_MACHINE}
-        found = {}
+        if not self._ask():
+            return {}
+        states, found = self._states or {}, {}
         for name, one in list(self._jobs.items()):
             if one.name in states:
                 continue
@@ -102,10 +140,11 @@ class SlurmEngine:
 
     def withdraw(self) -> Sequence[str]:
         """Take back the jobs that wait in the queue."""
-        states = _queue()
+        self._ask()
+        states = self._states or {}
         waiting = [name for name, one in self._jobs.items() if states.get(one.name, ("", ""))[0] == "PENDING"]
         if waiting:
-            _call(["scancel", "--state=PENDING", *sorted({self._arrays[name] for name in waiting})])
+            _call(["scancel", "--state=PENDING", *sorted({_array(self._jobs[name].name) for name in waiting})])
         for name in waiting:
             del self._jobs[name]
         return waiting
@@ -119,6 +158,11 @@ def make_slurm(address: str) -> SlurmEngine:
     if address:
         raise StgaError("--address: has no effect with --engine slurm, which uses the cluster of its configuration")
     return SlurmEngine()
+
+
+def _array(name: str) -> str:
+    """ "12" of the job "12_3"."""
+    return name.partition("_")[0]
 
 
 def _ordered(groups: list[list[Job]]) -> list[list[Job]]:
