@@ -5,8 +5,8 @@
 CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the model that they were
 made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of FLAME's open template (`v_template`,
 `shapedirs`, `faces`). Prints in millimeters, over the vertices within 9 cm of the face's landmarks: distances from the
-capture's surface and, where both have the same topology, from its vertices. Landmarks are detected, or come from files with
---landmarks.
+capture's surface and, where both have the same topology, from its vertices. Landmarks are detected, or
+read from the folder of --landmarks.
 """
 
 import argparse

@@ -1,6 +1,7 @@
 """Makes `driving/arkit_shapes.npz`: what ARKit's shapes do to 478 points of ICT-FaceKit's face.
 
-python -m stga_addon.development.arkit_shapes ict_facekit_light.npz. The input holds the light model's neutral (V, 3) in centimeters, tris (F, 3), expr (57, V, 3) with expr_names, ident (20, V, 3).
+python -m stga_addon.development.arkit_shapes ict_facekit_light.npz. The input holds the light
+model's neutral (V, 3) in centimeters, tris (F, 3), expr (57, V, 3) with expr_names, ident (20, V, 3).
 """
 
 import sys
