@@ -13,7 +13,7 @@ import time
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from functools import partial as partial_call
@@ -39,6 +39,7 @@ RENAME_PATIENCE_S, RENAME_INTERVAL_S = 5.0, 0.1
 WINDOWS_SHARING_ERRORS = (5, 32)
 """ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION: what Windows says of renaming over an open file."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
+SEQUENCE_FILE = ".stga_sequence"
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 """Computers that share a disk cannot see each other's processes."""
 
@@ -92,16 +93,51 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
         raise
 
 
-def remove_others(folder: Path, names: re.Pattern[str], kept: Iterable[Path]) -> None:
-    """Remove the folder's files whose whole name matches, except `kept`. Raises StgaError where one cannot be removed.
+class NumberedFiles:
+    """The numbered files of a folder, which replace those of an earlier sequence there, and nobody else's.
 
-    For the files of an earlier, longer sequence.
+    SEQUENCE_FILE in the folder lists what was written: name, bytes and time of modification in nanoseconds, a line
+    each; files with such a name that are not listed so are not touched.
     """
-    with _naming(folder):
-        found = [folder / name for name in os.listdir(folder) if names.fullmatch(name)]
-    for path in sorted(set(found) - set(kept)):
-        with _naming(path, "removed"):
-            _once_free(path.unlink, RENAME_PATIENCE_S)
+
+    def __init__(self, folder: Path, names: re.Pattern[str]) -> None:
+        """names: of the files, matched as a whole. Raises StgaError where the folder holds one that is not listed."""
+        self.folder, self._names, self._written = folder, names, dict[str, str]()
+        self._list = folder / SEQUENCE_FILE
+        listed = set(self._list.read_text(errors="replace").splitlines()) if self._list.is_file() else set()
+        with _naming(folder):
+            self._earlier = [path for path in self._found() if self._line(path.name, path) in listed]
+            other = next((path.name for path in self._found() if path not in self._earlier), None)
+        if other is not None:
+            raise StgaError(f"{folder}: holds {other}, which was not written here; choose another folder")
+
+    def add(self, name: str, content: Path) -> None:
+        """List a file before it gets its name; `content` is the complete file under a temporary one."""
+        with _naming(self._list), self._list.open("a") as stream:
+            self._written[name] = self._line(name, content)
+            stream.write(self._written[name] + "\n")
+
+    def finish(self) -> None:
+        """Remove the earlier sequence's files that none of the written ones replaced, where anything was written.
+
+        Raises StgaError where one cannot be removed.
+        """
+        if not self._written:
+            return
+        for path in self._earlier:
+            if path.name not in self._written:
+                with _naming(path, "removed"):
+                    _once_free(path.unlink, RENAME_PATIENCE_S)
+        with replacing(self._list) as partial:
+            partial.write_text("".join(f"{line}\n" for line in self._written.values()))
+
+    def _found(self) -> list[Path]:
+        names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
+        return [self.folder / name for name in names if self._names.fullmatch(name)]
+
+    def _line(self, name: str, content: Path) -> str:
+        status = content.stat()
+        return f"{name} {status.st_size} {status.st_mtime_ns}"
 
 
 @contextmanager

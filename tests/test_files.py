@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import re
 import stat
 import subprocess
 import sys
@@ -20,7 +19,6 @@ from stga_addon.files import (
     check_writable,
     read_json,
     read_npz,
-    remove_others,
     replacing,
     replacing_together,
     write_json,
@@ -318,11 +316,3 @@ def test_files_that_appear_together(tmp_path):
                 partial.write_text("2")
         assert not (tmp_path / "old/b.json").exists()
     assert {path.name: read_json(path) for path in (tmp_path / "old").iterdir()} == {"a.json": 2, "b.json": 2}
-
-
-def test_files_of_an_earlier_sequence_are_removed(tmp_path):
-    """Catches a longer sequence's last frames that play after a shorter one, and files of others that are removed."""
-    for name in ("00001.ply", "00002.ply", "00003.ply.bak", "notes.txt", "1.ply"):
-        (tmp_path / name).touch()
-    remove_others(tmp_path, re.compile(r"\d{5,}\.ply"), [tmp_path / "00001.ply"])
-    assert sorted(os.listdir(tmp_path)) == ["00001.ply", "00003.ply.bak", "1.ply", "notes.txt"]

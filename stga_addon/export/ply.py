@@ -10,7 +10,7 @@ import numpy as np
 
 from ..avatar.splats import MAX_SH_DEGREE, Splats
 from ..errors import StgaError
-from ..files import file_size, remove_others, replacing, replacing_together
+from ..files import NumberedFiles, file_size, replacing, replacing_together
 
 MAX_HEADER_BYTES = 1 << 16
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
@@ -51,16 +51,20 @@ def write_ply(path: Path, world: Splats) -> None:
 def write_ply_sequence(folder: Path, frames: Iterable[tuple[int, Splats]]) -> list[Path]:
     """Write numbered world-space splats as 00012.ply, … into `folder`, all or none; returns the files.
 
-    They replace an earlier sequence: every other file with such a name is removed once they are written, and all else
-    in the folder stays. Raises StgaError where a file cannot be written or removed.
+    They replace an earlier sequence, whose other files are removed once they are written; all else in the folder stays.
+    Raises StgaError where a file cannot be written or removed, and, before, where the folder holds files with such
+    names that this function did not write.
     """
+    files = NumberedFiles(folder, FRAME_NAME)
     written = []
     with replacing_together() as new_file:
         for number, world in frames:
             written.append(folder / f"{number:05d}.ply")
             with new_file(written[-1]) as partial:
                 save_columns(partial, PROPERTIES, splat_columns(world))
-    remove_others(folder, FRAME_NAME, written)
+    for path in written:
+        files.add(path.name, path)
+    files.finish()
     return written
 
 

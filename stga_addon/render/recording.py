@@ -9,10 +9,11 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..errors import StgaError
-from ..files import check_writable
+from ..files import NumberedFiles, check_writable
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from .compose import Composer
 from .protocol import pack_layers, receive, send, unpack_layers
+from .video import IMAGE_NAME
 
 FIRST_IMAGE = "0001.png"
 """Of a sequence, as `video.sequence_writer` names it."""
@@ -24,8 +25,10 @@ def is_video(output: Path) -> bool:
 
 
 def check_output(output: Path) -> None:
-    """Raise StgaError where a video, or the PNGs of a folder, cannot be written."""
+    """Raise StgaError where a video, or the PNGs of a folder, cannot be written, or others' images are there."""
     check_writable(output if is_video(output) else output / FIRST_IMAGE)
+    if not is_video(output):
+        NumberedFiles(output, IMAGE_NAME)
 
 
 class Recorder:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..errors import StgaError
 from ..export.playback import check_rate
-from ..files import remove_others, replacing
+from ..files import NumberedFiles, replacing
 
 CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
 """H.264 with halved color resolution: what browsers, phones and editors play."""
@@ -19,7 +20,7 @@ QUALITY = {"crf": "16", "preset": "medium"}
 """Constant rate factor of x264: 18 is called visually lossless, lower is better."""
 BT709, LIMITED_RANGE = 1, 1
 """Values of FFmpeg's AVCOL_* enumerations: what players assume of untagged high-definition video."""
-IMAGE_NAME = re.compile(r"\d{4,}\.png")
+IMAGE_NAME = re.compile(r"\d{4,}\.png", re.IGNORECASE)
 """Name of an image of a sequence: 0012.png."""
 
 WriteImage = Callable[[np.ndarray], None]
@@ -51,24 +52,24 @@ def sequence_writer(folder: Path) -> Iterator[WriteImage]:
     """Write 0001.png, 0002.png, … into the folder: the block is given a function that writes the next image.
 
     Images: (H, W, 3) or, with straight alpha, (H, W, 4) uint8, sRGB. They replace an earlier sequence: when the block
-    ends, every other file with such a name is removed, also where it was cut short, so that the folder never holds
-    images of two; all else in it stays. Raises StgaError where one cannot be written or removed.
+    ends, its other images are removed, also where it was cut short, so that the folder never holds images of two; all
+    else in it stays. Raises StgaError where one cannot be written or removed, and, before any is written, where the
+    folder holds images with such names that `sequence_writer` did not write.
     """
     from PIL import Image
 
-    written: list[Path] = []
+    files, number = NumberedFiles(folder, IMAGE_NAME), count(1)
 
     def write(image: np.ndarray) -> None:
-        path = folder / f"{len(written) + 1:04d}.png"
+        path = folder / f"{next(number):04d}.png"
         with replacing(path) as partial:
             Image.fromarray(image).save(partial, format="PNG")
-        written.append(path)
+            files.add(path.name, partial)
 
     try:
         yield write
     finally:
-        if written:
-            remove_others(folder, IMAGE_NAME, written)
+        files.finish()
 
 
 def _encoder(container: Any, rate: Fraction) -> tuple[WriteImage, Callable[[], None]]:

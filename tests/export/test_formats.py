@@ -39,11 +39,12 @@ def test_sequence_is_named_by_number(avatar, tmp_path):
 
 
 def test_a_sequence_replaces_an_earlier_one(avatar, tmp_path):
-    """Catches frames of an earlier, longer export that stay between or behind the new ones, and other files removed."""
+    """Catches frames of an earlier, longer export that stay between or behind the new ones, and other files removed,
+    such as somebody's scans with such names."""
     export_avatar(
         tmp_path, avatar, "ply-sequence", [(number, posed(avatar, number)) for number in (-7, 0, 1, 2, 100000)]
     )
-    others = {"notes.txt", "point_cloud.ply", "12.ply"}
+    others = {"notes.txt", "point_cloud.ply", "12.ply", ".stga_sequence"}
     for name in others:
         (tmp_path / name).touch()
     export_avatar(tmp_path, avatar, "ply-sequence", [(1, posed(avatar, 5))])
@@ -51,6 +52,11 @@ def test_a_sequence_replaces_an_earlier_one(avatar, tmp_path):
     assert np.allclose(
         read_ply(tmp_path / "00001.ply").xyz, to_world(avatar.splats, avatar.frames(posed(avatar, 5))).xyz
     )
+    (tmp_path / "00002.ply").write_text("a scan of somebody else")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(StgaError, match=r"holds 00002\.ply, which was not written here"):
+        export_avatar(tmp_path, avatar, "ply-sequence", [(1, posed(avatar, 1))])
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_sequence_that_fails_leaves_the_earlier_one(avatar, tmp_path):

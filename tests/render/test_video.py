@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.errors import StgaError
+from stga_addon.render.recording import check_output
 from stga_addon.render.video import sequence_writer, video_writer
 
 FPS = 12.5
@@ -68,27 +69,63 @@ def test_image_sequence(tmp_path: Path) -> None:
     with sequence_writer(tmp_path / "images") as write:
         for image in written:
             write(image)
-    assert sorted(path.name for path in (tmp_path / "images").iterdir()) == ["0001.png", "0002.png", "0003.png"]
+    assert sorted(path.name for path in (tmp_path / "images").glob("*.*g")) == ["0001.png", "0002.png", "0003.png"]
     for index, image in enumerate(written):
         np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / f"images/{index + 1:04d}.png")), image)
+
+
+def write_sequence(folder: Path, count: int) -> None:
+    with sequence_writer(folder) as write:
+        for image in images(count=count):
+            write(image)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 @pytest.mark.parametrize("cut_short", [False, True])
 def test_a_sequence_replaces_an_earlier_one(tmp_path: Path, cut_short: bool) -> None:
     """Catches images of an earlier, longer sequence that play after the new ones, and other files that are removed."""
-    for name in ("0001.png", "0002.png", "0003.png", "10000.png", "12.png", "texture_0001.png"):
-        (tmp_path / name).write_bytes(b"older")
+    write_sequence(tmp_path, 4)
+    for name in ("12.png", "texture_0001.png"):
+        (tmp_path / name).write_bytes(b"of others")
     with suppress(KeyboardInterrupt), sequence_writer(tmp_path) as write:
         write(images()[0])
         if cut_short:
             raise KeyboardInterrupt
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0001.png", "12.png", "texture_0001.png"]
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["0001.png", "12.png", "texture_0001.png"]
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "0001.png")), images()[0])
 
 
 def test_a_sequence_without_images_removes_none(tmp_path: Path) -> None:
     """Catches an earlier sequence lost to a rendering that failed at its first image."""
-    (tmp_path / "0001.png").write_bytes(b"older")
+    write_sequence(tmp_path, 2)
+    before = contents(tmp_path)
     with suppress(KeyboardInterrupt), sequence_writer(tmp_path):
         raise KeyboardInterrupt
-    assert (tmp_path / "0001.png").read_bytes() == b"older"
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["0001.png", "0002.png", "0044.png", "0044.PNG"])
+def test_images_of_others_are_kept(tmp_path: Path, name: str) -> None:
+    """Catches footage, retouched images or a camera's capitals, in the folder of an earlier sequence of ours, that a
+    sequence replaces or removes, and a refusal after something was written, recorded or drawn."""
+    write_sequence(tmp_path, 2)
+    (tmp_path / name).write_bytes(b"of others")
+    before = contents(tmp_path)
+    with pytest.raises(StgaError, match=f"{tmp_path}: holds {name}, which was not written here"):
+        write_sequence(tmp_path, 3)
+    with pytest.raises(StgaError, match=f"{tmp_path}: holds {name}, which was not written here"):
+        check_output(tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_a_killed_sequence_can_be_rendered_again(tmp_path: Path) -> None:
+    """Catches images of a process that was killed, or whose disk was full, taken for those of somebody else."""
+    writer = sequence_writer(tmp_path)
+    write = writer.__enter__()
+    for image in images(count=3):
+        write(image)
+    write_sequence(tmp_path, 2)
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["0001.png", "0002.png"]
