@@ -194,7 +194,10 @@ def write_take(recording: Recording, folder: Path) -> Path:
 
 
 @persistent
-def _show_again(scene: Any, _: Any = None) -> None:
-    """The scene's own animation posed the head: pose it live again, so that it does not flicker between two packets."""
-    if _session is not None and scene.name == _session.scene:
+def _show_again(scene: Any, depsgraph: Any) -> None:
+    """The scene's own animation posed the head: pose it live again, so that it does not flicker between two packets.
+
+    Rendered animations keep their own pose.
+    """
+    if _session is not None and scene.name == _session.scene and depsgraph.mode == "VIEWPORT":
         _session.show_again()

@@ -108,6 +108,37 @@ def test_the_head_follows_and_comes_back(live):
     assert not bpy.ops.stga.stop_live.poll()
 
 
+def test_a_rendered_animation_keeps_its_own_pose(live):
+    """Catches an animation rendered while the head is driven, each frame of which shows the last live pose."""
+    rendered = {}
+
+    class Recorder(bpy.types.RenderEngine):
+        bl_idname = "TEST_RECORDER"
+        bl_label = "Recorder"
+
+        def render(self, depsgraph):
+            vertices = the_head().evaluated_get(depsgraph).data.vertices
+            rendered[depsgraph.scene.frame_current] = np.array([vertex.co for vertex in vertices])
+
+    bpy.ops.stga.drive_live()
+    live.send(half(0), 0)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, 3
+    scene.render.resolution_x = scene.render.resolution_y = 4
+    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(scene.camera)
+    scene.render.filepath = str(live.takes / "image_")
+    bpy.utils.register_class(Recorder)
+    try:
+        scene.render.engine = Recorder.bl_idname
+        bpy.ops.render.render(animation=True)
+    finally:
+        bpy.utils.unregister_class(Recorder)
+    for number in (1, 2, 3):
+        wanted = flame_forward(live.own.model, live.own.shape, live.frames[number])
+        np.testing.assert_allclose(rendered[number], wanted, atol=TOLERANCE_M)
+
+
 def test_controls_follow(live):
     """Catches ARKit controls that are driven and posed at the same time, or are left moved."""
     bpy.ops.stga.add_arkit_controls()

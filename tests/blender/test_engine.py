@@ -432,6 +432,26 @@ def test_only_visible_objects_are_rendered(tmp_path):
     assert alpha[:, WIDTH // 2 :].max() > 0.5
 
 
+def test_keyframes_of_visibility_count_in_animations(tmp_path):
+    """Catches a keyframed *Disable in Renders* that is read before the frame's animation, of splats and instances."""
+    splats = replace(
+        random_splats(1, 50), xyz=np.zeros((50, 3), np.float32), log_scale=np.full((50, 3), -4, np.float32)
+    )
+    shown = show_world_splats(splats, "scan")
+    active_camera((0, 0, 1))
+    for frame, hidden in ((1, False), (2, True), (3, False)):
+        shown.hide_render = hidden
+        shown.keyframe_insert("hide_render", frame=frame)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, 3
+    multilayer(scene.render.image_settings)
+    scene.render.filepath = str(tmp_path / "image_####.exr")
+    bpy.ops.render.render(animation=True)
+    images = [read_exr(tmp_path / f"image_{frame:04d}.exr") for frame in (1, 2, 3)]
+    alphas = [next(v for k, v in passes.items() if k.endswith("Combined.A")).max() for passes in images]
+    assert [bool(alpha > 0.5) for alpha in alphas] == [True, False, True]
+
+
 def test_animation(tmp_path):
     """Catches splats that stay where they were on the first frame."""
     show(textured(avatar_of("stga")))

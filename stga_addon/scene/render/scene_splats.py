@@ -90,19 +90,25 @@ def _visible_objects(depsgraph: Any, view: Any) -> Iterator[tuple[Any, Matrix]]:
     view: the 3D viewport (a SpaceView3D) that shows them, None for a final image.
     """
     if view is None:
-        visible = _rendered_objects(depsgraph.view_layer.layer_collection)
+        visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
     else:
         visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
     for each in visible:
         yield from _with_instances(each, depsgraph, Matrix())
 
 
-def _rendered_objects(layer: Any) -> list[Any]:
+def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
     if layer.exclude or layer.collection.hide_render:
         return []
-    own = [candidate for candidate in layer.collection.objects if not candidate.hide_render]
-    return list(dict.fromkeys([*own, *(each for child in layer.children for each in _rendered_objects(child))]))
+    own = [candidate for candidate in layer.collection.objects if _is_rendered(candidate, depsgraph)]
+    inside = (each for child in layer.children for each in _rendered_objects(child, depsgraph))
+    return list(dict.fromkeys([*own, *inside]))
+
+
+def _is_rendered(candidate: Any, depsgraph: Any) -> bool:
+    """By the evaluated object: while an animation is rendered, keyframes do not reach the original."""
+    return not candidate.evaluated_get(depsgraph).hide_render
 
 
 def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iterator[tuple[Any, Matrix]]:
@@ -112,7 +118,7 @@ def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iter
     if collection is not None:
         inside = matrix @ Matrix.Translation(-collection.instance_offset)
         for member in collection.all_objects:
-            if not member.hide_render:
+            if _is_rendered(member, depsgraph):
                 yield from _with_instances(member, depsgraph, inside)
 
 
