@@ -3,7 +3,8 @@
     python benchmarks/tracking_speed.py [--timesteps 300] [--cameras 16] [--size 550x802] [--landmarks]
 
 Renders a few pictures of the demo's head per camera, which are shown again and again, tracks them, and prints the time
-of each stage and the peak memory; with --landmarks, exact landmarks take the detector's place, so that only fit, contact sheet and files are measured. Run it on a quiet machine. Of a further timestep, landmarks and points
+of each stage and the peak memory; with --landmarks, exact landmarks take the detector's place, so that only fit,
+contact sheet and files are measured. Run it on a quiet machine. Of a further timestep, landmarks and points
 are kept, about 0.5 MB for 16 cameras; images are not.
 """
 
