@@ -127,6 +127,22 @@ def test_a_folder_of_mattes(tmp_path):
         open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
 
 
+def test_mattes_of_a_turned_photo(tmp_path):
+    """Catches photos that are turned by EXIF or converted, whose stored pixels are not the frame's, without a matte."""
+    exif = Image.Exif()
+    exif[274] = 3  # upside down
+    for number in range(3):
+        path = tmp_path / f"footage/left/{number:04d}.jpg"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (WIDTH, HEIGHT), (90, 80, 70)).save(path, exif=exif)
+        write_image(tmp_path / f"mattes/left/{number:04d}.png", 10 * number)
+    footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
+    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(3)] == [0, 10, 20]
+    (tmp_path / "mattes/left/0001.png").unlink()
+    with pytest.raises(StgaError, match=r"has no matte of .*0001\.jpg; expected left/0001\.png"):
+        open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
+
+
 def test_mattes_of_a_video(tmp_path):
     """Catches mattes that are counted from 1, or by timestep where frames are left out."""
     pytest.importorskip("av")

@@ -1,5 +1,6 @@
 """Every frame of a video by its number, whatever the container and codec."""
 
+import pickle
 import random
 import struct
 
@@ -163,6 +164,16 @@ def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
             "a.mkv: its first 3 frames cannot be decoded; they are left out, and not counted"
         )
     assert_numbers(tmp_path / "take" / name, list(range(start, FRAMES)))
+
+
+def test_an_open_video_goes_to_a_helping_process(tmp_path):
+    """Catches a decoder in the middle of its video, which cannot be pickled."""
+    write_numbered(tmp_path / "video.mp4", "libx264", {})
+    frames = open_footage(tmp_path / "video.mp4", focal=50.0).cameras[0].frames
+    frames.image(frames.timesteps[0])
+    there = pickle.loads(pickle.dumps(frames))
+    for timestep in frames.timesteps[1:3]:
+        np.testing.assert_array_equal(there.image(timestep), frames.image(timestep))
 
 
 def test_variable_frame_rate(tmp_path):

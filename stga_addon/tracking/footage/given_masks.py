@@ -57,11 +57,11 @@ def _masked(camera: FootageCamera, recorded: Sources, given: Sources, single: bo
     by_number = {frame_number(path): path for name in reversed(names) for path in given.folders.get(name, [])}
     masks = {}
     for timestep in camera.timesteps:
-        path, file = None, camera.frames.file(timestep)
         if isinstance(camera.frames, VideoFrames):
             expected = f"{camera.name}/{camera.frames.numbers[timestep]:05d}"
             path = by_number.get(camera.frames.numbers[timestep])
-        elif file is not None:
+        else:
+            file = Path(camera.source(timestep))
             expected = recorded.name_of(file) if file.is_relative_to(recorded.root) else file.stem
             path = next(iter(given.images.get(expected) or given.masks.get(expected, [])), None)
         if path is None:

@@ -100,6 +100,10 @@ class VideoFrames:
         self._decoded = -1
         """Number of the frame that was decoded last."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For helping processes, which open the video themselves."""
+        return {**vars(self), "_container": None, "_decoder": None, "_decoded": -1}
+
     @property
     def timesteps(self) -> tuple[int, ...]:
         return tuple(self.numbers)
