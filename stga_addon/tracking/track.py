@@ -1,6 +1,7 @@
 """Tracking of a head: footage and a head model to a capture."""
 
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -154,7 +155,8 @@ def track(
         def head_pixels(timestep: int, camera: FootageCamera) -> np.ndarray:
             return silhouette(posed_mesh(fit, parameters[timestep]), fit.head.model.faces, cameras[camera.name])
 
-        source = _source(footage, head_file, landmarks)
+        plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
+        source = {**_source(footage, head_file, landmarks), "plates": [list(map(str, plates)), _state(plates)]}
         footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
     torso = follow_torso(fit, parameters, footage, report)
     result = TrackingReport(
@@ -245,7 +247,7 @@ def _source(footage: Footage, head_file: Path, landmarks: Path | None = None) ->
         "footage": str(footage.root),
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
-        "head_model": str(head_file.resolve()),
+        "head_model": [str(head_file.resolve()), _state([head_file])],
         "landmarks": None if landmarks is None else realpath(landmarks),
     }
 
@@ -259,11 +261,19 @@ def _begin(out: Path, source: dict[str, Any]) -> None:
 
 
 def _recording(camera: FootageCamera) -> list[Any]:
-    """The first frame and how it is undistorted; it changes with offset, lens and focal length."""
-    first, pinhole = camera.source(camera.timesteps[0]), camera.camera
+    """The first frame, the state of all files, and how frames are undistorted; it changes with offset and lens."""
+    pinhole = camera.camera
+    first = [camera.source(camera.timesteps[0]), _state(camera.frames.files)]
     if camera.undistortion is None:
-        return [first]
-    return [first, repr(camera.undistortion.lens), pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy]
+        return first
+    return [*first, repr(camera.undistortion.lens), pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy]
+
+
+def _state(files: Iterable[Path]) -> str:
+    """Changes with the size or the time of modification of one of the files."""
+    states = [file.stat() for file in files]
+    sizes = repr([(state.st_size, state.st_mtime_ns) for state in states])
+    return hashlib.sha256(sizes.encode()).hexdigest()[:16]
 
 
 def _reliable(found: Mapping[str, CameraLandmarks], reliable: np.ndarray) -> dict[str, CameraLandmarks]:

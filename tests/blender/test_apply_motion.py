@@ -90,6 +90,7 @@ def test_a_file_from_a_start_frame(scene):
 def test_a_runs_refined_tracking(scene, tmp_path):
     """Catches a head that does not get to where its avatar was trained: timesteps 0, 1 and 3, refined."""
     tracking = Tracking(scene.own, scene.own.timesteps)
+    tracking.state.steps[:] = 1
     tracking.state.change[:] = np.random.default_rng(0).normal(0, 0.05, tracking.tracked.shape)
     write_tracking(tmp_path, tracking.sequence, tracking.parameters(), tracking.tracked)
     shown = with_refined_tracking(open_capture(scene.folder, scene.model_file), tmp_path)
@@ -110,6 +111,7 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
     own = open_capture(folder, model)
     tracking = Tracking(own.flame, own.flame.timesteps)
+    tracking.state.steps[:] = 1
     tracking.state.change[:] = rng.normal(0, 0.05, tracking.tracked.shape)
     write_tracking(tmp_path, tracking.sequence, tracking.parameters(), tracking.tracked)
     shown = with_refined_tracking(own, tmp_path)

@@ -82,7 +82,7 @@ def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
     save_and_open(tmp_path / "head.blend")
     assert stga("export", "--format", "ply-sequence", "--out", tmp_path / "plys") == 0
     assert stga("export", tmp_path / "a.npz", "--format", "gaussian-avatars", "--out", tmp_path / "pair") == 0
-    assert sorted(path.name for path in (tmp_path / "plys").iterdir()) == [f"{t:05d}.ply" for t in range(4)]
+    assert sorted(path.name for path in (tmp_path / "plys").glob("*.ply")) == [f"{t:05d}.ply" for t in range(4)]
     bpy.context.scene.frame_set(2)  # not among the tracked timesteps
     frames = face_frames(evaluated_vertices(bpy.context.scene.stga.head), avatar.faces, avatar.neutral)
     expected = to_world(avatar.splats, frames).xyz

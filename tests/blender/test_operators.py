@@ -213,7 +213,7 @@ def test_exports_read_back(shown, tmp_path):
     at_3 = expected_world(avatar, capture.mesh(3)).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "one.ply").xyz, at_3, atol=1e-5)
     assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "many"), format="ply-sequence") == {"FINISHED"}
-    assert sorted(path.name for path in (tmp_path / "many").iterdir()) == [f"{frame:05d}.ply" for frame in range(4)]
+    assert sorted(path.name for path in (tmp_path / "many").glob("*.ply")) == [f"{frame:05d}.ply" for frame in range(4)]
     np.testing.assert_allclose(read_ply(tmp_path / "many/00003.ply").xyz, at_3, atol=1e-5)
     assert np.abs(read_ply(tmp_path / "many/00000.ply").xyz - at_3).max() > 1e-3
     assert bpy.context.scene.frame_current == 3

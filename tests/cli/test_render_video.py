@@ -63,7 +63,7 @@ def test_a_range_of_frames(parts: dict[str, Path], tmp_path: Path, capsys: pytes
     names = {}
     for span in ("0:3", "0:0", "1-3"):
         assert render(parts, *cameras, "--out", tmp_path / span, "--frames", span) == 0
-        names[span] = {path.name: path.read_bytes() for path in (tmp_path / span).iterdir()}
+        names[span] = {path.name: path.read_bytes() for path in (tmp_path / span).glob("*.png")}
     assert names["0:0"]
     assert names["1-3"]
     assert names["0:0"].keys().isdisjoint(names["1-3"])
@@ -88,7 +88,7 @@ def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
     """Catches a turn about another point, one that leaves out a part of the circle, and motion that does not play."""
     out = tmp_path / "turn"
     assert render(parts, "--turntable", 360, "--out", out, "--seconds", 2, "--fps", 4, "--camera", 0) == 0
-    pictures = sorted(out.iterdir())
+    pictures = sorted(out.glob("*.png"))
     assert [path.name for path in pictures] == [f"{index:04d}.png" for index in range(1, 9)]
     avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
     start = next(view.camera for views in capture.views.values() for view in views if view.camera_index == 0)

@@ -255,7 +255,7 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path: Path
 
 def contents(path: Path) -> dict[str, bytes]:
     """Name -> bytes of the files of a folder, or of one file."""
-    return {file.name: file.read_bytes() for file in (path.iterdir() if path.is_dir() else (path,))}
+    return {file.name: file.read_bytes() for file in (path.glob("[!.]*") if path.is_dir() else (path,))}
 
 
 @pytest.mark.slow

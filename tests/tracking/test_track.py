@@ -1,5 +1,6 @@
 """`stga track` from footage to a capture that opens, with landmark files and with the networks."""
 
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -413,8 +414,9 @@ def test_the_capture_is_not_written_into_the_footage(tmp_path):
         track(open_footage(tmp_path), tmp_path / "head.npz", tmp_path)
 
 
-def test_landmarks_of_another_offset_are_not_used_again(tmp_path, head, monkeypatch):
-    """Catches landmarks of a run that was out of step taken for those of the corrected offset."""
+def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monkeypatch):
+    """Catches landmarks of a run that was out of step taken for those of the corrected offset, and those of a recording
+    or a head model that was replaced under its name."""
     write_folders(tmp_path / "footage", (6, 8))
     write_flame(head.model, tmp_path / "head.npz")
     places = places_on(head, LANDMARKS)
@@ -424,6 +426,14 @@ def test_landmarks_of_another_offset_are_not_used_again(tmp_path, head, monkeypa
         footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset}))
         with pytest.raises(StgaError, match=message):
             track(footage, tmp_path / "head.npz", tmp_path / "out")
+    image = sorted((tmp_path / "footage").rglob("*.png"))[3]
+    for number, changed in enumerate((image, tmp_path / "head.npz")):
+        footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6))
+        with pytest.raises(StgaError, match="shows no face"):
+            track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
+        os.utime(changed, ns=(0, 1))
+        with pytest.raises(StgaError, match="holds landmarks of other footage"):
+            track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
 
 
 def test_two_faces_are_reported_with_camera_and_frame(recorded):

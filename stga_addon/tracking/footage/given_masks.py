@@ -35,6 +35,10 @@ class MaskedFrames:
     def source(self, timestep: int) -> str:
         return self.frames.source(timestep)
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return self.frames.files
+
     def file(self, timestep: int) -> Path | None:
         return self.frames.file(timestep)
 

@@ -40,6 +40,10 @@ class ImageFrames:
     def source(self, timestep: int) -> str:
         return str(self.views[timestep].image)
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return tuple(view.image for view in self.views.values())
+
     def file(self, timestep: int) -> Path | None:
         image = self.views[timestep].image
         return image if is_plain(image) else None

@@ -29,6 +29,10 @@ class Frames(Protocol):
     def source(self, timestep: int) -> str:
         """What a message calls the frame: its file, in a video with the number of the frame."""
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What the frames are read from: their image files, or the video."""
+
     def file(self, timestep: int) -> Path | None:
         """The image file whose stored pixels are the frame; None in a video, and where they are turned or converted."""
 

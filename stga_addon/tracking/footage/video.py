@@ -126,6 +126,10 @@ class VideoFrames:
     def source(self, timestep: int) -> str:
         return f"{self.video.path}: frame {self.numbers[timestep]}"
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return (self.video.path,)
+
     def file(self, timestep: int) -> None:
         return None
 
