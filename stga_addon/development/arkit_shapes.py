@@ -33,7 +33,7 @@ def main(source: Path) -> None:
 
     row = {str(name): number for number, name in enumerate(arrays["expr_names"])}
     shapes = [
-        sum(at_points(arrays["expr"][row[name]]) for name in _ict_names(shape))
+        sum(at_points(arrays["expr"][row[name]]) for name in ict_names(shape))
         for shape in ARKIT_SHAPES
         if shape not in OPTIONAL
     ]
@@ -51,7 +51,7 @@ def main(source: Path) -> None:
     )
 
 
-def _ict_names(shape: str) -> tuple[str, ...]:
+def ict_names(shape: str) -> tuple[str, ...]:
     if shape in BOTH_SIDES:
         return f"{shape}_L", f"{shape}_R"
     for side in ("Left", "Right"):

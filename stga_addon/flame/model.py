@@ -16,6 +16,11 @@ FULL_COMPONENTS, FULL_IDENTITY = 400, 300  # FLAME 2020 and 2023: 300 identity t
 MASK_FILE = "FLAME_masks.pkl"
 MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
 MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
+BUNDLED_HEAD = Path(__file__).with_name("head.npz")
+"""The head model of this package: ICT-FaceKit (MIT License, Copyright (c) 2020 USC Institute for Creative Technologies)
+in FLAME's form, made by `development/bundled_head.py`."""
+SHAPE_STEP_M = 1e-5
+"""Step of `shape_steps` (K, V, 3), displacements in whole numbers, which a file may have in place of shapedirs."""
 # Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
 KEY_MASKS = {
     "left_eye": ("left_eye_region", "left_eyeball"),
@@ -41,6 +46,7 @@ class FlameModel:
     weights      (V, 5) skinning weights
     faces        (F, 3) int32
     masks        region name -> vertex ids
+    expression_names  ARKit's name of each expression, whose coefficient is a weight from 0 to 1; () where they have none
     """
 
     v_template: np.ndarray
@@ -52,6 +58,7 @@ class FlameModel:
     weights: np.ndarray
     faces: np.ndarray
     masks: Mapping[str, np.ndarray] = field(default_factory=dict)
+    expression_names: tuple[str, ...] = ()
 
     @property
     def n_expression(self) -> int:
@@ -63,29 +70,52 @@ def read_flame(path: Path) -> FlameModel:
     """Read a FLAME model from the published .pkl or from an .npz with the same keys.
 
     Vertex masks come from an npz model's own `masks/<region>` entries, else from FLAME_masks.pkl
-    beside the model where there is one. Any sizes that agree with each other are accepted. Raises StgaError naming the
-    file and key that is missing, of the wrong shape or not finite, and any class in a pickle that is not an array.
+    beside the model where there is one. Any sizes that agree with each other are accepted. An npz may name its
+    expressions (`expression_names`), have `shape_steps` in place of shapedirs, and no posedirs. Raises StgaError naming
+    the file and key that is missing, of the wrong shape or not finite, and any class in a pickle that is not an array.
     """
     path = Path(path)
     in_npz = path.suffix.lower() == ".npz"
-    arrays = read_npz(path) if in_npz else read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
+    arrays = _npz_arrays(path) if in_npz else read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
     for key in MODEL_KEYS:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}, which a FLAME model needs")
     template = _floats(path, arrays, "v_template", (None, 3))
     vertices = len(template)
     shapedirs = _floats(path, arrays, "shapedirs", (vertices, 3, None))
+    n_identity = _identity_count(path, arrays, shapedirs.shape[2])
     return FlameModel(
         v_template=template,
         shapedirs=shapedirs,
-        n_identity=_identity_count(path, arrays, shapedirs.shape[2]),
+        n_identity=n_identity,
         posedirs=_floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES)),
         j_regressor=_floats(path, arrays, "J_regressor", (len(JOINTS), vertices)),
         parents=_parents(path, arrays),
         weights=_floats(path, arrays, "weights", (vertices, len(JOINTS))),
         faces=_faces(path, arrays, vertices),
         masks=_masks(path, arrays, vertices),
+        expression_names=_expression_names(path, arrays, shapedirs.shape[2] - n_identity),
     )
+
+
+def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The file's arrays, with what an npz may leave out."""
+    arrays = dict(read_npz(path))
+    if "shape_steps" in arrays and "v_template" in arrays:
+        steps = _floats(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
+        arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
+    if "v_template" in arrays:
+        arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
+    return arrays
+
+
+def _expression_names(path: Path, arrays: Mapping[str, np.ndarray], count: int) -> tuple[str, ...]:
+    if "expression_names" not in arrays:
+        return ()
+    names = arrays["expression_names"]
+    if names.dtype.kind != "U" or names.shape != (count,) or len(set(names.tolist())) != count:
+        raise StgaError(f"{path}: expression_names: expected {count} different names, one per expression")
+    return tuple(names.tolist())
 
 
 def _check_shape(path: Path, key: str, array: np.ndarray, expected: tuple[int | None, ...]) -> None:
