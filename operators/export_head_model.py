@@ -1,12 +1,10 @@
 """Exports a mesh object with shape keys as a linear head model, which footage can be tracked with."""
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.shape_keys import has_shape_keys, shape_key_model
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
 from . import ids
@@ -29,12 +27,6 @@ class ExportHeadModel(bpy.types.Operator, ExportHelper):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        write_shape_key_model(context, file_path(self.filepath, "head model"))
+        path = file_path(self.filepath, "head model")
+        write_linear_model(path, shape_arrays(*shape_key_model(context.active_object)))
         return {"FINISHED"}
-
-
-def write_shape_key_model(context: Any, path: Path) -> None:
-    """Write the active object's shape keys as a linear head model. Raises StgaError where it has none."""
-    if not has_shape_keys(context.active_object):
-        raise StgaError("No head model given, and the active object has no shape keys")
-    write_linear_model(path, shape_arrays(*shape_key_model(context.active_object)))

@@ -9,12 +9,8 @@ from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import SolveAgain, Track
 from . import ids
 from .common import file_path, path_property, reporting
-from .export_head_model import write_shape_key_model
 from .request import needs_idle, start
 from .training_python import training_python
-
-HEAD_MODEL = "head_model.npz"
-"""In the capture's folder: the shape keys that it was tracked with."""
 
 
 class TrackOptions:
@@ -27,7 +23,7 @@ class TrackOptions:
     )
     model: path_property(
         "Head Model",
-        "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb); empty: the active object's shape keys",
+        "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb); empty: the head of this add-on",
     )
     directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
     focal: bpy.props.FloatProperty(
@@ -73,18 +69,13 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
     def execute(self, context: Any) -> set[str]:
         python = training_python(context, self.python)
         out, footage = file_path(self.directory, "capture").resolve(), file_path(self.footage, "footage")
-        if self.model:
-            model = file_path(self.model, "head model").resolve()
-        else:
-            model = out / HEAD_MODEL
-            write_shape_key_model(context, model)
 
         def optional(value: str, what: str) -> Path | None:
             return file_path(value, what).resolve() if value else None
 
         request = Track(
             footage.resolve(),
-            model,
+            optional(self.model, "head model"),
             out,
             optional(self.cameras, "cameras"),
             optional(self.landmarks, "landmarks"),

@@ -1,5 +1,6 @@
 """The Motion step: applying the motion of others, and sliders for expression and identity."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import bpy
@@ -8,7 +9,7 @@ from ..operators import ids
 from ..operators.common import is_head, rig_or_none, scene_settings
 from ..stga_addon.driving.names import ARKIT_SHAPES
 from ..stga_addon.scene.rig.arkit import has_controls
-from ..stga_addon.scene.rig.names import EXPRESSION_KEY, IDENTITY_KEY, property_path
+from ..stga_addon.scene.rig.names import IDENTITY_KEY, is_expression_key, property_path
 from ..stga_addon.scene.rig.trained import outside_now, stored_range
 from .sidebar import SidebarPanel
 
@@ -71,32 +72,32 @@ class TrainedPanel(SidebarPanel, bpy.types.Panel):
 class _Sliders(SidebarPanel):
     bl_parent_id = MotionPanel.bl_idname
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
-    start = ""
+    belongs: ClassVar[Any]
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return bool(_sliders(context, cls.start))
+        return bool(_sliders(context, cls.belongs))
 
     def draw(self, context: Any) -> None:
         column = self.layout.column(align=True)
-        for key in _sliders(context, self.start)[:MAX_SLIDERS]:
+        for key in _sliders(context, self.belongs)[:MAX_SLIDERS]:
             column.prop(key, "value", text=key.name, slider=True)
 
 
 class ExpressionPanel(_Sliders, bpy.types.Panel):
     bl_idname = "STGA_PT_expression"
     bl_label = "Expression"
-    start = EXPRESSION_KEY
+    belongs = staticmethod(is_expression_key)
 
 
 class IdentityPanel(_Sliders, bpy.types.Panel):
     bl_idname = "STGA_PT_identity"
     bl_label = "Identity"
-    start = IDENTITY_KEY
+    belongs = staticmethod(lambda name: name.startswith(IDENTITY_KEY))
 
 
-def _sliders(context: Any, start: str) -> list[Any]:
+def _sliders(context: Any, belongs: Callable[[str], bool]) -> list[Any]:
     head = scene_settings(context).head
     if not is_head(head) or head.data.shape_keys is None:
         return []
-    return [key for key in head.data.shape_keys.key_blocks if key.name.startswith(start)]
+    return [key for key in head.data.shape_keys.key_blocks if belongs(key.name)]

@@ -11,7 +11,6 @@ from ..operators.track import TrackOptions
 from ..operators.track_correct import tracking_keys
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.shape_keys import has_shape_keys
 from ..stga_addon.tracking.folder import SHEET_FILE
 from .options import set_options
 from .request import draw_end, draw_running
@@ -35,10 +34,6 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
             draw_text(box, context, tracking.snapshot.status.detail)
         for name in ("footage", "cameras", "model", "directory"):
             layout.prop(settings.track, name)
-        thing = context.view_layer.objects.active
-        if not settings.track.model:
-            name = thing.name if has_shape_keys(thing) else "none"
-            layout.label(text=f"Shape keys of the active object: {name}", icon="SHAPEKEY_DATA")
         track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
         set_options(track, settings.track, TrackOptions)
         draw_missing_environment(layout, context)

@@ -28,6 +28,8 @@ CANONICAL_NAME = "canonical_flame_param.npz"
 PARAMETERS = "flame_param"
 OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
 """Names of a FLAME model file in the folder of a capture, which is used where none is given."""
+BUNDLED_MODEL = "bundled_head.npz"
+"""Copy of the head model of this package in the folder of a capture that was tracked with it."""
 
 
 def open_flame_capture(
@@ -97,7 +99,9 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
 
 
 def _model_file(root: Path, given: Path | None) -> Path:
-    """The FLAME model file that is given, else the one in the capture's folder."""
+    """The capture's bundled head, else the FLAME model file that is given, else the one in the capture's folder."""
+    if (root / BUNDLED_MODEL).is_file():
+        return root / BUNDLED_MODEL
     beside = (root / name for name in OWN_MODELS)
     found = given or next((path for path in beside if path.is_file()), None)
     if found is None:

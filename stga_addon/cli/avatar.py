@@ -119,7 +119,7 @@ def _track(options: Namespace, capture: Path) -> None:
 def _read_inputs(out: Path) -> dict[str, Any]:
     """Raises StgaError where inputs.json is missing or malformed."""
     values = read_json(out / INPUTS)
-    if not isinstance(values, dict) or not isinstance(values.get("model"), str):
+    if not isinstance(values, dict) or not isinstance(values.get("model", 0), str | None):
         raise StgaError(f"{out / INPUTS}: has no model; expected what `stga avatar` wrote")
     return values
 
@@ -154,7 +154,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     from ..tracking.folder import is_flame
 
     inputs = _read_inputs(out)
-    flame = Path(inputs["model"]) if is_flame(out / CAPTURE) else None
+    flame = Path(inputs["model"]) if inputs["model"] and is_flame(out / CAPTURE) else None
     capture, avatar = open_capture(out / CAPTURE, flame), read_avatar(out / RUN / AVATAR)
     empty_file()
     head = set_up_head(refine(capture), flame)

@@ -24,9 +24,8 @@ def add_footage(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--model",
         type=usable_path,
-        required=True,
         metavar="HEAD",
-        help="FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb)",
+        help="FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb) in place of the bundled head",
     )
     parser.add_argument("--cameras", type=usable_path, metavar="FILE", help="calibration that is not in FOOTAGE")
     parser.add_argument("--landmarks", type=usable_path, metavar="FOLDER", help="landmark files of another detector")

@@ -20,7 +20,8 @@ from .arkit_shapes import METERS_PER_UNIT, ict_names
 # First and last vertex of the model's parts, and how many triangles of each are kept. Its second
 # shells of the eyeballs, tear films and lashes are left out.
 FACE, HEAD, MOUTH_INSIDE, EYE_SOCKETS = (0, 9409), (9409, 11248), (11248, 13294), (13294, 14062)
-SKIN, GUMS, TEETH, LEFT_EYEBALL, RIGHT_EYEBALL = (0, 14062), (14062, 17039), (17039, 21451), (21451, 22221), (23021, 23791)  # fmt: skip
+SKIN, GUMS, TEETH = (0, 14062), (14062, 17039), (17039, 21451)
+LEFT_EYEBALL, RIGHT_EYEBALL = (21451, 22221), (23021, 23791)
 KEPT_TRIANGLES = {SKIN: 19000, GUMS: 900, TEETH: 2500, LEFT_EYEBALL: 500, RIGHT_EYEBALL: 500}
 # Factors of the skin's geometric error, by which triangles are distributed over it.
 DETAIL = {FACE: 1.0, HEAD: 0.3, MOUTH_INSIDE: 0.03, EYE_SOCKETS: 0.03}
@@ -142,7 +143,7 @@ def collapsed(vertices: np.ndarray, triangles: np.ndarray, detail: np.ndarray, w
 
     def cost(gone: int, end: int) -> float:
         at = np.append(vertices[end], 1.0)
-        return float(at @ quadrics[gone] @ at) * detail[gone]
+        return float(at @ quadrics[gone] @ at * detail[gone])
 
     def folds(gone: int, end: int) -> bool:
         for number in around[gone] - around[end]:

@@ -1,4 +1,4 @@
-"""The map from ARKit's 52 weights to the parameters of one FLAME head."""
+"""The map from ARKit's 52 weights to the parameters of one FLAME head: fitted, or exact for the bundled head."""
 
 import hashlib
 from collections import OrderedDict
@@ -115,7 +115,8 @@ def head_map(sequence: FlameSequence, name: str) -> HeadMap:
         digest.update(np.ascontiguousarray(array).tobytes())
     key = digest.digest()
     if key not in _cache:
-        _cache[key] = _fitted(person, *face_points(sequence.model, name))
+        fitted = _named if person.expression_names else _fitted
+        _cache[key] = fitted(person, *face_points(sequence.model, name))
         while len(_cache) > CACHED_MAPS:
             _cache.popitem(last=False)
     return _cache[key]
@@ -135,6 +136,18 @@ def _fitted(person: FlameModel, places: SurfacePoints, used: np.ndarray) -> Head
     eyes = _gaze()
     found = HeadMap(points, used, fit.targets, expressions, fit.jaw, eyes, np.zeros(COUNT))
     return replace(found, reach=_reach(found, fit, person))
+
+
+def _named(person: FlameModel, places: SurfacePoints, used: np.ndarray) -> HeadMap:
+    """The map of a model without identity components whose expressions are ARKit's shapes."""
+    points = SurfacePoints(places.face[used], places.barycentric[used])
+    columns = [COLUMN[name] for name in person.expression_names]
+    targets, expressions = np.zeros((COUNT, used.sum(), 3)), np.zeros((FEATURES, person.n_expression))
+    targets[columns] = [points.on(shape, person.faces) for shape in np.moveaxis(person.shapedirs, 2, 0)]
+    expressions[columns, range(person.n_expression)] = 1
+    eyes, reach = _gaze(), np.zeros(COUNT)
+    reach[columns] = 1
+    return HeadMap(points, used, targets, expressions, np.zeros((COUNT, 3)), eyes, reach)
 
 
 class _Fit:

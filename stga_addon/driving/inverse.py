@@ -44,10 +44,14 @@ def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Perf
 def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameSequence) -> np.ndarray:
     """(T, 52) weights of 0 to 1 whose parameters (`HeadMap.parameters`) move the face most like the frames.
 
-    The jaw's and the gaze's shapes follow from the rotations; what they do to the skin is taken off, and the others
-    follow from the expression coefficients by coordinate descent on the non-negative least squares.
+    Expressions with ARKit's names are the weights. Else the jaw's and the gaze's shapes follow from the rotations; what
+    they do to the skin is taken off, and the others follow from the expression coefficients by coordinate descent on
+    the non-negative least squares.
     """
     weights = np.zeros((len(frames), COUNT))
+    if names := sequence.model.expression_names:
+        weights[:, [COLUMN[name] for name in names]] = np.clip([frame.expr for frame in frames], 0, 1)
+        return weights
     jaw_columns = [COLUMN[name] for name in JAW_SHAPES]
     jaw = np.stack([frame.jaw_pose for frame in frames])
     weights[:, jaw_columns] = _descended(*_normal(found.jaw[jaw_columns], jaw), np.zeros((len(frames), 3)))

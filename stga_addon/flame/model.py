@@ -46,7 +46,7 @@ class FlameModel:
     weights      (V, 5) skinning weights
     faces        (F, 3) int32
     masks        region name -> vertex ids
-    expression_names  ARKit's name of each expression, whose coefficient is a weight from 0 to 1; () where they have none
+    expression_names  ARKit's name of each expression, whose coefficient is then a weight from 0 to 1; else ()
     """
 
     v_template: np.ndarray

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from .model import JOINTS, FlameModel, read_flame
+from .model import BUNDLED_HEAD, JOINTS, FlameModel, read_flame
 
 TEMPLATE_VERTICES = 5023
 TEETH_VERTICES, TEETH_FACES = 120, 168
@@ -38,6 +38,8 @@ OVERBITE, OVERJET = 0.06, 0.02
 """How far the upper edge reaches below the lower one, and stands in front of it."""
 EDGE_THICKNESS, ROOT_THICKNESS = 0.05, 0.1
 MAX_MOUTH_RINGS = 12
+MAX_LIP_DISTANCE_M = 0.002
+"""Between opposite vertices of closed lips."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,9 @@ class _Mouth:
         return np.concatenate(self.rings)
 
 
-def flame_model(path: Path) -> FlameModel:
-    """The FLAME model file, with teeth where it has FLAME's 5023 vertices. Raises StgaError."""
-    model = read_flame(path)
+def flame_model(path: Path | None) -> FlameModel:
+    """The FLAME model file, with teeth where it has FLAME's 5023 vertices; None: the bundled head. Raises StgaError."""
+    model = read_flame(path or BUNDLED_HEAD)
     return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
 
 
@@ -98,13 +100,27 @@ def with_teeth(model: FlameModel) -> FlameModel:
 def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
     """Vertex ids (n,) along the upper and the lower lip between the corners of the mouth, opposite each other.
 
-    They are found on FLAME's mesh with or without teeth. Raises StgaError for a mesh without an open mouth.
+    They are found on FLAME's mesh with or without teeth, and where expressions have ARKit's names. Raises StgaError for
+    another mesh without an open mouth.
     """
+    if "jawOpen" in model.expression_names:
+        return _opened_lips(model)
     lips = _mouth(model).lips
     half = len(lips) // 2
     sides = lips[1:half], lips[:half:-1]
     heights = [model.v_template[side, 1].mean() for side in sides]
     return sides if heights[0] > heights[1] else sides[::-1]
+
+
+def _opened_lips(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs of nearest vertices of the lips, of which jawOpen moves one and leaves the other."""
+    column = model.n_identity + model.expression_names.index("jawOpen")
+    lips = model.masks["lips"]
+    opened = np.linalg.norm(model.shapedirs[lips, :, column], axis=1)
+    upper, lower = lips[opened < opened.max() / 4], lips[opened > opened.max() / 2]
+    distances = np.linalg.norm(model.v_template[upper, None] - model.v_template[lower], axis=2)
+    near = np.flatnonzero(distances.min(axis=1) < MAX_LIP_DISTANCE_M)
+    return upper[near], lower[distances[near].argmin(axis=1)]
 
 
 def teeth_faces(first: int) -> np.ndarray:

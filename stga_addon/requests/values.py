@@ -145,7 +145,7 @@ class Track:
     """Track a head through footage, and write a capture.
 
     footage         folder of images or videos, or a video
-    model           head model file
+    model           head model file; None: the bundled head
     out             folder of the capture
     cameras         calibration that is not in the footage's folder
     landmarks       folder of landmark files of another detector
@@ -162,7 +162,7 @@ class Track:
     """
 
     footage: Path
-    model: Path
+    model: Path | None
     out: Path
     cameras: Path | None = None
     landmarks: Path | None = None

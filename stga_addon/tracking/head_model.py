@@ -44,13 +44,16 @@ class HeadModel:
         return (True, *(bool(value) for value in present[1:]))
 
 
-def read_head_model(path: Path) -> HeadModel:
-    """Read a FLAME model (.pkl or .npz), a linear model from an .npz, or morph targets from a .glb (`shape_arrays`).
+def read_head_model(path: Path | None) -> HeadModel:
+    """Read a FLAME model (.pkl or .npz), a linear model from an .npz, or morph targets from a .glb (`shape_arrays`);
+    None: the bundled head.
 
     A linear model has `mean` (V, 3) meters and `faces` (F, 3), and optionally `identity` (V, 3, I), `expression`
     (V, 3, E), and `J_regressor` (5, V) with `weights` (V, 5) for the joints root, neck, jaw, left and right eye.
     Components are scaled so that a coefficient is of the order of 1. Raises StgaError naming the file and the field.
     """
+    if path is None:
+        return HeadModel(flame_model(None), "flame")
     if path.suffix.lower() == ".glb":
         mesh = read_glb(path)
         arrays = shape_arrays(mesh.positions, mesh.faces, mesh.names, mesh.targets)

@@ -1,6 +1,7 @@
 """Tracking of a head: footage and a head model to a capture."""
 
 import hashlib
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -12,11 +13,13 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
+from ..capture.flame_capture import BUNDLED_MODEL
 from ..capture.mesh_raster import silhouette
 from ..capture.model import evenly_spread
 from ..errors import StgaError
-from ..files import read_json, write_json
+from ..files import read_json, replacing, write_json
 from ..flame.forward import RIGID_SIZE
+from ..flame.model import BUNDLED_HEAD
 from ..schema import to_json
 from ..worker.helpers import Helpers
 from .camera_scale import scale_warnings
@@ -92,7 +95,7 @@ class TrackingReport:
 
 def track(
     footage: Footage,
-    head_file: Path,
+    head_file: Path | None,
     out: Path,
     landmarks: Path | None = None,
     meshes: bool = False,
@@ -102,6 +105,7 @@ def track(
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
+    head_file: a head model; None: the bundled one, which is copied into the capture.
     landmarks: folder of landmark files in place of the networks'.
     mattes: whether they are made for frames without a mask (`with_mattes`).
     What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks: called again after an interruption, those
@@ -122,7 +126,7 @@ def track(
     else:
         detector = FaceNetworks()
         report("Head model", 0, 1)
-        places, reliable = calibrate(head.model, detector, str(head_file))
+        places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
         _begin(out, _source(footage, head_file))
         places_file = out / LANDMARKS_FOLDER / PLACES_FILE
         write_places(places_file, places, reliable)
@@ -184,6 +188,9 @@ def track(
         write_landmarks(out / LANDMARKS_FOLDER, detected, places, reliable)
     if torso.points is not None:
         write_torso_points(out, torso.points)
+    if head_file is None:
+        with replacing(out / BUNDLED_MODEL) as copy:
+            shutil.copyfile(BUNDLED_HEAD, copy)
     write_capture(out, footage, torso.fit, torso.parameters, torso.offsets, meshes, report)
     return result
 
@@ -241,13 +248,13 @@ def reprojection_errors(
     return errors
 
 
-def _source(footage: Footage, head_file: Path, landmarks: Path | None = None) -> dict[str, Any]:
+def _source(footage: Footage, head_file: Path | None, landmarks: Path | None = None) -> dict[str, Any]:
     """What landmarks and mattes are of; landmarks: the folder that they were read from."""
     return {
         "footage": str(footage.root),
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
-        "head_model": [str(head_file.resolve()), _state([head_file])],
+        "head_model": [str(head_file.resolve()) if head_file else "", _state([head_file or BUNDLED_HEAD])],
         "landmarks": None if landmarks is None else realpath(landmarks),
     }
 

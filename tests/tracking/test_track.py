@@ -18,6 +18,7 @@ from stga_addon.errors import StgaError
 from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import flame_forward
+from stga_addon.flame.teeth import flame_model
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.open import open_footage
@@ -56,6 +57,25 @@ def recorded(tmp_path, take, monkeypatch):
 def command(folder, *more):
     out = ["--out", str(folder / "out"), "--landmarks", str(folder / "points")]
     return main(["track", str(folder / "footage"), "--model", str(folder / "head.npz"), *out, *more])
+
+
+def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
+    """Catches a default that needs a file, a capture that opens only with one, or with another one that is given, and
+    weights of another scale."""
+    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
+    head = HeadModel(flame_model(None), "flame")
+    meshes = record(tmp_path, head)
+    paths = [str(tmp_path / name) for name in ("footage", "out", "points")]
+    assert main(["track", paths[0], "--out", paths[1], "--landmarks", paths[2], "--mattes", "none"]) == 0
+    capture = open_capture(tmp_path / "out", tmp_path / "head.npz")
+    assert capture.flame_file == tmp_path / "out/bundled_head.npz"
+    assert capture.flame.model.expression_names == head.model.expression_names
+    face, cameras = head.model.masks["nose"], {f"cam{number}": camera for number, camera in enumerate(rig())}
+    for view in capture.views["train"]:
+        if view.timestep != 2:
+            pixels, _ = view.camera.project(capture.mesh(view.timestep)[face])
+            expected, _ = cameras[f"cam{view.camera_index}"].project(meshes[view.timestep][face])
+            assert np.abs(pixels - expected).mean() < 0.4
 
 
 def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsys, head):

@@ -72,6 +72,7 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
 
 
 def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
+    controls = playback.controls if rig.expressions else None
     return {
         "title": playback.title,
         "convention": avatar.convention,
@@ -81,8 +82,9 @@ def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
         "up": [float(value) for value in playback.up],
         "joints": list(rig.joint_names),
         "parents": list(rig.parents),
-        "sliders": _sliders(rig),
-        **_shapes(playback.controls if rig.expressions else None),
+        # Where expressions are ARKit's shapes, those are their sliders.
+        "sliders": [] if controls is not None and rig.expression_names else _sliders(rig),
+        **_shapes(controls),
         **({} if avatar.light is None else {"light": {"damping": avatar.light.damping}}),
         "views": [_view(name, camera) for name, camera in playback.views.items()],
     }
@@ -90,10 +92,11 @@ def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
 
 def _sliders(rig: WebRig) -> list[dict[str, Any]]:
     """Name, component and range of every expression, those that the motion uses most first."""
+    names = rig.expression_names or [f"expr_{k:03d}" for k in range(rig.expressions)]
     used = rig.coefficients[:, : rig.expressions]
     reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
     order = np.argsort(-used.std(0), kind="stable") if len(used) else np.arange(rig.expressions)
-    return [{"name": f"expr_{k:03d}", "component": k, "reach": round(float(reach[k]), 2)} for k in order.tolist()]
+    return [{"name": names[k], "component": k, "reach": round(float(reach[k]), 2)} for k in order.tolist()]
 
 
 def _shapes(controls: ShapeControls | None) -> dict[str, Any]:

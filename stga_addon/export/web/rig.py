@@ -20,7 +20,8 @@ class WebRig:
     """Blend shapes, skeleton and motion: V vertices, R blend shapes, J joints, T frames; meters and radians.
 
     base         (V, 3) vertices before blend shapes
-    basis        (R, V, 3); the first `expressions` are sliders
+    basis        (R, V, 3); the first `expressions` are sliders, which have the
+                 `expression_names` or, without any, numbers
     correctives  (9·(J − 1), V, 3), factors: the entries of the rotations of joints 1… minus identity
     joints       (J, 3); they move with the blend shapes by joint_basis (R, J, 3)
     parents      of the joints, -1 for the root
@@ -40,6 +41,7 @@ class WebRig:
     pose: np.ndarray
     translation: np.ndarray
     expressions: int
+    expression_names: tuple[str, ...] = ()
 
 
 def flame_rig(sequence: FlameSequence) -> WebRig:
@@ -68,6 +70,7 @@ def flame_rig(sequence: FlameSequence) -> WebRig:
         pose=np.stack([frame.pose for frame in frames]),
         translation=np.stack([frame.translation for frame in frames]),
         expressions=model.n_expression,
+        expression_names=model.expression_names,
     )
 
 

@@ -18,6 +18,9 @@ from .rig import WebRig, baked_rig, flame_rig
 SCRIPT_NAME = "stga-avatar.js"
 BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
 """About what a splat, and a coefficient of its color, takes in a page: compressed, then written as text."""
+BUNDLED_NOTICE = (
+    "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for Creative Technologies."
+)
 RIG_NOTICE = (
     "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides "
     "who may receive them."
@@ -53,10 +56,12 @@ def write_web(
 
 
 def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bool) -> str:
-    """What a page of the avatar holds of a FLAME model, and whose licence that has; "" for any other head.
+    """What a page of the avatar holds of a head model, and whose licence that has; "" for a head of the user's own.
 
     Without a sequence, FLAME's mesh is known by its number of vertices.
     """
+    if sequence is not None and sequence.model.expression_names:
+        return BUNDLED_NOTICE
     if sequence is not None and not motion_only:
         return RIG_NOTICE
     is_flame = len(avatar.neutral) in (TEMPLATE_VERTICES, TEMPLATE_VERTICES + TEETH_VERTICES)

@@ -59,11 +59,10 @@ def add_controls(head: Any, rig: Any, found: HeadMap) -> None:
             slot += 1
     count = found.expressions.shape[1]
     for component, terms in enumerate(paths[:count]):
-        if terms and expression_key(component) in head.data.shape_keys.key_blocks:
+        key = expression_key(head, component)
+        if terms and key in head.data.shape_keys.key_blocks:
             variables = {VARIABLES[k]: (rig, path) for k, path in enumerate(terms)}
-            add_driver(
-                head.data.shape_keys, key_value_path(expression_key(component)), -1, "+".join(variables), variables
-            )
+            add_driver(head.data.shape_keys, key_value_path(key), -1, "+".join(variables), variables)
     for joint, rows in JOINT_ROWS.items():
         _drive_joint(rig, joint, [paths[count + row] for row in rows])
 

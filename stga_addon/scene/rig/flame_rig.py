@@ -27,6 +27,7 @@ from ..arrays import flat_floats
 from ..objects import Warn, leave_edit_mode, log_warning, place, remove
 from .keyframes import MAX_SLIDER, key_motion, key_tracked_offsets
 from .names import (
+    EXPRESSION_NAMES,
     deform_bone,
     key_value_path,
     location_path,
@@ -77,6 +78,8 @@ def add_rig(
     _remove_bone_groups(head, _rigs(head))
     rig = _place_armature(head, joint_positions(model, basis), model.parents, displaced)
     _skin(head, rig, model.weights, displaced)
+    if model.expression_names:
+        head[EXPRESSION_NAMES] = ",".join(model.expression_names)
     for name, component in sliders.items():
         _new_shape_key(head, name, basis + model.shapedirs[:, :, component], MAX_SLIDER)
     corrected = np.ones(len(JOINTS), bool) if correctives == "all" else joint_angles(frames) > MIN_JOINT_ANGLE_DEG

@@ -16,10 +16,10 @@ from ..animation import write_curve, write_triangle_curves
 from ..compat import action_curves, copy_action, push_down_action
 from ..objects import Warn, log_warning
 from .names import (
-    EXPRESSION_KEY,
     PART_JOINTS,
     ROOT_LOCATION,
     expression_key,
+    is_expression_key,
     key_value_path,
     offset_key,
     offset_keys,
@@ -126,7 +126,7 @@ def key_current_pose(head: Any, rig: Any, frame: int) -> None:
     for curve in action_curves(head.data.shape_keys):
         name = curve.data_path.partition('"')[2].partition('"')[0]
         value, before = head.data.shape_keys.key_blocks[name].value, curve.evaluate(frame)
-        if not name.startswith(EXPRESSION_KEY) or abs(value - before) < UNCHANGED:
+        if not is_expression_key(name) or abs(value - before) < UNCHANGED:
             continue
         if len(curve.keyframe_points) == 1:  # the motion never moves this slider
             for neighbor in (frame - 1, frame + 1):
@@ -145,7 +145,7 @@ def _key_expressions(head: Any, numbers: Sequence[int], values: np.ndarray, warn
     curves, at = action_curves(head.data.shape_keys), np.asarray(numbers)
     for component, column in enumerate(values.T):
         keyed = slice(None) if column.any() else slice(1)
-        write_curve(curves, key_value_path(expression_key(component)), 0, at[keyed], column[keyed])
+        write_curve(curves, key_value_path(expression_key(head, component)), 0, at[keyed], column[keyed])
     row, component = np.unravel_index(np.abs(values).argmax(), values.shape) if values.size else (0, 0)
     if values.size and abs(values[row, component]) > MAX_SLIDER:
         warn(

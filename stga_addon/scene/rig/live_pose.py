@@ -11,7 +11,7 @@ from ...flame.forward import FlameFrame
 from ...flame.model import JOINTS
 from ...flame.quaternions import from_axis_angle
 from .arkit import has_controls, shape_key_names
-from .names import EXPRESSION_KEY, OFFSET_KEY, expression_key, offset_property
+from .names import OFFSET_KEY, is_expression_key, offset_property
 
 LIVE_JOINTS = ("neck", "jaw", "left_eye", "right_eye")
 WEIGHT_RANGE = (-1.0, 2.0)
@@ -38,10 +38,8 @@ class LivePose:
         if rig is None:
             self._rows = {column: names.index(name) for column, name in shape_key_names(head).items()}
             return
-        self._values[[name.startswith((EXPRESSION_KEY, OFFSET_KEY)) for name in names]] = 0.0
-        self._rows = {}
-        while (name := expression_key(len(self._rows))) in names:
-            self._rows[len(self._rows)] = names.index(name)
+        self._values[[is_expression_key(name) or name.startswith(OFFSET_KEY) for name in names]] = 0.0
+        self._rows = dict(enumerate(row for row, name in enumerate(names) if is_expression_key(name)))
         self._turns = {joint: tuple(rig.pose.bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
         self._offsets = [name for joint in JOINTS if (name := offset_property(joint)) in rig]
         controls = [] if self.takes_frames else list(ARKIT_SHAPES)

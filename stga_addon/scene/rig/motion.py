@@ -19,7 +19,7 @@ from ..objects import Warn, log_warning
 from ..timeline import iterate_frames
 from .flame_rig import rig_of
 from .keyframes import animated_by, check_keyable, key_motion, key_tracked_offsets, key_zero_offsets, start_action
-from .names import EXPRESSION_KEY, expression_key, is_of_parts, offset_keys, parent_bone, slider_components
+from .names import expression_key, is_expression_key, is_of_parts, offset_keys, parent_bone, slider_components
 
 MESH_TOLERANCE = 1e-4
 """Metres that the mesh in the scene may differ from FLAME's forward pass of the sampled parameters."""
@@ -65,7 +65,7 @@ def apply_motion(
 
 def _for_all_sliders(head: Any, expr: np.ndarray) -> np.ndarray:
     """(K,) coefficients of the head's K expression sliders; those that `expr` lacks are zero."""
-    count = sum(key.name.startswith(EXPRESSION_KEY) for key in head.data.shape_keys.key_blocks)
+    count = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
     return np.pad(expr[:count], (0, max(0, count - len(expr))))
 
 
@@ -74,8 +74,8 @@ def _check_rig(head: Any, rig: Any, frames: Sequence[FlameFrame], parts: Sequenc
     check_keyable(head.data.shape_keys)
     used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
     for component in np.flatnonzero(used).tolist():
-        if expression_key(component) not in head.data.shape_keys.key_blocks:
-            raise StgaError(f"{head.name}: has no slider {expression_key(component)}; import the head again to get all")
+        if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
+            raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
 
 
 def sample_motion(
@@ -119,7 +119,7 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
     root, above = bones["root"], bones.get(parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
     return FlameFrame(
-        expr=np.array([_key_value(head, expression_key(k)) for k in range(model.n_expression)]),
+        expr=np.array([_key_value(head, expression_key(head, k)) for k in range(model.n_expression)]),
         rotation=vectors["root"],
         neck_pose=vectors["neck"],
         jaw_pose=vectors["jaw"],

@@ -3,18 +3,28 @@
 from collections.abc import Sequence
 from typing import Any
 
+from ...driving.names import ARKIT_SHAPES
 from ...flame.model import FlameModel
 
 IDENTITY_SLIDERS = 10
 # Prefixes of shape keys; the number after one is the component, or the timestep.
 EXPRESSION_KEY, IDENTITY_KEY, OFFSET_KEY = "expr_", "identity_", "offset_t"
+EXPRESSION_NAMES = "stga_expressions"
+"""Property of a head whose expressions have ARKit's names: these, separated by commas."""
 # The joints that each part of a motion (`flame.motion.PARTS`) rotates.
 PART_JOINTS = {"jaw": ("jaw",), "eyes": ("left_eye", "right_eye"), "neck": ("neck",), "head": ("root",)}
 ROOT_LOCATION = 'pose.bones["root"].location'
 
 
-def expression_key(component: int) -> str:
-    return f"{EXPRESSION_KEY}{component:03d}"
+def expression_key(head: Any, component: int) -> str:
+    """The head's shape key of an expression component."""
+    named = head.get(EXPRESSION_NAMES)
+    return named.split(",")[component] if named else f"{EXPRESSION_KEY}{component:03d}"
+
+
+def is_expression_key(name: str) -> bool:
+    """Whether a head with a FLAME rig has the shape key for one of its expression components."""
+    return name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES
 
 
 def identity_key(component: int) -> str:
@@ -27,7 +37,8 @@ def offset_key(timestep: int) -> str:
 
 def slider_components(model: FlameModel) -> dict[str, int]:
     """Shape key -> component of `model.shapedirs`: every expression, and the first `IDENTITY_SLIDERS` of identity."""
-    expressions = {expression_key(k): model.n_identity + k for k in range(model.n_expression)}
+    names = model.expression_names or [f"{EXPRESSION_KEY}{k:03d}" for k in range(model.n_expression)]
+    expressions = {name: model.n_identity + k for k, name in enumerate(names)}
     return expressions | {identity_key(k): k for k in range(min(IDENTITY_SLIDERS, model.n_identity))}
 
 
@@ -79,4 +90,5 @@ def is_of_parts(data_path: str, parts: Sequence[str]) -> bool:
     # The tracked per-frame offsets belong to the tracked expressions.
     if "expression" in parts:
         prefixes += [f'key_blocks["{EXPRESSION_KEY}', f'key_blocks["{OFFSET_KEY}', '["stga_']
+        prefixes += [f'key_blocks["{name}"]' for name in ARKIT_SHAPES]
     return data_path.startswith(tuple(prefixes))

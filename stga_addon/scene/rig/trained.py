@@ -37,7 +37,7 @@ def stored_range(head: Any) -> TrainedRange | None:
 def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
     """Part -> how far outside the range the head is as it is posed now (`transfer.outside`)."""
     keys, bones = head.data.shape_keys.key_blocks, rig.pose.bones
-    names = [expression_key(k) for k in range(len(trained.middle["face"]))]
+    names = [expression_key(head, k) for k in range(len(trained.middle["face"]))]
     expr = np.array([keys[name].value if name in keys else 0.0 for name in names])
     jaw, left, right = (
         to_axis_angle(np.array(bones[bone].rotation_quaternion)) for bone in ("jaw", "left_eye", "right_eye")

@@ -11,7 +11,7 @@ from ...capture.camera import Camera
 from ...capture.model import Capture, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.sequence import joint_angles
-from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, lip_pairs
+from ...flame.teeth import lip_pairs
 from ...selection import select_capture
 from ..settings import TrainingSettings
 from .evidence import (
@@ -215,9 +215,8 @@ class CaptureFacts:
 
     @property
     def has_teeth(self) -> bool:
-        """Whether the mesh has the rows of teeth that are added to FLAME's."""
-        flame = self.capture.flame
-        return flame is not None and len(flame.model.v_template) == TEMPLATE_VERTICES + TEETH_VERTICES
+        """Whether the mesh has teeth."""
+        return self.capture.flame is not None and "teeth" in self.capture.flame.model.masks
 
 
 def _is_same(one: Camera, other: Camera) -> bool:
