@@ -131,7 +131,7 @@ def _native(
     color = nodes.vector("SUBTRACT", nodes.switch("VECTOR", flat, color, shown), (0.5, 0.5, 0.5))
     red, green, blue = nodes.components(nodes.scale(color, 1 / SH_C0))
     base = {"Red": red, "Green": green, "Blue": blue, "Alpha": nodes.attribute(OPACITY, "FLOAT")}
-    # A color, which Blender reads as four floats: of a vector, this node of 5.2 stores three.
+    # A color, which 5.3 converts to four floats where it draws; of FLOAT4, this node of 5.2 stores three.
     splats = nodes.store(splats, RADIANCE, nodes.out("FunctionNodeCombineColor", base), "FLOAT_COLOR")
     scale = nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size)
     splats = nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
