@@ -57,10 +57,11 @@ extension: .venv/ready
 extension-platform: .venv/ready
 	$(BIN)/python -m stga_addon.development.package --edition platform --out dist
 
-# BLENDER: the command that starts a Blender, for the Python of that Blender alone; ALL=1: for every platform
+# BLENDER: the command that starts a Blender, for the Python of that Blender alone; ALL=1: for every platform;
+# CUDA=1: with PyTorch's CUDA build where its CPU build cannot be had
 extension-complete: .venv/ready
 	$(BIN)/python -m stga_addon.development.package --edition complete --out dist \
-		$(if $(BLENDER),--blender '$(BLENDER)') $(if $(ALL),--all)
+		$(if $(BLENDER),--blender '$(BLENDER)') $(if $(ALL),--all) $(if $(CUDA),--allow-cuda)
 
 # The zips of dist as a repository for Blender, in dist/repository
 repository: .venv/ready

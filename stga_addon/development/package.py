@@ -9,6 +9,7 @@ import tempfile
 import tomllib
 import zipfile
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -158,25 +159,24 @@ def target_of(blender: Sequence[str]) -> Target:
     return Target(this_platform(), python, (f"{major}.{minor}.0", f"{major}.{minor + 1}.0"))
 
 
-def build_editions(options: argparse.Namespace) -> list[Path]:
+def build_editions(options: argparse.Namespace) -> Iterator[Path]:
     """Build the edition that was asked for, the complete one for each of its targets. Raises StgaError."""
     if options.edition != "complete":
-        return [build_zip(options.out, edition={"small": SMALL, "platform": PLATFORM}[options.edition])]
+        yield build_zip(options.out, edition={"small": SMALL, "platform": PLATFORM}[options.edition])
+        return
     here = this_platform()
     targets = [target_of(shlex.split(options.blender))] if options.blender else list(TARGETS)
     if not (options.blender or options.all):
         targets = [target for target in targets if target.platform == here]
     demo = options.out / DEMO_FOLDER
-    if not (demo / "transforms.json").exists():
-        make_capture(demo, DEMO_SEED, DEMO_OPTIONS)
-    made = []
-    for target in targets:
+    for target in [replace(target, cuda=options.allow_cuda) for target in targets]:
         collect_wheels(wheel_folder(target), target)
+        if not (demo / "transforms.json").exists():
+            make_capture(demo, DEMO_SEED, DEMO_OPTIONS)
         kernels = compile_kernels(target, wheel_folder(target), shlex.split(options.blender))
         if not kernels:
             print(f"{target.name}: no Python of it is here; kernels are compiled when they are first used")
-        made.append(build_zip(options.out, edition=complete(target), demo=demo, kernels=kernels))
-    return made
+        yield build_zip(options.out, edition=complete(target), demo=demo, kernels=kernels)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -185,6 +185,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--edition", choices=("small", "platform", "complete"), default="small")
     parser.add_argument("--blender", default="", help="complete: for the Python of this Blender, and no other")
     parser.add_argument("--all", action="store_true", help="complete: for every platform, not only this one")
+    parser.add_argument(
+        "--allow-cuda", action="store_true", help="complete: PyTorch's CUDA build where its CPU build cannot be had"
+    )
     options = parser.parse_args(arguments)
 
     def build() -> None:

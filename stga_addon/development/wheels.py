@@ -64,11 +64,13 @@ PINS = {
 
 @dataclass(frozen=True)
 class Target:
-    """A platform by Blender's name, a Python as "3.11", and the Blender versions (first, first no longer) with it."""
+    """A platform by Blender's name, a Python as "3.11", the Blender versions (first, first no longer) with it, and
+    whether torch may be the CUDA build, where its CPU build cannot be had."""
 
     platform: str
     python: str
     blender: tuple[str, str]
+    cuda: bool = False
 
     @property
     def name(self) -> str:
@@ -175,9 +177,13 @@ def _present(folder: Path, requirement: Requirement, target: Target) -> Path | N
     for wheel in sorted(folder.glob("*.whl"), reverse=True):
         name, version, _, own = parse_wheel_filename(wheel.name)
         fits = name == canonicalize_name(requirement.name) and specifier.contains(version, prereleases=True)
-        if fits and own & tags:
+        if fits and own & tags and (target.cuda or name != "torch" or not _needs_cuda(wheel, target)):
             return wheel
     return None
+
+
+def _needs_cuda(wheel: Path, target: Target) -> bool:
+    return any(text.startswith(("nvidia-", "cuda-")) for text in needs(wheel, target))
 
 
 def pins_of(target: Target) -> list[str]:
@@ -185,17 +191,26 @@ def pins_of(target: Target) -> list[str]:
 
 
 def _download(folder: Path, requirement: Requirement, target: Target) -> Path:
-    """Download one wheel as it is; on Linux PyTorch's CPU build, where its index can be reached."""
+    """Download one wheel as it is; on Linux PyTorch's CPU build, unless the target may have another."""
     folder.mkdir(parents=True, exist_ok=True)
-    if requirement.name == "torch" and target.platform == "linux-x64":
+    bare = f"{requirement.name}{requirement.specifier}"
+    if requirement.name != "torch" or target.platform != "linux-x64":
+        return _pip_download(folder, bare, target)
+    build = next(pin for pin in pins_of(target) if pin.startswith("torch==")) + "+cpu"
+    for more in ([], ["--index-url", TORCH_CPU_INDEX, "--retries", "0"]):
         try:
-            return _pip_download(folder, requirement, target, ["--index-url", TORCH_CPU_INDEX, "--retries", "0"])
+            return _pip_download(folder, build, target, more)
         except StgaError as error:
-            print(f"{error}\nTaking torch from pip's own index, whose build for Linux needs gigabytes of CUDA packages")
-    return _pip_download(folder, requirement, target)
+            failure = error
+    if target.cuda:
+        return _pip_download(folder, bare, target)
+    raise StgaError(
+        f"{failure}; expected {build} where pip is configured to look, at {TORCH_CPU_INDEX}, or in {folder}; "
+        "with --allow-cuda (make: CUDA=1) the zip has the CUDA build, and gigabytes that nothing uses"
+    )
 
 
-def _pip_download(folder: Path, requirement: Requirement, target: Target, more: Sequence[str] = ()) -> Path:
+def _pip_download(folder: Path, wanted: str, target: Target, more: Sequence[str] = ()) -> Path:
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         pins = Path(scratch) / "pins.txt"
         pins.write_text("\n".join(pins_of(target)), encoding="utf-8")
@@ -209,13 +224,13 @@ def _pip_download(folder: Path, requirement: Requirement, target: Target, more: 
             "cp",
             *tags,
         ]
-        bare = f"{requirement.name}{requirement.specifier}"
         command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", *options]
         done = subprocess.run(
-            [*command, "-c", str(pins), "-d", scratch, *more, bare], capture_output=True, text=True, check=False
+            [*command, "-c", str(pins), "-d", scratch, *more, wanted], capture_output=True, text=True, check=False
         )
         found = sorted(Path(scratch).glob("*.whl"))
         if done.returncode or len(found) != 1:
-            reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
-            raise StgaError(f"{target.name}: pip could not download {bare} ({reason[0]})")
+            # The first error: the last one of several is about how to ask for help.
+            reason = next((line for line in done.stderr.splitlines() if line.startswith("ERROR: ")), "pip failed")
+            raise StgaError(f"{target.name}: pip could not download {wanted} ({reason.removeprefix('ERROR: ')})")
         return found[0].replace(folder / found[0].name)

@@ -8,6 +8,7 @@ import numpy as np
 
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
+NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
 REC709 = "Linear Rec.709"
 """The scene-linear color space of new files, and of all before Blender 5.0."""
 # Options of a path property whose value may start with "//"; versions before 4.5 refuse this one.
@@ -126,18 +127,14 @@ def world_nodes(world: Any) -> Any:
 
 
 def native_splats(tree: Any, points: Any) -> Any:
-    """Add nodes that turn points into Blender's native splats; None before 5.3, or where the menu item is unknown.
-
-    points: geometry socket of the node tree. Returns the output socket.
-    """
-    if not hasattr(bpy.types, "GeometryNodePointsSetType"):
-        return None
+    """Add a node that makes points (a geometry socket) Blender's native splats; its output, None if it has no such
+    type."""
     node = tree.nodes.new("GeometryNodePointsSetType")
-    for name in ("Gaussian Splat", "Gaussian Splats", "GAUSSIAN_SPLAT"):
+    for name in ("3D Gaussian Splat", "3D Gaussian Splats"):  # as builds of 5.3 named it
         with suppress(TypeError):  # there is no such item
             node.inputs["Type"].default_value = name
             tree.links.new(points, node.inputs["Points"])
-            return node.outputs[0]
+            return node.outputs["Points"]
     tree.nodes.remove(node)
     return None
 

@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import time
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def offline() -> list[str]:
 
 def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
     """The complete edition for a Blender, in the folder `out`; skips the test where wheels cannot be had."""
-    target = target_of(command)
+    target = replace(target_of(command), cuda=True)
     try:
         collect_wheels(wheel_folder(target), target)
     except StgaError as error:

@@ -1,6 +1,8 @@
 """The editions' wheels, manifests and files, and the repository's page; Blender's part is in tests/blender."""
 
+import os
 import re
+import sys
 import tomllib
 import zipfile
 from pathlib import Path
@@ -8,7 +10,15 @@ from pathlib import Path
 import pytest
 
 from stga_addon.development.editions import INSTALLER_FILES, PLATFORM, SMALL, complete, edition_manifest
-from stga_addon.development.package import ROOT, build_zip, extension_files, fetch_wheels, read_manifest
+from stga_addon.development.package import (
+    ROOT,
+    build_zip,
+    extension_files,
+    fetch_wheels,
+    main,
+    read_manifest,
+    wheel_folder,
+)
 from stga_addon.development.wheels import PINS, TARGETS, Target, check_wheels, needs
 from stga_addon.errors import StgaError
 from stga_addon.worker.requirements import REQUIREMENTS
@@ -23,11 +33,13 @@ NATIVE = {
 
 
 def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: str) -> Path:
-    path = folder / f"{name.replace('-', '_')}-{version}-{tag}.whl"
+    stem = f"{name.replace('-', '_')}-{version}"
+    path = folder / f"{stem}-{tag}.whl"
     text = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
     text += "".join(f"Requires-Dist: {requirement}\n" for requirement in requirements)
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(f"{name}-{version}.dist-info/METADATA", text)
+        archive.writestr(f"{stem}.dist-info/METADATA", text)
+        archive.writestr(f"{stem}.dist-info/WHEEL", "Wheel-Version: 1.0\n")
     return path
 
 
@@ -61,6 +73,55 @@ def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
     old = make_wheel(tmp_path, "torch", "1.0", torch.name.split("-", 2)[2].removesuffix(".whl"))
     with pytest.raises(StgaError, match=r"needs torch.*hold 1\.0"):
         check_wheels([wheel for wheel in wheels if wheel != torch] + [old], target)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="only PyPI's torch for Linux needs CUDA")
+def test_only_when_told_to_does_a_zip_have_cuda(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a zip of gigabytes that nothing uses, also by a wheel of an earlier build; a CPU build that pip's
+    configuration sees and that is not taken; and a refusal that does not say how to go on."""
+    monkeypatch.setattr("stga_addon.development.package.ROOT", tmp_path)
+    wheels, offered, index = wheel_folder(LINUX), tmp_path / "offered", tmp_path / "index"
+    for folder in (wheels, offered, index):
+        folder.mkdir(parents=True)
+    wheel_set(wheels, LINUX)
+    next(wheels.glob("torch-*")).unlink()
+    make_wheel(wheels, "wgpu", "0.32.0", "py3-none-any")
+    tag = NATIVE["linux-x64"].format("311")
+    cpu = make_wheel(offered, "torch", "2.13.0+cpu", tag, "sympy")
+    with_cuda = {
+        make_wheel(offered, "torch", "2.13.0", tag, "sympy", "nvidia-things").name,
+        make_wheel(offered, "nvidia-things", "1.0", "py3-none-any").name,
+    }
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.setenv("PIP_INDEX_URL", index.as_uri())
+    monkeypatch.setenv("PIP_FIND_LINKS", str(offered))
+    monkeypatch.setattr("stga_addon.development.wheels.TORCH_CPU_INDEX", index.as_uri())
+    package = "stga_addon.development.package"
+    monkeypatch.setattr(f"{package}.TARGETS", [LINUX])
+    monkeypatch.setattr(f"{package}.make_capture", lambda demo, *_: demo.mkdir(parents=True))
+    monkeypatch.setattr(f"{package}.compile_kernels", lambda *_: [])
+
+    def built(name: str, *more: str) -> set[str]:
+        assert main(["--edition", "complete", "--out", str(tmp_path / name), *more]) == 0
+        with zipfile.ZipFile(next((tmp_path / name).glob("*.zip"))) as archive:
+            names = {Path(entry).name for entry in archive.namelist() if entry.startswith("wheels/")}
+        return {wheel for wheel in names if wheel.startswith(("torch", "nvidia"))}
+
+    def refusal() -> str:
+        assert main(["--edition", "complete", "--out", str(tmp_path / "refused")]) == 2
+        assert not (tmp_path / "refused").exists()
+        return capsys.readouterr().err
+
+    assert built("seen") == {cpu.name}
+    cpu.unlink()
+    (wheels / cpu.name).unlink()
+    said = refusal()
+    assert all(part in said for part in ("torch==2.13.0+cpu", str(wheels), "--allow-cuda", "CUDA=1"))
+    assert built("allowed", "--allow-cuda") == with_cuda
+    assert refusal() == said
 
 
 def test_markers_are_those_of_the_target(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_raster import rasterize
@@ -15,7 +16,7 @@ from stga_addon.development.demo.head import synthetic_head, write_flame
 from stga_addon.development.demo.paint import paint
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, frame_of, joint_positions
-from stga_addon.flame.model import torso_faces
+from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
 from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.folder import PLACES_FILE, REPORT_FILE
@@ -25,11 +26,17 @@ from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.solve import person
-from stga_addon.tracking.torso import follow_torso
-from stga_addon.tracking.torso_cloth import found_bending
+from stga_addon.tracking.surface import with_offset
+from stga_addon.tracking.torso import _followed, follow_torso
+from stga_addon.tracking.torso_cloth import Bending, found_bending
 from stga_addon.tracking.torso_drape import draped, torso_sheet
-from stga_addon.tracking.torso_motion import TorsoPoints, read_torso_motion, read_torso_points
-from stga_addon.tracking.torso_take import NECK, ROOT, TorsoPose, TorsoTake, with_root
+from stga_addon.tracking.torso_motion import (
+    TorsoMotion,
+    TorsoPoints,
+    read_torso_motion,
+    read_torso_points,
+)
+from stga_addon.tracking.torso_take import NECK, ROOT, PosedTorso, TorsoPose, TorsoTake, with_root
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import posed_mesh
 
@@ -271,6 +278,53 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
     apart = model.weights[:, ROOT] == 0
     np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
     np.testing.assert_allclose(axis_angle_matrices(frame_of(changed).rotation[None])[0], rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize(("earlier", "bends"), [(True, True), (False, True), (True, False)])
+def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_head, earlier, bends):
+    """Catches a drape that offsets repeat, or that template or static offset lack, an earlier static
+    offset that is lost, cloth that does not bend, a head that offsets move, and figures of the
+    report in other units or of another joint."""
+    bare, rng = person(fine_head, np.zeros(fine_head.model.n_identity)), np.random.default_rng(3)
+    size = bare.model.v_template.shape
+    static = rng.normal(0, 1e-3, size) * earlier
+    one = with_offset(bare, static)
+    model, expressions = one.model, bare.model.n_expression
+    tracked = {t: rng.normal(0, 0.2, expressions + 18) for t in (2, 5, 9)}
+    posed = {t: PosedTorso(values, rng.normal(0, 0.01, 3)) for t, values in tracked.items()}
+    world = Similarity(1.0, np.eye(3), np.zeros(3))
+    fit = HeadFit(one, np.zeros(0), tracked, world, static if earlier else None)
+    cloth = torso_sheet(model).vertices
+    drape = np.zeros(size)
+    drape[cloth] = rng.normal(0, 0.01, (len(cloth), 3))
+    bent = {t: rng.normal(0, 0.004, (len(cloth), 3)) for t in posed}
+    bending = Bending(cloth, drape, bent) if bends else None
+    take = TorsoTake(fit, tracked, (), torso_faces(model))
+    decided = TorsoMotion("own", {"head": 0.5, "still": 0.4, "own": 0.2}, 0.0)
+    followed = _followed(fit, take, posed, bending, decided, TorsoPoints(5, np.zeros((0, 3))))
+    share = np.minimum(model.weights[:, [ROOT]] / MIN_TORSO_WEIGHT, 1)
+    assert (share[cloth] > 0).all()
+    for timestep, torso in posed.items():
+        expression, pose = np.split(torso.parameters, [expressions])
+        rest = model.v_template + model.shapedirs @ expression
+        turn, joint = Rotation.from_rotvec(pose[:3]).as_matrix(), model.j_regressor[ROOT] @ rest
+        rigid = (rest - joint) @ turn.T + joint + pose[-3:] + torso.shift
+        wanted = share * rigid + (1 - share) * flame_forward(model, np.zeros(0), frame_of(torso.parameters))
+        if bends:
+            wanted[cloth] += (drape[cloth] + bent[timestep]) @ turn.T
+        found = posed_mesh(followed.fit, followed.parameters[timestep], followed.offsets[timestep])
+        np.testing.assert_allclose(found, wanted, atol=1e-12)
+    template = bare.model.v_template + followed.fit.static_offset
+    np.testing.assert_allclose(followed.fit.static_offset, static + drape * bends, atol=1e-15)
+    np.testing.assert_allclose(followed.fit.head.model.v_template, template, atol=1e-15)
+    motion = followed.motion
+    assert motion.misfit == decided.misfit
+    turns = [np.linalg.norm(values[expressions + 3 : expressions + 6]) for values in tracked.values()]
+    assert motion.turn_deg == pytest.approx(np.degrees(max(turns)))
+    shifts = [1000 * np.linalg.norm(torso.shift) for torso in posed.values()]
+    assert motion.shift_mm == pytest.approx(max(shifts))
+    by_cloth = [1000 * np.linalg.norm(bend, axis=1).max() for bend in bent.values()]
+    assert motion.bend_mm == (pytest.approx(max(by_cloth)) if bends else 0)
 
 
 @pytest.mark.slow

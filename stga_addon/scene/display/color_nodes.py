@@ -49,6 +49,16 @@ def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
     return nodes.combine(*linear)
 
 
+def _linear_to_srgb(nodes: Nodes, color: Any) -> Any:
+    """The inverse, of colors from 0 on."""
+    srgb = []
+    for value in nodes.components(color):
+        power = nodes.math("MULTIPLY_ADD", nodes.math("POWER", value, 1 / 2.4), 1.055, -0.055)
+        line = nodes.math("MULTIPLY", value, 12.92)
+        srgb.append(nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.0031308), line, power))
+    return nodes.combine(*srgb)
+
+
 def _sh(nodes: Nodes, index: int) -> Any:
     return nodes.attribute(SH.format(index), "FLOAT_VECTOR")
 
@@ -104,6 +114,7 @@ def _third_band(nodes: Nodes, direction: Any) -> Any:
 
 
 SRGB_TO_LINEAR = NodeGroup("STGA sRGB to Linear", {"sRGB": "Vector"}, "Color", _srgb_to_linear)
+LINEAR_TO_SRGB = NodeGroup("STGA Linear to sRGB", {"Color": "Color"}, "Vector", _linear_to_srgb)
 SH_BANDS = tuple(
     NodeGroup(f"STGA Spherical Harmonics {degree}", {"Direction": "Vector"}, "Vector", build)
     for degree, build in enumerate((_first_band, _second_band, _third_band), 1)

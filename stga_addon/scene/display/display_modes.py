@@ -1,16 +1,22 @@
 """Node groups for the display modes: as trained, points, ellipsoids, camera quads and, from 5.3, native splats."""
 
+from functools import partial
 from typing import Any
 
 import bpy
 
+from ...avatar.splats import SH_C0
 from ..compat import native_splats
-from .materials import EXTENT, ellipsoid_material, point_material
+from .color_nodes import LINEAR_TO_SRGB
+from .materials import DISPLAY_COLOR, EXTENT, ellipsoid_material, point_material
 from .node_builder import NodeGroup, Nodes
+from .splat_attributes import OPACITY, RELIT_COLOR, SH
 
-# Attributes that the splats have by now, under the names that Blender's native splats use.
+# Attributes that Blender's native splats use; rotation and scale are those that the splats have by now.
 WORLD_ROTATION = "rotation"
 WORLD_SCALE = "scale"
+RADIANCE = "radiance:base"  # coefficient of degree 0, and opacity
+RADIANCE_SH = "radiance:sh_{}"  # coefficients of degrees 1 to 3
 
 AS_TRAINED = "As Trained"
 POINTS = "Points"
@@ -22,15 +28,16 @@ LIMITS = {
     POINTS: "Fast: round, of each splat's mean size",
     ELLIPSOIDS: "For EEVEE and Cycles, from all sides, in the colors that the scene's camera sees",
     QUADS: "For EEVEE and Cycles, faster; right through the scene's camera only",
-    NATIVE: "Blender's own splats; this was not tried",
+    NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; not tried in Blender 5.3",
 }
 """What each display is for and what it is not, in its tooltip and in the panel."""
 
 
-def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> Any:
+def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, native: Any) -> Any:
     """Geometry of the splats in the display mode that the menu socket `mode` chooses.
 
-    visible: field, which splats; size: factor on their standard deviations.
+    visible: field, which splats; size: factor on their standard deviations; native: points from NATIVE_GROUPS, None
+    in a Blender without native splats.
     """
     made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
     # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads that
@@ -38,7 +45,8 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any) -> 
     is_viewport = nodes.out("GeometryNodeIsViewport")
     in_images = nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": made[QUADS]}, input_type="GEOMETRY")
     geometries = {AS_TRAINED: in_images, **made}
-    native = native_splats(nodes.tree, geometries[POINTS])
+    if native is not None:
+        native = native_splats(nodes.tree, native)
     if native is not None:
         geometries[NATIVE] = native
     menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
@@ -110,9 +118,43 @@ def _quad_transform(nodes: Nodes, size: Any) -> bpy.types.NodeSocket:
     return nodes.out("FunctionNodeMatrixMultiply", {"Matrix": transforms})
 
 
+def _native(
+    degree: int, nodes: Nodes, splats: Any, visible: Any, size: Any, color: Any, view_dependent: Any, gray: Any
+) -> bpy.types.NodeSocket:
+    """Points with what native splats are drawn from: harmonics have the object's axes, in which they were trained.
+
+    color: constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as are those that are relit.
+    """
+    relit = nodes.add("GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR").outputs
+    flat = nodes.logic("OR", gray, relit["Exists"])
+    shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
+    color = nodes.vector("SUBTRACT", nodes.switch("VECTOR", flat, color, shown), (0.5, 0.5, 0.5))
+    red, green, blue = nodes.components(nodes.scale(color, 1 / SH_C0))
+    base = {"Red": red, "Green": green, "Blue": blue, "Alpha": nodes.attribute(OPACITY, "FLOAT")}
+    # A color, which 5.3 converts to four floats where it draws; of FLOAT4, this node of 5.2 stores three.
+    splats = nodes.store(splats, RADIANCE, nodes.out("FunctionNodeCombineColor", base), "FLOAT_COLOR")
+    scale = nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size)
+    splats = nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
+    factor = nodes.logic("NIMPLY", view_dependent, flat)
+    for index in range((degree + 1) ** 2 - 1):
+        coefficient = nodes.scale(nodes.attribute(SH.format(index + 1), "FLOAT_VECTOR"), factor)
+        splats = nodes.store(splats, RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
+    return nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible})
+
+
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
 MODES = {
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
     ELLIPSOIDS: NodeGroup("STGA Ellipsoids", _INPUTS, "Geometry", _ellipsoids),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }
+NATIVE_GROUPS = tuple(
+    NodeGroup(
+        f"STGA Native Splats {degree}",
+        {**_INPUTS, "Color": "Vector", "View-Dependent": "Bool", "Gray": "Bool"},
+        "Geometry",
+        partial(_native, degree),
+    )
+    for degree in range(4)
+)
+"""By the harmonics' degree."""

@@ -10,9 +10,10 @@ import bpy
 
 from ...capture.region import SELECTED_WEIGHT
 from .. import tags
+from ..compat import NATIVE_SPLATS
 from ..layers import FROZEN_COLOR
-from .color_nodes import SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
-from .display_modes import AS_TRAINED, MODES, displayed
+from .color_nodes import LINEAR_TO_SRGB, SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
+from .display_modes import AS_TRAINED, MODES, NATIVE_GROUPS, displayed
 from .frame_nodes import FRAMES, PLACED
 from .materials import DISPLAY_COLOR
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
@@ -101,7 +102,7 @@ def _node_groups(options: TreeOptions) -> list[NodeGroup]:
         groups += [SIGNALS[name].group, shifted(name, convention)]
     if degree > 0 or strain_color:
         groups.append(SRGB_TO_LINEAR)
-    return groups
+    return [*groups, LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if NATIVE_SPLATS else groups
 
 
 def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:
@@ -134,6 +135,7 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
 def _build(nodes: Nodes, options: TreeOptions) -> None:
     inputs = nodes.add("NodeGroupInput").outputs
     splats, visible = inputs["Geometry"], _visible(nodes, inputs)
+    strain, gray = None, False
     if options.convention is None:
         splats = nodes.group(PLACED[None], splats)
         color = _color(nodes, inputs, None, options.degree)
@@ -146,10 +148,17 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         color = _color(nodes, inputs, strain, options.degree)
         splats = nodes.store(splats, _FROZEN, nodes.group(_FROZEN_SPLATS, head), "BOOLEAN")
         frozen = nodes.attribute(_FROZEN, "BOOLEAN")
-        color = nodes.switch("RGBA", nodes.logic("AND", frozen, inputs[SHOW_SELECTION]), color, FROZEN_COLOR)
+        gray = nodes.logic("AND", frozen, inputs[SHOW_SELECTION])
+        color = nodes.switch("RGBA", gray, color, FROZEN_COLOR)
         visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", frozen, inputs[SELECTED_ONLY]))
     splats = nodes.store(splats, DISPLAY_COLOR, nodes.group(_RELIT, color), "FLOAT_COLOR")
-    nodes.finish("NodeGroupOutput", {"Geometry": displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE])})
+    native = None
+    if NATIVE_SPLATS:
+        view_dependent = inputs[VIEW_DEPENDENT] if options.degree > 0 else False
+        fields = inputs[SIZE], constant_color(nodes, strain), view_dependent, gray
+        native = nodes.group(NATIVE_GROUPS[options.degree], splats, visible, *fields)
+    shown = displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE], native)
+    nodes.finish("NodeGroupOutput", {"Geometry": shown})
     display = next(item for item in nodes.tree.interface.items_tree if item.name == DISPLAY)
     display.default_value = AS_TRAINED  # the menu has items only once it is linked
 

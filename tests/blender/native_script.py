@@ -1,0 +1,69 @@
+"""Runs in any Blender, or with bpy, started by test_native_splats.py: writes what native splats are drawn from.
+
+`python native_script.py -- AVATAR HEAD OUT`: the avatar's file, the head's vertices (.npy) and the .npz file of the
+attributes of each case. Before Blender 5.3 the points stay points.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.scene import compat, tags
+
+if not compat.NATIVE_SPLATS:
+    compat.NATIVE_SPLATS, compat.native_splats = True, lambda tree, points: points
+
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.display_modes import NATIVE
+from stga_addon.scene.display.splat_attributes import RELIT_COLOR
+from stga_addon.scene.display.splat_object import set_input, show_avatar
+
+AVATAR, HEAD, OUT = sys.argv[sys.argv.index("--") + 1 :]
+FIELDS = {
+    "FLOAT4": ("vector", 4),
+    "FLOAT_COLOR": ("color", 4),
+    "FLOAT_VECTOR": ("vector", 3),
+    "QUATERNION": ("value", 4),
+}
+found: dict[str, Any] = {}
+
+
+def read(case: str) -> None:
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    (cloud,) = [each.object.data for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"]
+    found[f"{case}/type"] = getattr(cloud, "type", "")
+    for attribute in cloud.attributes:
+        if attribute.data_type in FIELDS:
+            field, size = FIELDS[attribute.data_type]
+            values = np.empty(size * len(cloud.points), np.float32)
+            attribute.data.foreach_get(field, values)
+            found[f"{case}/{attribute.name}"] = values.reshape(-1, size)
+
+
+avatar = read_avatar(Path(AVATAR))
+mesh = bpy.data.meshes.new("head")
+mesh.from_pydata(np.load(HEAD).tolist(), [], avatar.faces.tolist())
+head = bpy.data.objects.new("head", mesh)
+bpy.context.scene.collection.objects.link(head)
+head.vertex_groups.new(name=f"{tags.GROUP_PREFIX}{bpy.context.scene.frame_current}")  # selects no triangle
+shown = show_avatar(avatar, head)
+set_input(shown, splat_nodes.DISPLAY, NATIVE)
+set_input(shown, splat_nodes.SIZE, 1.5)
+read("recorded")
+set_input(shown, splat_nodes.VIEW_DEPENDENT, False)
+read("constant")
+set_input(shown, splat_nodes.VIEW_DEPENDENT, True)
+set_input(shown, splat_nodes.SHOW_SELECTION, True)
+read("gray")
+set_input(shown, splat_nodes.SHOW_SELECTION, False)
+relit = np.random.default_rng(0).uniform(0, 2, (len(avatar.splats), 4)).astype(np.float32)
+shown.data.attributes.new(RELIT_COLOR, "FLOAT_COLOR", "POINT").data.foreach_set("color", relit.ravel())
+shown.data.update()
+read("relit")
+np.savez(OUT, **found)
