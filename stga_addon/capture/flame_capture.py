@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..flame.model import key_regions
+from ..files import read_npz
+from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES, key_regions
 from ..flame.sequence import (
     FlameSequence,
     expression_mesh,
@@ -54,8 +55,11 @@ def open_flame_capture(
 
 
 def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
-    """A motion file (`flame.sequence.read_motion`) as a capture of layout "flame" without views. Raises StgaError."""
-    model_file = _model_file(path, model_file)
+    """A motion file (`flame.sequence.read_motion`) as a capture of layout "flame" without views.
+
+    A file that names its expressions is of the bundled head, and needs no model file. Raises StgaError.
+    """
+    model_file = BUNDLED_HEAD if EXPRESSION_NAMES in read_npz(path) else _model_file(path, model_file)
     return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
 
 

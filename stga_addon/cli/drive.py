@@ -26,7 +26,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
         metavar="FILE",
         help="ARKit's shapes (.csv) or FLAME parameters (.npz)",
     )
-    parser.add_argument("--flame", type=usable_path, help="FLAME model file of the head")
+    parser.add_argument("--flame", type=usable_path, help="FLAME model file of the head (default: the bundled head)")
     parser.add_argument(
         "--head", type=usable_path, metavar="CAPTURE", dest="of", help="whose identity (default: average)"
     )

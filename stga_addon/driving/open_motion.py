@@ -40,7 +40,6 @@ from .transfer import (
 )
 
 MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
-NEEDS_FLAME = "needs the FLAME model file (.pkl or .npz) of the head that it is to move"
 
 
 @dataclass(frozen=True)
@@ -108,18 +107,20 @@ def open_motion(
     """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles `faces` (F, 3).
 
     path   FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a performance (`read_performance`)
-    flame  the model file; None: the one in the capture's folder
+    flame  the model file; None: the one in the capture's folder, or the bundled head for a performance
     fps    rate that a performance is resampled to; None: its own. Timesteps of FLAME motions stay as they are
     Raises StgaError where the file is no motion, or its model has other triangles.
     """
     options = options or MotionOptions()
     chosen_neutral(str(path), options.neutral)
     if is_performance(path):
-        if flame is None:
-            raise StgaError(f"{path}: {NEEDS_FLAME}; give it with --flame")
         model = flame_model(flame)
+        if flame is None and len(model.faces) != len(faces):
+            raise StgaError(
+                f"{path}: needs the FLAME model file (.pkl or .npz) of the head that it moves; give it with --flame"
+            )
         _check_faces(path, model, faces)
-        return performed(read_performance(path), person_of(model, neutral), str(flame), options, trained, fps)
+        return performed(read_performance(path), person_of(model, neutral), str(flame or path), options, trained, fps)
     capture = open_capture(path, flame)
     if capture.flame is None:
         raise StgaError(f"{path}: was not tracked with FLAME, so it has no parameters of expression and pose")

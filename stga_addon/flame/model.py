@@ -19,6 +19,8 @@ MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_tab
 BUNDLED_HEAD = Path(__file__).with_name("head.npz")
 """The head model of this package: ICT-FaceKit (MIT License, Copyright (c) 2020 USC Institute for Creative Technologies)
 in FLAME's form, made by `development/bundled_head.py`."""
+EXPRESSION_NAMES = "expression_names"
+"""Key of the names in model files, and in motions of the bundled head."""
 SHAPE_STEP_M = 1e-5
 """Step of `shape_steps` (K, V, 3), displacements in whole numbers, which a file may have in place of shapedirs."""
 # Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
@@ -110,9 +112,9 @@ def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def _expression_names(path: Path, arrays: Mapping[str, np.ndarray], count: int) -> tuple[str, ...]:
-    if "expression_names" not in arrays:
+    if EXPRESSION_NAMES not in arrays:
         return ()
-    names = arrays["expression_names"]
+    names = arrays[EXPRESSION_NAMES]
     if names.dtype.kind != "U" or names.shape != (count,) or len(set(names.tolist())) != count:
         raise StgaError(f"{path}: expression_names: expected {count} different names, one per expression")
     return tuple(names.tolist())

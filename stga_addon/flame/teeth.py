@@ -7,6 +7,7 @@ teeth are this project's own construction from the mesh.
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -60,8 +61,15 @@ class _Mouth:
 
 def flame_model(path: Path | None) -> FlameModel:
     """The FLAME model file, with teeth where it has FLAME's 5023 vertices; None: the bundled head. Raises StgaError."""
-    model = read_flame(path or BUNDLED_HEAD)
+    if path is None:
+        return _bundled_head()
+    model = read_flame(path)
     return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
+
+
+@cache
+def _bundled_head() -> FlameModel:
+    return read_flame(BUNDLED_HEAD)
 
 
 def with_teeth(model: FlameModel) -> FlameModel:

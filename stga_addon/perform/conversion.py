@@ -9,11 +9,12 @@ from ..capture.open import open_capture
 from ..driving.face_video import watched_performance
 from ..driving.head_map import person_of
 from ..driving.inverse import captured_performance, write_performance
-from ..driving.open_motion import NEEDS_FLAME, MotionOptions, adapted, performed, prepared_performance
+from ..driving.open_motion import MotionOptions, adapted, performed, prepared_performance
 from ..driving.read_performance import is_performance, read_performance
 from ..errors import StgaError
 from ..export.playback import playback_fps
 from ..files import write_npz
+from ..flame.model import EXPRESSION_NAMES
 from ..flame.sequence import FRAME_FIELDS, FlameSequence
 from ..flame.teeth import flame_model
 from ..progress import Progress, Report, Say
@@ -73,8 +74,6 @@ def _person(request: ConvertMotion) -> FlameSequence:
         if capture.flame is None:
             raise StgaError(f"{request.head}: was not tracked with FLAME, so it has no identity")
         return capture.flame
-    if request.flame is None:
-        raise StgaError(f"{request.source}: {NEEDS_FLAME}; give it with --flame")
     model = flame_model(request.flame)
     return person_of(model, model.v_template)
 
@@ -83,4 +82,7 @@ def write_motion(path: Path, sequence: FlameSequence) -> None:
     """Write a sequence as FLAME parameters that `read_motion` takes."""
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
     arrays = {name: np.stack([getattr(frame, name) for frame in frames]).astype(np.float32) for name in FRAME_FIELDS}
-    write_npz(path, {**arrays, "shape": sequence.shape, "timesteps": np.array(sequence.timesteps)}, compressed=True)
+    arrays |= {"shape": sequence.shape, "timesteps": np.array(sequence.timesteps)}
+    if sequence.model.expression_names:
+        arrays[EXPRESSION_NAMES] = np.array(sequence.model.expression_names)
+    write_npz(path, arrays, compressed=True)
