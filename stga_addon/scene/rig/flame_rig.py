@@ -207,7 +207,7 @@ def _add_pose_correctives(head: Any, rig: Any, model: FlameModel, basis: np.ndar
     """
     for feature in range(model.posedirs.shape[2]):
         joint, entry = divmod(feature, 9)
-        if not corrected[1 + joint]:
+        if not corrected[1 + joint] or not model.posedirs[:, :, feature].any():
             continue
         bone, row, column = JOINTS[1 + joint], *divmod(entry, 3)
         name = f"pose_{bone}_{row}{column}"
