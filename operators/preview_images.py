@@ -31,9 +31,8 @@ class PreviewImages(bpy.types.Operator):
         mode = QUADS if scene.camera is not None else ELLIPSOIDS
         for thing in _own_as_trained(context):
             set_input(thing, DISPLAY, mode)
+        use_transparent_bounces(scene)
         engine = scene.render.engine
-        if engine == "CYCLES" and hasattr(scene, "cycles"):  # it can be chosen while its add-on is disabled
-            use_transparent_bounces(scene)
         if getattr(context.space_data, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
             is_shown_by_engine = engine == "CYCLES" or engine.startswith("BLENDER_EEVEE")

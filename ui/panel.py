@@ -11,7 +11,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
-from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_transform_hint
+from ..stga_addon.scene.display.hints import view_transform_hint
 from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
 from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.render import viewport_display
@@ -92,10 +92,6 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
                 column.prop(owner, prop, text=name)
         if viewport_display.display.problem:
             draw_text(layout, context, viewport_display.display.problem, "ERROR")
-        bounces = transparent_bounces_hint(context.scene)
-        if bounces:
-            layout.label(text=bounces, icon="ERROR")
-            layout.operator(ids.MORE_BOUNCES)
         mode = display_mode(splats)
         if mode == AS_TRAINED:
             layout.operator(ids.PREVIEW_IMAGES, icon="SHADING_RENDERED")

@@ -15,6 +15,7 @@ from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
+from .hints import use_transparent_bounces
 from .node_builder import is_splat_tree
 from .offset_nodes import displayed_offsets
 from .splat_attributes import (
@@ -249,6 +250,8 @@ def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
     set_input(
         splat_object, splat_nodes.DISPLAY, AS_TRAINED
     )  # a menu's default reaches the modifier in some versions only
+    for scene in splat_object.users_scene:
+        use_transparent_bounces(scene)
 
 
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
