@@ -15,10 +15,10 @@ from ..stga_addon.scene.display.hints import view_transform_hint
 from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
 from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.render import viewport_display
+from . import lighting
 from .continue_panel import ContinuePanel
 from .drive import DrivePanel
 from .effects import EffectsPanel
-from .lighting import LightingPanel
 from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel, TrainedPanel
 from .next_step import NextStepPanel
 from .render_panel import RenderPanel
@@ -121,7 +121,7 @@ CLASSES = (
     ContinuePanel,
     EffectsPanel,
     ShowPanel,
-    LightingPanel,
+    lighting.LightingPanel,
     MotionPanel,
     DrivePanel,
     TrainedPanel,
@@ -134,7 +134,9 @@ CLASSES = (
 
 def register() -> None:
     register_classes(CLASSES)
+    lighting.register()
 
 
 def unregister() -> None:
+    lighting.unregister()
     unregister_classes(CLASSES)

@@ -24,6 +24,10 @@ from stga_addon.scene.gpu.context import has_gpu_context  # noqa: E402
 from stga_addon.scene.render.camera import render_camera  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
+from .test_engine import camera_at, show, textured, with_light  # noqa: E402
+from .test_panel import draw  # noqa: E402
+from .test_splat_object import avatar_of  # noqa: E402
+
 SIZE_PX = 64
 SAMPLES = 4
 MIN_PSNR_DB = 33.0
@@ -97,15 +101,46 @@ def test_images_without_noise(engine: str, display: str, tmp_path: Path) -> None
     assert psnr_db >= MIN_PSNR_DB
 
 
+def test_images_of_recorded_light_say_so(extension, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches F12 and animations that show another light than the panel's without a word, or say it of each image."""
+    scene, cast = bpy.context.scene, "the light of this frame"
+    shown, _ = show(with_light(textured(avatar_of("stga"))))
+    camera_at()
+    scene.collection.objects.link(bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN")))
+    scene.stga.splats, scene.render.engine, scene.cycles.samples = shown, "CYCLES", 1
+    scene.render.resolution_x = scene.render.resolution_y = 8
+    scene.render.filepath, scene.frame_start, scene.frame_end = f"{tmp_path}/", 5, 7
+
+    def said(**how: bool) -> str:
+        bpy.ops.render.render(**how)
+        return capsys.readouterr().out
+
+    assert cast not in said()
+    scene.stga_lighting.mode = "scene"
+    assert "render colors as recorded" in said()
+    assert any(cast in text for text in draw(extension, "lighting"))
+    bpy.ops.stga.relight_frame()
+    assert cast not in said()
+    assert not any(cast in text for text in draw(extension, "lighting"))
+    text = said(animation=True)
+    assert "render the light of frame 5" in text
+    assert text.count(cast) == 1
+    scene.frame_set(6)
+    assert cast in said()
+    bpy.ops.stga.relight_frame()
+    assert cast not in said()
+    bpy.ops.stga.relight_frame(clear=True)
+    assert "render colors as recorded" in said()
+    shown.hide_render = True
+    assert cast not in said()
+
+
 def test_relit_color_of_a_frame(tmp_path: Path) -> None:
     """Catches relit colors that do not reach the nodes, in another color space, or stay when they are taken back."""
     from stga_addon.light.relight import Relighter
     from stga_addon.scene.display.materials import DISPLAY_COLOR
     from stga_addon.scene.light import settings
     from stga_addon.scene.render.frame_colors import forget_frame, relight_frame
-
-    from .test_engine import camera_at, show, textured, with_light
-    from .test_splat_object import avatar_of
 
     def node_colors() -> np.ndarray:
         depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -13,6 +13,11 @@ def view_transform_hint(scene: bpy.types.Scene) -> str | None:
     return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"
 
 
+def shows_nodes(scene: bpy.types.Scene) -> bool:
+    """Whether the scene is rendered by EEVEE or Cycles, which show what geometry nodes make of splats."""
+    return scene.render.engine == "CYCLES" or scene.render.engine.startswith("BLENDER_EEVEE")
+
+
 def use_transparent_bounces(scene: bpy.types.Scene) -> None:
     """Let Cycles, where its add-on is enabled, see through overlapping splats without ending rays between them at
     random; limits that are higher stay."""

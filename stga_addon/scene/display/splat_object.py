@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ...avatar.file import Avatar
+from ...avatar.light import AvatarLight
 from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
@@ -103,6 +104,15 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
     write_light(neutral.data, avatar.light)
     splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
     return True
+
+
+def stored_light(splat_object: Any) -> AvatarLight | None:
+    """The light of the object's avatar; None where it does not know that, or has lost its modifier."""
+    try:
+        neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    except StgaError:
+        return None
+    return None if neutral is None else read_light(neutral.data)
 
 
 def build_next_node_group(avatar: Avatar) -> bool:
