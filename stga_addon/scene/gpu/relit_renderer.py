@@ -14,8 +14,8 @@ from .relit_shaders import MAP_COLUMNS, NOTHING, shadow_map_shader
 from .textures import texture
 
 NEAR_PER_SQUARE = 3e-4
-"""Meters from a light before which objects throw no shadow, over its squared distance from the head: the nearer, the
-coarser float32 depth is at the head. So it is 0.2 mm."""
+"""Meters from a lamp at which its map begins, over the squared distance of the head: float32 then tells depths there
+0.2 mm apart, and less where the map begins nearer. What is nearer throws no shadow."""
 
 
 class RelitTextures:
@@ -27,7 +27,7 @@ class RelitTextures:
         self._scene_of: tuple[Any, ...] = ()
         self._kept: tuple[Any, ...] = ()
         self._scene: RelitScene | None = None
-        self._atlas: tuple[int, Any, Any] | None = None
+        self._atlas: tuple[int, Any, Any, Any] | None = None
         self._batches: dict[tuple[int, int], tuple[Any, Any]] = {}
         self.textures: dict[str, Any] = {}
 
