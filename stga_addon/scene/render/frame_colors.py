@@ -39,7 +39,7 @@ def forget_frame(splat_object: Any) -> bool:
     attribute = splat_object.data.attributes.get(RELIT_COLOR)
     if attribute is not None:
         splat_object.data.attributes.remove(attribute)
-        del splat_object.data[tags.RELIT_FRAME]
+        splat_object.data.pop(tags.RELIT_FRAME, None)
         splat_object.data.update()
     return attribute is not None
 
