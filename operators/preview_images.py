@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.scene.display.display_modes import ELLIPSOIDS, LIMITS, QUADS
-from ..stga_addon.scene.display.hints import use_transparent_bounces, view_transform_hint
+from ..stga_addon.scene.display.hints import shows_nodes, use_transparent_bounces, view_transform_hint
 from ..stga_addon.scene.display.splat_nodes import DISPLAY
 from ..stga_addon.scene.display.splat_object import set_input
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
@@ -31,13 +31,10 @@ class PreviewImages(bpy.types.Operator):
         mode = QUADS if scene.camera is not None else ELLIPSOIDS
         for thing in _own_as_trained(context):
             set_input(thing, DISPLAY, mode)
-        engine = scene.render.engine
-        if engine == "CYCLES" and hasattr(scene, "cycles"):  # it can be chosen while its add-on is disabled
-            use_transparent_bounces(scene)
+        use_transparent_bounces(scene)
         if getattr(context.space_data, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
-            is_shown_by_engine = engine == "CYCLES" or engine.startswith("BLENDER_EEVEE")
-            context.space_data.shading.type = "RENDERED" if is_shown_by_engine else "MATERIAL"
+            context.space_data.shading.type = "RENDERED" if shows_nodes(scene) else "MATERIAL"
             if scene.camera is not None:
                 context.space_data.region_3d.view_perspective = "CAMERA"
         hint = view_transform_hint(scene)

@@ -6,11 +6,10 @@ import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.avatar_scene import show_world
-from ..stga_addon.scene.display.hints import use_transparent_bounces
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes
 from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
 from . import ids
-from .common import FileImport, file_filter, file_path, head_of, needs_head, polled, reporting, scene_settings
+from .common import FileImport, file_filter, file_path, head_of, needs_head, reporting, scene_settings
 
 
 class ShowAvatar(bpy.types.Operator, FileImport):
@@ -67,20 +66,4 @@ class StandardView(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         context.scene.view_settings.view_transform = "Standard"
         context.scene.view_settings.look = "None"
-        return {"FINISHED"}
-
-
-class MoreBounces(bpy.types.Operator):
-    """Raise Cycles' transparent bounces, least and most, to 64: it sees through overlapping splats, without noise"""
-
-    bl_idname = ids.MORE_BOUNCES
-    bl_label = "Use 64 Transparent Bounces"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return polled(cls, hasattr(context.scene, "cycles"), "Cycles is not enabled")
-
-    def execute(self, context: Any) -> set[str]:
-        use_transparent_bounces(context.scene)
         return {"FINISHED"}

@@ -1,21 +1,25 @@
-"""The panel Lighting: which light avatars show."""
+"""The panel Lighting: which light avatars show. Images that show another one say so."""
 
+from functools import partial
 from typing import Any
 
 import bpy
+from bpy.app.handlers import persistent
 
 from ..operators import ids
 from ..operators.common import scene_settings
-from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.scene.display import splat_nodes
-from ..stga_addon.scene.display.splat_object import get_input
-from ..stga_addon.scene.display.stored_light import read_light
+from ..stga_addon.scene.display.hints import shows_nodes
+from ..stga_addon.scene.display.splat_object import stored_light
 from ..stga_addon.scene.light.settings import lighting_settings
 from ..stga_addon.scene.light.world import world_light
+from ..stga_addon.scene.render.frame_colors import light_hint
 from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
+
+_is_told = False
+"""Whether the render job in progress has said that it does not show the scene's light."""
 
 
 class LightingPanel(SidebarPanel, bpy.types.Panel):
@@ -29,7 +33,7 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, lighting_settings(context.scene)
-        light = _light(scene_settings(context).splats)
+        light = stored_light(scene_settings(context).splats)
         if light is None:
             draw_text(layout, context, "The avatar does not know the light of its capture", "INFO")
             if not draw_running(layout, context, Kind.LIGHT):
@@ -37,6 +41,9 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
                 layout.operator(ids.ESTIMATE_LIGHT, icon="LIGHT_SUN").directory = folder
             return
         layout.row().prop(settings, "mode", expand=True)
+        hint = light_hint(context.scene)
+        if hint:
+            draw_text(layout, context, hint, "ERROR" if shows_nodes(context.scene) else "INFO")
         if settings.mode != "recorded":
             self._draw_settings(layout, context, settings)
         if light.damping:
@@ -60,9 +67,36 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, context, text, "ERROR")
 
 
-def _light(splats: Any) -> Any:
-    try:
-        neutral = get_input(splats, splat_nodes.NEUTRAL)
-    except StgaError:
-        return None
-    return None if neutral is None else read_light(neutral.data)
+@persistent
+def _before_job(*_: Any) -> None:
+    global _is_told
+    _is_told = False
+
+
+@persistent
+def _before_image(scene: Any, *_: Any) -> None:
+    """Say once a job that an image does not show the scene's light."""
+    global _is_told
+    hint = light_hint(scene) if shows_nodes(scene) and not _is_told else None
+    if hint:
+        _is_told = True
+        print(f"STGA: {hint}")
+        if not bpy.app.background:  # this is the job's thread
+            bpy.app.timers.register(partial(_pop_up, hint))
+
+
+def _pop_up(hint: str) -> None:
+    """Show the sentence in the window that was opened last: that of the image, where it has one."""
+    manager = bpy.context.window_manager
+    with bpy.context.temp_override(window=manager.windows[-1]):
+        manager.popup_menu(lambda menu, _: menu.layout.label(text=hint), title="STGA Lighting", icon="ERROR")
+
+
+def register() -> None:
+    bpy.app.handlers.render_init.append(_before_job)
+    bpy.app.handlers.render_pre.append(_before_image)
+
+
+def unregister() -> None:
+    bpy.app.handlers.render_init.remove(_before_job)
+    bpy.app.handlers.render_pre.remove(_before_image)

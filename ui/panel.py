@@ -11,14 +11,14 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
-from ..stga_addon.scene.display.hints import transparent_bounces_hint, view_transform_hint
+from ..stga_addon.scene.display.hints import view_transform_hint
 from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
 from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.render import viewport_display
+from . import lighting
 from .continue_panel import ContinuePanel
 from .drive import DrivePanel
 from .effects import EffectsPanel
-from .lighting import LightingPanel
 from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel, TrainedPanel
 from .next_step import NextStepPanel
 from .render_panel import RenderPanel
@@ -92,10 +92,6 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
                 column.prop(owner, prop, text=name)
         if viewport_display.display.problem:
             draw_text(layout, context, viewport_display.display.problem, "ERROR")
-        bounces = transparent_bounces_hint(context.scene)
-        if bounces:
-            layout.label(text=bounces, icon="ERROR")
-            layout.operator(ids.MORE_BOUNCES)
         mode = display_mode(splats)
         if mode == AS_TRAINED:
             layout.operator(ids.PREVIEW_IMAGES, icon="SHADING_RENDERED")
@@ -125,7 +121,7 @@ CLASSES = (
     ContinuePanel,
     EffectsPanel,
     ShowPanel,
-    LightingPanel,
+    lighting.LightingPanel,
     MotionPanel,
     DrivePanel,
     TrainedPanel,
@@ -138,7 +134,9 @@ CLASSES = (
 
 def register() -> None:
     register_classes(CLASSES)
+    lighting.register()
 
 
 def unregister() -> None:
+    lighting.unregister()
     unregister_classes(CLASSES)

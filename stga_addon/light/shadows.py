@@ -107,13 +107,16 @@ class ShadowMap:
         casters: Sequence[Caster] = (),
         size: int = MAP_SIZE,
     ) -> None:
-        add_depths = shadow_kernels().add_depths
         self._project = light_projection(vertices, light, size)
         self._light, self._texel_m = light, texel_meters(head_bounds(vertices), size)
-        self.depth = np.full((size, size), np.inf, np.float32)
-        add_depths(self._project(vertices), np.ascontiguousarray(faces, np.int32), self.depth)
-        for caster in casters:
-            add_depths(self._project(caster.vertices), np.ascontiguousarray(caster.faces, np.int32), self.depth)
+        is_parallel = light.kind == "sun"
+        depth = np.full((size, size), np.inf if is_parallel else 0, np.float32)
+        for mesh in (Caster(vertices, faces), *casters):
+            points = self._project(mesh.vertices)
+            if not is_parallel:  # of a plane in perspective, not depth but 1 / depth is linear in texels
+                points[:, 2] = -1 / points[:, 2]
+            shadow_kernels().add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
+        self.depth = depth if is_parallel else np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
 
     def lit(
         self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP, normals: np.ndarray | None = None

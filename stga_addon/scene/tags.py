@@ -20,6 +20,7 @@ PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a 
 CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
+RELIT_FRAME = "stga_relit_frame"  # on a splat object's mesh: the frame in whose light EEVEE and Cycles show it
 AVATAR = "stga_avatar"  # on splats that were made without the panel: the avatar's file
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
 WORLD = "stga_world"  # on splats of a run's world: their file

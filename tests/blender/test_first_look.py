@@ -126,6 +126,20 @@ def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
     assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20
 
 
+def test_cycles_sees_through_splats_that_are_shown(extension, tmp_path):
+    """Catches F12 in Cycles that makes holes of overlapping splats, and limits lowered or raised where none are."""
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    write_ball_avatar(tmp_path / "avatar.npz")
+    other, cycles = bpy.data.scenes.new("other").cycles, bpy.context.scene.cycles
+    before = other.transparent_max_bounces, other.min_transparent_bounces
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (64, 64)
+    cycles.transparent_max_bounces, cycles.min_transparent_bounces = 200, 8
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (200, 64)
+    assert (other.transparent_max_bounces, other.min_transparent_bounces) == before
+
+
 def test_preview_for_other_engines(extension, tmp_path):
     """Catches quads that face no camera, black holes in Cycles, and displays that do not state their limits."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))

@@ -20,12 +20,13 @@ from stga_addon.avatar.splats import Splats, no_strain_color
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
+from stga_addon.light.shadows import MAP_SIZE, ShadowMap
 from stga_addon.light.values import Caster, Light, Lighting
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
 from stga_addon.scene.gpu.context import has_gpu_context
 from stga_addon.scene.gpu.packing import View
-from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer
+from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer, _pixels
 from stga_addon.scene.layers import DisplaySettings, Relit, SceneLayer
 
 from .gpu_context import run_with_gpu
@@ -225,3 +226,37 @@ def test_light_of_the_scene(mode):
     assert psnr_db(image.rgb, expected.rgb) >= MIN_RELIT_PSNR_DB
     plain = compose([replace(one, relit=None).posed() for one in layers], camera)
     assert psnr_db(image.rgb, plain.rgb) < 28, "nothing is lit"
+
+
+def check_shadow_map(atlas: np.ndarray, index: int, expected: np.ndarray) -> None:
+    """A map of the atlas against the depth map (MAP_SIZE, MAP_SIZE) of the CPU, texel by texel."""
+    found = atlas[:, MAP_SIZE * index : MAP_SIZE * (index + 1)]
+    hit = np.isfinite(expected)
+    assert 0.1 < hit.mean() < 0.9, "nothing to compare"
+    assert (hit != (found < 1e20)).mean() < 1e-4, "another outline"
+    error = np.abs(found - expected)[hit & (found < 1e20)]
+    print(f"map {index}: {1e3 * error.max():.2f} mm at most")
+    assert (error > 1e-3).mean() < 1e-4  # edges of triangles at the middle of a texel
+
+
+@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+def test_shadow_maps() -> None:
+    """Catches surfaces that hide what is nearer to a sun or a lamp, near, far, or drawn later, and depth that does not
+    run straight across a large triangle."""
+    shown = relit_layers("scene")[1]
+    relit, far = shown.relit, Light("point", np.ones(3), (30, 50, 20))
+    assert relit is not None
+    relit = replace(relit, lighting=replace(relit.lighting, lights=(*relit.lighting.lights[:3], far)))
+    atlas: list[np.ndarray] = []
+
+    def draw() -> None:
+        renderer = SplatRenderer()
+        renderer.draw([replace(shown, relit=relit)], View(look_at((0.3, 0.2, 0.7), (0, 0, 0), 16, 20, 30)))
+        assert renderer._relit is not None
+        atlas.append(_pixels(renderer._relit[0].textures["shadows"], 1)[..., 0])
+
+    run_with_gpu(draw)
+    for index, light in enumerate(relit.lighting.lights):
+        check_shadow_map(
+            atlas[0], index, ShadowMap(relit.mesh, shown.relit.relighter.avatar.faces, light, relit.casters).depth
+        )

@@ -39,7 +39,7 @@ OPERATORS = (
     "track_footage", "view_footage", "mark_key", "solve_again", "export_head_model", "open_demo", "import_capture",
     "import_motion", "import_meshes", "select", "toggle_region", "count_selected", "heat_map", "analyze_capture",
     "train", "refine", "extend", "cancel", "dismiss", "copy_report", "make_environment", "test_environment",
-    "show_avatar", "apply_motion", "standard_view", "more_bounces", "preview_images", "render_video", "import_ply",
+    "show_avatar", "apply_motion", "standard_view", "preview_images", "render_video", "import_ply",
     "export_avatar", "export_cameras", "open_npz",
 )  # fmt: skip
 
@@ -366,27 +366,6 @@ def test_a_capture_that_is_gone_is_named(extension, mesh_capture):
     mesh_capture.rename(mesh_capture.with_name("elsewhere"))
     with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
         bpy.ops.stga.select()
-
-
-def test_more_bounces_where_cycles_needs_them(extension):
-    """Catches a hint that shows where nothing has to be done, and a button that lowers what somebody raised."""
-    hints = extension.stga_addon.scene.display.hints
-    scene = bpy.context.scene
-    scene.render.engine = "CYCLES"
-    scene.cycles.transparent_max_bounces = 8
-    assert "8 layers" in hints.transparent_bounces_hint(scene)
-    bpy.ops.stga.more_bounces()
-    assert (scene.cycles.transparent_max_bounces, scene.cycles.min_transparent_bounces) == (64, 64)
-    scene.cycles.min_transparent_bounces = 0
-    assert "noise" in hints.transparent_bounces_hint(scene)
-    bpy.ops.stga.more_bounces()
-    assert hints.transparent_bounces_hint(scene) is None
-    scene.cycles.transparent_max_bounces = 200
-    bpy.ops.stga.more_bounces()
-    assert scene.cycles.transparent_max_bounces == 200
-    scene.cycles.transparent_max_bounces = 8
-    scene.render.engine = "BLENDER_WORKBENCH"
-    assert hints.transparent_bounces_hint(scene) is None
 
 
 def test_standard_view(extension):

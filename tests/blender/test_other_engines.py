@@ -18,12 +18,15 @@ from stga_addon.raster.cpu.compose import compose  # noqa: E402
 from stga_addon.raster.posed_splats import PosedSplats  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import ELLIPSOIDS, QUADS  # noqa: E402
-from stga_addon.scene.display.hints import use_transparent_bounces  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
 from stga_addon.scene.gpu.context import has_gpu_context  # noqa: E402
 from stga_addon.scene.render.camera import render_camera  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+
+from .test_engine import camera_at, show, textured, with_light  # noqa: E402
+from .test_panel import draw  # noqa: E402
+from .test_splat_object import avatar_of  # noqa: E402
 
 SIZE_PX = 64
 SAMPLES = 4
@@ -68,7 +71,8 @@ def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
     [pytest.param(EEVEE, QUADS, marks=EEVEE_MARKS), ("CYCLES", QUADS), ("CYCLES", ELLIPSOIDS)],
 )
 def test_images_without_noise(engine: str, display: str, tmp_path: Path) -> None:
-    """Catches splats that are blended out of order, and transparency by chance, which a few samples show as noise."""
+    """Catches splats that are blended out of order, black holes behind the eighth splat of a pixel, and transparency by
+    chance, which a few samples show as noise."""
     scene = bpy.context.scene
     splats = overlapping_splats()
     set_input(show_world_splats(splats, "ball"), DISPLAY, display)
@@ -84,7 +88,6 @@ def test_images_without_noise(engine: str, display: str, tmp_path: Path) -> None
     scene.view_settings.view_transform = "Standard"
     if engine == "CYCLES":
         scene.cycles.samples, scene.cycles.use_denoising = SAMPLES, False
-        use_transparent_bounces(scene)
     else:
         scene.eevee.taa_render_samples = SAMPLES
     bpy.ops.render.render(write_still=True)
@@ -98,15 +101,46 @@ def test_images_without_noise(engine: str, display: str, tmp_path: Path) -> None
     assert psnr_db >= MIN_PSNR_DB
 
 
+def test_images_of_recorded_light_say_so(extension, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches F12 and animations that show another light than the panel's without a word, or say it of each image."""
+    scene, cast = bpy.context.scene, "the light of this frame"
+    shown, _ = show(with_light(textured(avatar_of("stga"))))
+    camera_at()
+    scene.collection.objects.link(bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN")))
+    scene.stga.splats, scene.render.engine, scene.cycles.samples = shown, "CYCLES", 1
+    scene.render.resolution_x = scene.render.resolution_y = 8
+    scene.render.filepath, scene.frame_start, scene.frame_end = f"{tmp_path}/", 5, 7
+
+    def said(**how: bool) -> str:
+        bpy.ops.render.render(**how)
+        return capsys.readouterr().out
+
+    assert cast not in said()
+    scene.stga_lighting.mode = "scene"
+    assert "render colors as recorded" in said()
+    assert any(cast in text for text in draw(extension, "lighting"))
+    bpy.ops.stga.relight_frame()
+    assert cast not in said()
+    assert not any(cast in text for text in draw(extension, "lighting"))
+    text = said(animation=True)
+    assert "render the light of frame 5" in text
+    assert text.count(cast) == 1
+    scene.frame_set(6)
+    assert cast in said()
+    bpy.ops.stga.relight_frame()
+    assert cast not in said()
+    bpy.ops.stga.relight_frame(clear=True)
+    assert "render colors as recorded" in said()
+    shown.hide_render = True
+    assert cast not in said()
+
+
 def test_relit_color_of_a_frame(tmp_path: Path) -> None:
     """Catches relit colors that do not reach the nodes, in another color space, or stay when they are taken back."""
     from stga_addon.light.relight import Relighter
     from stga_addon.scene.display.materials import DISPLAY_COLOR
     from stga_addon.scene.light import settings
     from stga_addon.scene.render.frame_colors import forget_frame, relight_frame
-
-    from .test_engine import camera_at, show, textured, with_light
-    from .test_splat_object import avatar_of
 
     def node_colors() -> np.ndarray:
         depsgraph = bpy.context.evaluated_depsgraph_get()

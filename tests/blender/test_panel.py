@@ -84,8 +84,8 @@ def trained(extension, tmp_path, monkeypatch):
     return run
 
 
-def draw(extension) -> list[str]:
-    """Draw every panel; the texts on it."""
+def draw(extension, name: str = "") -> list[str]:
+    """Draw the panels with `name` in their identifiers; the texts on them."""
     context = SimpleNamespace(
         scene=bpy.context.scene,
         region=SimpleNamespace(width=10_000),
@@ -97,7 +97,7 @@ def draw(extension) -> list[str]:
         screen=SimpleNamespace(is_animation_playing=False),
     )
     layout = Layout()
-    for cls in panels(extension):
+    for cls in [cls for cls in panels(extension) if name in cls.bl_idname]:
         own = [base for base in reversed(cls.__mro__) if base.__module__.startswith("stga")]
         members = {key: value for base in own for key, value in vars(base).items() if not key.startswith("__")}
         panel = type(cls.__name__, (), members)()  # Blender makes panels itself, in a window only

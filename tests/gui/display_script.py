@@ -29,7 +29,8 @@ from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, show_avatar  # noqa: E402
-from stga_addon.scene.gpu.renderer import SplatRenderer  # noqa: E402
+from stga_addon.scene.gpu.renderer import SplatRenderer, _pixels  # noqa: E402
+from stga_addon.scene.light import settings as lighting  # noqa: E402
 from stga_addon.scene.render import engine, viewport_display  # noqa: E402
 from stga_addon.scene.render.view_transform import inverse_view  # noqa: E402
 from stga_addon.scene.render.viewport_display import display, region_view  # noqa: E402
@@ -156,6 +157,27 @@ def bones_in_front(shown: Any) -> None:
     shown.hide_set(False)
     overlay.show_overlays = False
     bpy.data.objects.remove(rig)
+
+
+def shadows() -> None:
+    """The shadow maps of a sun and a lamp as the display draws them, and these lights in the avatar's space."""
+    lamps = []
+    for kind, place, energy in (("SUN", (0.4, -0.6, 1.0), 2.0), ("POINT", (0.3, 0.2, 0.4), 5.0)):
+        data = bpy.data.lights.new(kind, kind)
+        data.energy = energy
+        lamps.append(bpy.data.objects.new(kind, data))
+        lamps[-1].location, lamps[-1].rotation_euler = place, (0.4, 0.5, 0.0)
+        bpy.context.scene.collection.objects.link(lamps[-1])
+    settings = lighting.lighting_settings(bpy.context.scene)
+    settings.mode = "scene"
+    redraw()
+    drawn = display._renderer
+    (relit,) = (layer.relit for layer in drawn._layers)
+    seen["lights"] = {light.kind: [*light.position, *light.direction] for light in relit.lighting.lights}
+    np.save(FOLDER / "shadows.npy", _pixels(drawn._relit[0].textures["shadows"], 1)[..., 0])
+    settings.mode = "recorded"
+    for lamp in lamps:
+        bpy.data.objects.remove(lamp)
 
 
 def in_viewport(operator: Any, *how: str, **settings: Any) -> None:
@@ -303,10 +325,12 @@ def steps() -> Any:
     yield
     viewport_display.register()
     engine.register(no_python)
+    lighting.register()
     shown = set_up()
     yield
     pictures(shown)
     bones_in_front(shown)
+    shadows()
     memory(shown)
     in_viewport(bpy.ops.screen.region_quadview)
     yield  # regions get their places between two steps

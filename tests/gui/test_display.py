@@ -15,12 +15,17 @@ import pytest
 
 pytest.importorskip("bpy")
 
-from blender.test_gpu_renderer import avatar, psnr_db
+from blender.test_gpu_renderer import avatar, check_shadow_map, psnr_db
 from PIL import Image
 
 from stga_addon.avatar.file import write_avatar
+from stga_addon.avatar.light import AvatarLight
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
+from stga_addon.light.harmonics import uniform
+from stga_addon.light.shadows import ShadowMap
+from stga_addon.light.transfer import transfer_of
+from stga_addon.light.values import Light
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
 
@@ -50,7 +55,11 @@ def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     if backend == "vulkan" and not has_vulkan():
         pytest.skip("Blender does not start with Vulkan here: too old, or no driver")
     folder = tmp_path_factory.mktemp("display")
-    write_avatar(folder / "avatar.npz", avatar(3))
+    of = avatar(3)
+    transfer, occlusion = transfer_of(of.neutral, of.faces, 64)
+    world, skin = uniform(np.ones(3)).astype(np.float32), np.zeros(len(of.neutral), np.float32)
+    light = AvatarLight(world, transfer, occlusion, (transfer @ world).astype(np.float32), skin, 0.0)
+    write_avatar(folder / "avatar.npz", replace(of, light=light))
     shutil.copytree(Path(filelock.__file__).parent, folder / "packages/filelock")
     script = Path(__file__).with_name("display_script.py")
     arguments = ["--factory-startup", "--gpu-backend", backend, "--python", str(script), "--", str(folder)]
@@ -105,6 +114,16 @@ def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: 
     colored = np.ptp(plain, axis=0) > 0.4  # little of the background is seen there
     assert colored.sum() > 1000
     assert np.median(np.abs(found - plain)[:, colored]) < 3 / 255
+
+
+def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
+    """Catches a head that throws no shadow on itself, because surfaces hide what is nearer to a sun or a lamp."""
+    folder, result = shown
+    atlas, of = np.load(folder / "shadows.npy"), avatar(3)
+    assert set(result["lights"]) == {"sun", "point"}
+    for index, (kind, place) in enumerate(result["lights"].items()):
+        light = Light(kind, np.ones(3), place[:3], direction=place[3:])
+        check_shadow_map(atlas, index, ShadowMap(of.neutral, of.faces, light).depth)
 
 
 def test_rendering_in_a_window(shown: tuple[Path, dict[str, Any]]) -> None:

@@ -10,7 +10,7 @@ import pytest
 from light.scenes import ball_and_plate, blocked
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.lamps import Lamps
-from stga_addon.light.shadows import LIFT_M
+from stga_addon.light.shadows import LIFT_M, ShadowMap, head_bounds, light_view
 from stga_addon.light.values import Caster, Light, Lighting
 
 NO_FACES = np.zeros((0, 3), np.int32)
@@ -154,3 +154,19 @@ def test_another_object_throws_its_shadow():
     wall = Caster(np.array([[-1.0, 1, -1], [1, 1, -1], [0, 1, 1]]), np.array([[0, 1, 2]]))
     assert Lamps(sun, vertices[:162], ball).irradiance(top, up)[0, 0] == pytest.approx(1, abs=1e-3)
     assert Lamps(sun, vertices[:162], ball, [wall]).irradiance(top, up)[0, 0] == pytest.approx(0, abs=1e-3)
+
+
+def test_depth_of_a_large_triangle():
+    """Catches a wall from near a lamp to the head whose depth is that of its corners' mean and not of its plane."""
+    lamp = Light("point", np.ones(3), (0, 0, 1))
+    wall = Caster(np.array([[0.0, 0.4, 0.9], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]]), np.array([[0, 1, 2]]))
+    found = ShadowMap(AROUND, NO_FACES, lamp, [wall]).depth
+    view = light_view(head_bounds(AROUND), lamp)
+    y, x = (np.indices(found.shape) + 0.5 - view.size / 2) / view.scale
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ view.axes.T
+    normal = np.cross(*(wall.vertices[1:] - wall.vertices[0]))
+    expected = (wall.vertices[0] - lamp.position) @ normal / (rays @ normal)
+    drawn = np.isfinite(found)
+    assert drawn.mean() > 0.1
+    assert np.ptp(expected[drawn]) > 0.1
+    np.testing.assert_allclose(found[drawn], expected[drawn], rtol=1e-4)

@@ -14,7 +14,8 @@ ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 def add_depths(points, faces, depth):
     """Draw triangles into a depth map (S, S) float32, which keeps the least depth at each texel's center.
 
-    points (V, 3) float32: x and y in texels, depth; triangles with a point that is not finite are left out.
+    points (V, 3) float32: x and y in texels, depth, or what grows with it and is linear in texels; triangles with a
+    point that is not finite are left out.
     """
     size = len(depth)
     centers = np.arange(size).astype(np.float32) + HALF

@@ -1,9 +1,9 @@
-"""Scene settings that change how splats look, each reported in one sentence."""
+"""Scene settings that change how EEVEE and Cycles show splats."""
 
 import bpy
 
 TRANSPARENT_BOUNCES = 64
-"""Layers of overlapping splats that Cycles has to see through; its default of 8 leaves black holes."""
+"""Layers of overlapping splats that Cycles has to see through; behind its default of 8 is black."""
 
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
@@ -13,22 +13,14 @@ def view_transform_hint(scene: bpy.types.Scene) -> str | None:
     return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"
 
 
-def transparent_bounces_hint(scene: bpy.types.Scene) -> str | None:
-    """A sentence where Cycles renders the scene with too few transparent bounces for splats, else None."""
-    cycles = getattr(scene, "cycles", None)  # None where the Cycles add-on is disabled
-    if scene.render.engine != "CYCLES" or cycles is None:
-        return None
-    if cycles.transparent_max_bounces < TRANSPARENT_BOUNCES:
-        return (
-            f"Cycles sees through {cycles.transparent_max_bounces} layers of splats; {TRANSPARENT_BOUNCES} are needed"
-        )
-    if cycles.min_transparent_bounces < TRANSPARENT_BOUNCES:
-        return "Cycles ends rays between splats at random, which is seen as noise"
-    return None
+def shows_nodes(scene: bpy.types.Scene) -> bool:
+    """Whether the scene is rendered by EEVEE or Cycles, which show what geometry nodes make of splats."""
+    return scene.render.engine == "CYCLES" or scene.render.engine.startswith("BLENDER_EEVEE")
 
 
 def use_transparent_bounces(scene: bpy.types.Scene) -> None:
-    """Let Cycles see through overlapping splats, without ending rays between them at random."""
-    cycles = scene.cycles
-    cycles.transparent_max_bounces = max(cycles.transparent_max_bounces, TRANSPARENT_BOUNCES)
-    cycles.min_transparent_bounces = max(cycles.min_transparent_bounces, TRANSPARENT_BOUNCES)
+    """Let Cycles, where its add-on is enabled, see through overlapping splats without ending rays between them at
+    random; limits that are higher stay."""
+    cycles = getattr(scene, "cycles", None)
+    for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
+        setattr(cycles, limit, max(getattr(cycles, limit), TRANSPARENT_BOUNCES))

@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ...avatar.file import Avatar
+from ...avatar.light import AvatarLight
 from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
@@ -15,6 +16,7 @@ from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
+from .hints import use_transparent_bounces
 from .node_builder import is_splat_tree
 from .offset_nodes import displayed_offsets
 from .splat_attributes import (
@@ -102,6 +104,15 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
     write_light(neutral.data, avatar.light)
     splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
     return True
+
+
+def stored_light(splat_object: Any) -> AvatarLight | None:
+    """The light of the object's avatar; None where it does not know that, or has lost its modifier."""
+    try:
+        neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    except StgaError:
+        return None
+    return None if neutral is None else read_light(neutral.data)
 
 
 def build_next_node_group(avatar: Avatar) -> bool:
@@ -249,6 +260,8 @@ def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
     set_input(
         splat_object, splat_nodes.DISPLAY, AS_TRAINED
     )  # a menu's default reaches the modifier in some versions only
+    for scene in splat_object.users_scene:
+        use_transparent_bounces(scene)
 
 
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:

@@ -13,6 +13,10 @@ from .relit_packing import RelitScene, ShadowView, relit_scene, surface, with_ey
 from .relit_shaders import MAP_COLUMNS, NOTHING, shadow_map_shader
 from .textures import texture
 
+NEAR_PER_SQUARE = 3e-4
+"""Meters from a lamp at which its map begins, over the squared distance of the head: float32 then tells depths there
+0.2 mm apart, and less where the map begins nearer. What is nearer throws no shadow."""
+
 
 class RelitTextures:
     """What `relit_shaders` reads for the layers drawn last."""
@@ -23,7 +27,7 @@ class RelitTextures:
         self._scene_of: tuple[Any, ...] = ()
         self._kept: tuple[Any, ...] = ()
         self._scene: RelitScene | None = None
-        self._atlas: tuple[int, Any, Any] | None = None
+        self._atlas: tuple[int, Any, Any, Any] | None = None
         self._batches: dict[tuple[int, int], tuple[Any, Any]] = {}
         self.textures: dict[str, Any] = {}
 
@@ -46,10 +50,10 @@ class RelitTextures:
         rows = max(1, -(-len(maps) // MAP_COLUMNS))
         if self._atlas is None or self._atlas[0] != rows:
             size = MAP_SIZE * MAP_COLUMNS, MAP_SIZE * rows
-            depths = GPUTexture(size, format="R32F")
-            target = GPUFrameBuffer(depth_slot=GPUTexture(size, format="DEPTH_COMPONENT32F"), color_slots=(depths,))
-            self._atlas = rows, depths, target
-        _, depths, target = self._atlas
+            depths, tested = GPUTexture(size, format="R32F"), GPUTexture(size, format="DEPTH_COMPONENT32F")
+            target = GPUFrameBuffer(depth_slot=tested, color_slots=(depths,))
+            self._atlas = rows, depths, target, tested  # a framebuffer does not keep its textures alive
+        _, depths, target, _ = self._atlas
         known, self._batches = self._batches, {}
         with target.bind():
             target.clear(color=(NOTHING, 0.0, 0.0, 0.0), depth=1.0)
@@ -71,7 +75,9 @@ class RelitTextures:
         shader.bind()
         for name, axis in zip(("row_x", "row_y", "row_z"), view.axes.T, strict=True):
             shader.uniform_float(name, (*axis, -float(view.origin @ axis)))
-        shader.uniform_float("lens", (2 * view.scale / view.size, float(view.is_parallel), 0.0, 0.0))
+        distance = float(((drawn.meshes[0][0] - view.origin) @ view.axes[:, 2]).max())
+        near = min(max(1e-3, NEAR_PER_SQUARE * distance**2), abs(distance) / 2)
+        shader.uniform_float("lens", (2 * view.scale / view.size, float(view.is_parallel), near, 0.0))
         for mesh in drawn.meshes:
             key = id(mesh[0]), id(mesh[1])
             if key not in self._batches:

@@ -199,8 +199,8 @@ void main()
   vec3 local = vec3(dot(row_x, vec4(position, 1.0)), dot(row_y, vec4(position, 1.0)), dot(row_z, vec4(position, 1.0)));
   distance_out = local.z;
   vec2 place = local.xy * lens.x;
-  /* Depths from 1 mm to 1 km before a light, and 1 km around a sun's center. */
-  gl_Position = lens.y > 0.5 ? vec4(place, local.z * 1e-3, 1.0) : vec4(place, local.z * 1.000002 - 0.002, local.z);
+  /* Depths from lens.z to infinity before a light, and 1 km around a sun's center. */
+  gl_Position = lens.y > 0.5 ? vec4(place, local.z * 1e-3, 1.0) : vec4(place, local.z - 2.0 * lens.z, local.z);
 }
 """
 
@@ -215,7 +215,8 @@ void main()
 def shadow_map_shader() -> Any:
     """Draws triangles into a shadow map: depth in meters along the light's axis.
 
-    row_x, row_y, row_z: as packed by `relit_packing`; lens: scale to normalized device coordinates, whether parallel.
+    row_x, row_y, row_z: as packed by `relit_packing`; lens: scale to normalized device coordinates, whether parallel,
+    least depth in perspective.
     """
     info = GPUShaderCreateInfo()
     info.vertex_in(0, "VEC3", "position")
