@@ -10,10 +10,13 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.flame.forward import flame_forward  # noqa: E402
 from stga_addon.flame.model import JOINTS  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh  # noqa: E402
+from stga_addon.flame.teeth import flame_model as bundled_model  # noqa: E402
 from stga_addon.flame.teeth import with_teeth  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
+from stga_addon.scene.rig.motion import sample_motion  # noqa: E402
+from stga_addon.scene.rig.names import is_of_parts  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 
@@ -290,3 +293,21 @@ def test_a_saved_rig_shows_the_same(source, tmp_path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
     assert_parity(bpy.data.objects[name], sequence)
+
+
+def test_the_bundled_head_has_arkits_sliders(source):
+    """Fails when shape keys of the bundled head have numbers, move other vertices, lose their keyframes to another part
+    or do not come back as its coefficients."""
+    sequence = flame_sequence(bundled_model(None))
+    head = import_head(motion_capture(sequence, source))
+    names = [key.name for key in head.data.shape_keys.key_blocks[1:] if not key.name.startswith("identity_")]
+    assert names == list(sequence.model.expression_names)  # and none for correctives, which it has not
+    assert_parity(head, sequence)
+    sampled = sample_motion(head, sequence, sequence.timesteps)
+    for number, timestep in enumerate(sequence.timesteps):
+        np.testing.assert_allclose(sampled.frame(number).expr, sequence.frame(timestep).expr, atol=1e-5)
+    key = head.data.shape_keys.key_blocks["jawOpen"]
+    assert is_of_parts(key.path_from_id("value"), ["expression"])
+    assert not is_of_parts(key.path_from_id("value"), ["head", "jaw"])
+    key.value = -9.5  # tracked coefficients leave 0 to 1
+    assert key.value == -9.5
