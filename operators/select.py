@@ -201,7 +201,8 @@ def count_selected(scene: Any, head: Any) -> None:
     """Fill the panel's table of selected triangles."""
     settings = getattr(scene, ids.SETTINGS)
     per_face = splats_per_face(settings.splats, head)
-    every = (TrainingSettings.lattice + 1) * (TrainingSettings.lattice + 2) // 2  # at the start of a training
+    order = TrainingSettings().lattice_order(len(head.data.polygons))
+    every = (order + 1) * (order + 2) // 2  # at the start of a training
     settings.selected_frames.clear()
     for timestep, selected in read_selection(head).items():
         row = settings.selected_frames.add()

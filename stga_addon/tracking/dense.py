@@ -19,7 +19,7 @@ from .dense_terms import Misfit, PyramidView, flow_start, misfit, photo_term, sa
 from .fit import HeadFit, TimestepLandmarks, by_visibility, observed_landmarks, triangulated
 from .landmarks import Report
 from .seen_surface import RecordedTake, excerpt, parts_of
-from .solve import Observation, acceleration_precision, normal_equations, smooth_take
+from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smooth_take
 
 MIN_TIMESTEPS = 6
 """Below it, a texture averaged over the take is no evidence of how its timesteps differ."""
@@ -229,7 +229,7 @@ class _Solver:
         else:
             values = shot.start
             stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
-            terms = stiff, self.head.precision * values  # which the prior does not move
+            terms = stiff, -prior_terms(self.head.head, values)[1]  # which the prior does not move
         found, missed = self._evidence(shot, texture, values, visible), self._missed(shot.landmarks, values)
         return _Solved(values, visible, terms, coarse, found, missed, better)
 
@@ -291,9 +291,10 @@ class _Solver:
         """A damped Gauss–Newton step, and the root mean square in meters of what it moves the points by."""
         at, jacobian = self.head.linearized(values, level)
         matrix, right = self._terms(shot, texture, values, visible, level, at, jacobian)
-        matrix = matrix + np.diag(self.head.precision)
+        precision, pull = prior_terms(self.head.head, values)
+        matrix = matrix + np.diag(precision)
         matrix[np.diag_indices(len(matrix))] *= 1 + DAMPING
-        step = np.linalg.solve(matrix, right - self.head.precision * values)
+        step = np.linalg.solve(matrix, right + pull)
         step = step / max(1.0, np.abs(step[-RIGID_SIZE:-3]).max() / MAX_TURN)
         return step, float(np.sqrt(3 * np.mean((jacobian @ step) ** 2)))
 

@@ -13,7 +13,7 @@ from .head_model import HeadModel
 from .photo_consistency import facing, in_sight
 from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .seen_surface import large_parts, surface_points
-from .solve import parameter_precision
+from .solve import prior_terms
 
 HEAD_POINTS = 5000
 """Points over the whole head, of which those near landmarks are used; the landmarks' places come on top, because they
@@ -53,9 +53,9 @@ class DenseHead:
         model = person.model
         self.active = np.flatnonzero(np.abs(model.shapedirs).max(axis=(0, 1)) > 0)
         dirs = np.ascontiguousarray(model.shapedirs[:, :, self.active])
-        self.head = replace(person, model=replace(model, shapedirs=dirs))
+        names = tuple(model.expression_names[k] for k in self.active) if model.expression_names else ()
+        self.head = replace(person, model=replace(model, shapedirs=dirs, expression_names=names))
         self.count = model.n_expression
-        self.precision = parameter_precision(self.head)
         self.landmarks = PosedPoints(self.head.model, places)
         self.skin = large_parts(person)[places.face]
         """(L,) bool: landmarks that are not on eyeballs or teeth."""
@@ -144,7 +144,7 @@ class DenseHead:
         use = self._chin | self._fixed
         moving = jacobian[use].reshape(-1, len(values)) / OPENING_SIGMA_M
         moving[:, -RIGID_SIZE : -RIGID_SIZE + 3] = moving[:, -3:] = 0  # the head stays
-        matrix = moving.T @ moving + np.diag(self.precision)
+        matrix = moving.T @ moving + np.diag(prior_terms(self.head, values)[0])
         return values + np.linalg.solve(matrix, moving.T @ wanted[use].ravel() / OPENING_SIGMA_M)
 
     def rest(self, take: Sequence[np.ndarray]) -> np.ndarray:

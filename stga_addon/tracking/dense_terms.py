@@ -9,6 +9,7 @@ import numpy as np
 from ..capture.camera import Camera
 from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, Level, Sample, Texture, fitted_light, robust, sampled, shading
 from .dense_head import REGIONS, DenseHead
+from .solve import prior_terms
 
 POINT_SHARE = 0.25
 """Weight of a point in a view: neighboring points share pixels."""
@@ -132,7 +133,8 @@ def flow_start(
     moved = values
     for _ in range(FLOW_ITERATIONS):
         at, jacobian = head.linearized(moved, FLOW_POINTS)
-        matrix, right = np.diag(head.precision), -head.precision * moved
+        precision, right = prior_terms(head.head, moved)
+        matrix = np.diag(precision)
         for key, camera, target in targets:
             miss = camera.project(at)[0] - target
             weight = np.repeat(FLOW_SHARE * weights[key] * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX), 2)

@@ -41,7 +41,8 @@ class PosedPoints:
         rows = model.faces[points.face].ravel()
         self.barycentric = points.barycentric
         self.template, self.dirs = model.v_template[rows], model.shapedirs[rows]
-        self.posedirs, self.weights, self.parents = model.posedirs[rows], model.weights[rows], model.parents.tolist()
+        self.weights, self.parents = model.weights[rows], model.parents.tolist()
+        self.posedirs = model.posedirs[rows] if model.posedirs.any() else None
         self.joints = model.j_regressor @ model.v_template
         self.joint_dirs = np.einsum("jv,vak->jak", model.j_regressor, model.shapedirs)
         self._below = _below(self.parents)
@@ -68,8 +69,10 @@ class PosedPoints:
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
         moved = _moves(posed.rotations, self._placed(posed.rotations, self.joint_dirs), self.joint_dirs)
         found[..., :first] = skin @ self.dirs.reshape(count, 9, first) + np.tensordot(share.T, moved, 1)
-        found[..., first:-TRANSLATION_SIZE] = skin @ self._corrective_dirs(posed, turns).reshape(count, 9, -1)
-        found[..., first:-TRANSLATION_SIZE] += self._by_joints(posed, turns)
+        found[..., first:-TRANSLATION_SIZE] = self._by_joints(posed, turns)
+        if self.posedirs is not None:
+            bent = self._corrective_dirs(self.posedirs, posed, turns).reshape(count, 9, -1)
+            found[..., first:-TRANSLATION_SIZE] += skin @ bent
         found[..., -TRANSLATION_SIZE:] = np.eye(3)
         return posed.positions, found
 
@@ -89,20 +92,23 @@ class PosedPoints:
         joints = self.joints + self.joint_dirs @ coefficients
         places = self._placed(rotations, joints[..., None])[..., 0]
         moved = _moves(rotations, places[..., None], joints[..., None])[..., 0]
-        corrected = self.template + self.dirs @ coefficients + self.posedirs @ (local[1:] - np.eye(3)).ravel()
+        corrected = self.template + self.dirs @ coefficients
+        if self.posedirs is not None:
+            corrected += self.posedirs @ (local[1:] - np.eye(3)).ravel()
         skin = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
         posed = np.einsum("nij,nj->ni", skin, corrected) + self.weights @ moved
         positions = self._weighted(posed).sum(1) + rigid[POSE_SIZE:]
         angles = rigid[:POSE_SIZE].reshape(-1, 3)
         return _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
 
-    def _corrective_dirs(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
+    @staticmethod
+    def _corrective_dirs(posedirs: np.ndarray, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
         """Derivatives (3 N, 3, 15) of the corners' correctives by the joints' axis-angles; the root has none."""
-        bent = np.zeros((self.posedirs.shape[2], POSE_SIZE))
+        bent = np.zeros((posedirs.shape[2], POSE_SIZE))
         for joint in range(1, len(turns)):
             changes = cross_matrices(turns[joint].T) @ posed.local[joint]
             bent[9 * (joint - 1) : 9 * joint, 3 * joint : 3 * joint + 3] = changes.reshape(3, 9).T
-        return np.asarray((self.posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
+        return np.asarray((posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
 
     def _by_joints(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
         """Derivatives (N, 3, 15) by the axis-angles of the joints, whose `_left_jacobian` is given; no correctives.

@@ -22,6 +22,8 @@ JOINT_SIGMA_RAD = {
     "right_eye": (0.3, 0.3, 0.01),
 }
 """Landmarks of the face cannot tell the neck's rotation from the head's: nearly all of it becomes the root's."""
+WEIGHT_EXCESS_SIGMA = 0.1
+"""By which a coefficient that is a weight from 0 to 1 leaves that range."""
 TRANSLATION_SIGMA_M = 10.0
 ABSENT_SIGMA = 1e-6
 EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.25, 0.015, 0.0015
@@ -79,12 +81,13 @@ def solve_identity(
     sized = np.concatenate([columns[0], scale_sigma * model.v_template[..., None], columns[1]], axis=2)
     points = PosedPoints(replace(model, shapedirs=sized), places)
     shared, own = known + 1, expressions + RIGID_SIZE
-    prior = np.concatenate([np.ones(shared), np.tile(parameter_precision(head), len(observations))])
     state = np.zeros(shared + own * len(observations))
     for number, start in enumerate(rigid):
         state[shared + own * (number + 1) - RIGID_SIZE : shared + own * (number + 1)] = start
     for _ in range(IDENTITY_ITERATIONS):
-        matrix, right = np.diag(prior), -prior * state
+        precision, pull = prior_terms(head, state[shared:].reshape(-1, own))
+        matrix = np.diag(np.concatenate([np.ones(shared), precision.ravel()]))
+        right = np.concatenate([-state[:shared], pull.ravel()])
         for number, observation in enumerate(observations):
             frame = slice(shared + own * number, shared + own * (number + 1))
             rows = np.r_[:shared, frame]
@@ -196,14 +199,15 @@ def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray, ordered: bo
 
 
 def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray, ordered: bool) -> np.ndarray:
-    prior, stiffness = parameter_precision(head), acceleration_precision(head.model)
+    stiffness = acceleration_precision(head.model)
     state, size = start.copy(), start.shape[1]
     blocks, right = np.zeros((len(state), size, size)), np.zeros_like(state)
     for _ in range(TAKE_ITERATIONS):
         for number, values in enumerate(state):
             blocks[number], right[number] = terms(first + number, values)
-            blocks[number][np.diag_indices(size)] += prior
-            right[number] -= prior * values
+            precision, pull = prior_terms(head, values)
+            blocks[number][np.diag_indices(size)] += precision
+            right[number] += pull
         if ordered and len(state) > 2:
             step = _smooth_step(blocks, right, state, stiffness)
         else:
@@ -249,6 +253,21 @@ def parameter_precision(head: HeadModel) -> np.ndarray:
     ]
     rigid = np.concatenate([*joints, (TRANSLATION_SIGMA_M,) * TRANSLATION_SIZE])
     return np.concatenate([np.ones(head.model.n_expression), rigid**-2.0])
+
+
+def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The prior's diagonal Gauss–Newton matrix and right-hand side at parameters (..., E + 18), of the same shape.
+
+    `parameter_precision`, and where expressions are weights from 0 to 1 a pull back into that range.
+    """
+    precision = np.broadcast_to(parameter_precision(head), values.shape).copy()
+    right = -precision * values
+    if head.model.expression_names:
+        weights = values[..., :-RIGID_SIZE]
+        excess = weights - np.clip(weights, 0, 1)
+        precision[..., :-RIGID_SIZE] += (excess != 0) / WEIGHT_EXCESS_SIGMA**2
+        right[..., :-RIGID_SIZE] -= excess / WEIGHT_EXCESS_SIGMA**2
+    return precision, right
 
 
 def acceleration_precision(model: FlameModel) -> np.ndarray:

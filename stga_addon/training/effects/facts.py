@@ -118,7 +118,7 @@ class CaptureFacts:
 
     def pixels_per_splat(self, percentile: float) -> float:
         """Percentile over the visible triangles, at the trained image size; 0 where none is visible."""
-        lattice = self.settings.lattice
+        lattice = self.settings.lattice_order(len(self.capture.faces))
         pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
         return float(np.percentile(pixels, percentile)) / ((lattice + 1) * (lattice + 2) / 2) if len(pixels) else 0.0
 

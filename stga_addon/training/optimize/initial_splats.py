@@ -34,9 +34,8 @@ MAX_ASYMMETRY_SHARE = 0.015
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, hull points of the first training timestep
     (`flat_points` where a single camera shows it)."""
-    lattice = lattice_splats(
-        capture.neutral, capture.faces, settings.lattice, settings.sh_degree, convention=settings.convention
-    )
+    order = settings.lattice_order(len(capture.faces))
+    lattice = lattice_splats(capture.neutral, capture.faces, order, settings.sh_degree, convention=settings.convention)
     if not settings.teeth:
         lattice = lattice.rows(~teeth_triangles(capture)[lattice.face])
     first = capture.views["train"][0].timestep

@@ -239,7 +239,7 @@ def frame(**pose):
 
 def with_frames(*frames):
     """Facts of a FLAME capture that has these frames and no teeth."""
-    model = SimpleNamespace(v_template=np.zeros((10, 3)))
+    model = SimpleNamespace(v_template=np.zeros((10, 3)), masks={})
     flame = SimpleNamespace(timesteps=tuple(range(len(frames))), frame=lambda timestep: frames[timestep], model=model)
     capture = SimpleNamespace(views={"train": ()}, flame=flame, timesteps=flame.timesteps)
     return CaptureFacts(capture, make_settings(iterations=1))
@@ -441,7 +441,7 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
         posed.append(timestep)
         return neutral + 0.01
 
-    flame = SimpleNamespace(model=SimpleNamespace(v_template=neutral))
+    flame = SimpleNamespace(model=SimpleNamespace(v_template=neutral, masks={"teeth": [0]}))
     capture = replace(
         painted(), timesteps=tuple(range(500)), neutral=neutral, expression_mesh=expression_mesh, flame=flame
     )
@@ -457,7 +457,8 @@ def test_lips_that_part(painted, shared_data):
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, faces = data["v_template"].astype(float), data["faces"]
     closed = np.concatenate([template, np.zeros((TEETH_VERTICES, 3))])
-    model = SimpleNamespace(v_template=closed, faces=np.concatenate([faces, teeth_faces(TEMPLATE_VERTICES)]))
+    faces = np.concatenate([faces, teeth_faces(TEMPLATE_VERTICES)])
+    model = SimpleNamespace(v_template=closed, faces=faces, masks={"teeth": [0]}, expression_names=())
     opened = closed - [0, 0.01, 0] * (closed[:, 1:2] < -0.047)  # a cut through the mouth, below its corners
     meshes = [closed, closed @ [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], opened]
     capture = replace(
