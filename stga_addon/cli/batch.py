@@ -1,15 +1,17 @@
 """Carry out a plan of many jobs, or train many captures: on this machine, or on the engine that is there."""
 
+import shlex
 import shutil
 import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 
-from ..batch.engines.table import EMITTERS, ENGINES
+from ..batch.engines.table import ENGINES
 from ..batch.plan import Plan, plan_of_captures, read_plan
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
 from ..training.settings import PRESETS
+from ..worker.launch import PACKAGES_FOLDER
 from .arguments import add_device, add_principal_point, duration, usable_path, whole_number
 from .inputs import principal_point_of
 
@@ -31,9 +33,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_principal_point(parser)
     add_device(parser)
     add_engine(parser)
-    files = "; ".join(f"{name}: {row.what}" for name, row in EMITTERS.items())
     parser.add_argument(
-        "--emit", choices=tuple(EMITTERS), help=f"write a file by which a farm carries out the jobs: {files}"
+        "--commands", action="store_true", help="prepare the jobs and print a command for each, for another scheduler"
     )
 
 
@@ -51,8 +52,8 @@ def run(options: Namespace) -> None:
     plan = with_threads(plan, options.threads or _shared_threads(plan, options))
     if options.dry_run:
         print_plan(plan)
-    elif options.emit is not None:
-        _emit(plan, options.emit)
+    elif options.commands:
+        _print_commands(plan)
     else:
         carry_out_plan(plan, options.engine, options.address)
 
@@ -104,7 +105,7 @@ def _shared_threads(plan: Plan, options: Namespace) -> int:
     """This machine's processors, shared among the jobs; 1 on every other engine."""
     from ..worker.helpers import processors
 
-    is_here = options.engine == "local" and options.emit is None
+    is_here = options.engine == "local" and not options.commands
     return max(1, processors() // len(plan.jobs)) if is_here else 1
 
 
@@ -129,17 +130,21 @@ def print_plan(plan: Plan) -> None:
     print("\n".join(plan_lines(batch, processors())))
 
 
-def _emit(plan: Plan, name: str) -> None:
-    from ..batch.engines.table import emit
+def _print_commands(plan: Plan) -> None:
+    """Prepare the folders of the jobs that are not finished, and print a shell command for each in an order in which
+    they can be done. Raises StgaError where a worker is running in a folder."""
+    from ..batch.engine import job_command
+    from ..batch.folder import prepare
     from ..batch.lease import hold_folder
     from ..batch.run import Batch
 
     with hold_folder(plan.out):
         batch = Batch(plan)
-        if batch.unfinished:
-            print(f"{len(batch.unfinished)} jobs: {emit(name, batch)}")
-        else:
-            print("every job is finished")
+        for job in batch.unfinished:
+            prepare(job, batch.entries[job.name].digest, 0.0)
+            command = ["env", f"PYTHONPATH={PACKAGES_FOLDER}", *job_command(job)]
+            waits = [name for name in job.after if not batch.entries[name].state.is_over]
+            print(shlex.join(command) + (f"  # after {' '.join(waits)}" if waits else ""))
 
 
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:

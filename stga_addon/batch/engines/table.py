@@ -1,22 +1,15 @@
-"""The engines, and the farms' formats, that there are: a row and a file each."""
+"""The engines that there are: a row and a file each."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
-from typing import Any
 
-from ...files import replacing, write_json
 from ..engine import Engine
-from ..folder import prepare
-from ..job import Job
-from ..plan import Plan
-from ..run import Batch
 
 
 @dataclass(frozen=True)
 class EngineRow:
-    """module and name: of the function that makes an engine from an address, or a farm's file; what: for the help."""
+    """module and name: of the function that makes an engine from an address; what: for the help."""
 
     module: str
     name: str
@@ -29,31 +22,6 @@ ENGINES = {
     "slurm": EngineRow(".slurm", "make_slurm", "a SLURM cluster, as arrays of sbatch"),
 }
 """Name on the command line -> engine."""
-
-EMITTERS = {
-    "openjd": EngineRow(".openjd", "openjd_template", "batch.openjd.json, a template of Open Job Description"),
-    "flamenco": EngineRow(".flamenco", "flamenco_job_type", "stga_batch.js, a job type of Flamenco"),
-}
-"""Name on the command line -> function that makes a farm's file from the plan and its unfinished jobs."""
-FILES = {"openjd": "batch.openjd.json", "flamenco": "stga_batch.js"}
-
-
-def emit(name: str, batch: Batch) -> Path:
-    """Prepare the folders of a batch's unfinished jobs, and write the file by which a farm carries them out; returns
-    its path. Raises StgaError where a worker is running in a folder, or the farm's format cannot hold the batch."""
-    row, jobs = EMITTERS[name], batch.unfinished
-    make: Callable[[Plan, Sequence[Job]], Any] = getattr(import_module(row.module, __package__), row.name)
-    made = make(batch.plan, jobs)
-    for job in jobs:
-        entry = batch.entries[job.name]
-        prepare(job, entry.digest, entry.forecast_s)
-    path = batch.plan.out / FILES[name]
-    if not isinstance(made, str):
-        write_json(path, made)
-        return path
-    with replacing(path) as partial:
-        partial.write_text(made, encoding="utf-8")
-    return path
 
 
 def make_engine(name: str, address: str = "") -> Engine:
