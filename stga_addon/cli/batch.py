@@ -17,6 +17,8 @@ from .inputs import principal_point_of
 
 NAME, HELP = "batch", "carry out a plan of many jobs, or train many captures"
 PLAN_SUFFIX = ".toml"
+OF_CAPTURES = ("out", "preset", "budget", "iterations", "seed", "flame", "principal_point")
+"""Options that a plan has in its file."""
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -42,8 +44,8 @@ def add_engine(parser: ArgumentParser) -> None:
     """Options of how the jobs of a plan are carried out."""
     parser.add_argument("--threads", type=whole_number(1), metavar="N", help="threads of each job that names none")
     parser.add_argument("--dry-run", action="store_true", help="print the jobs, and how long they are expected to take")
-    what = "; ".join(f"{name}: {row.what}" for name, row in ENGINES.items())
-    parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{what} (default local)")
+    engines = "; ".join(f"{name}: {what}" for name, (_, what) in ENGINES.items())
+    parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{engines} (default local)")
     parser.add_argument("--address", default="", help="of a running cluster (ray)")
 
 
@@ -64,19 +66,10 @@ def batch_plan(options: Namespace) -> Plan:
         return _plan_of_captures(options)
     if len(options.sources) > 1:
         raise StgaError(f"{options.sources[1]}: cannot be given beside a plan")
-    given = {
-        "--out": options.out,
-        "--preset": options.preset,
-        "--budget": options.budget,
-        "--iterations": options.iterations,
-        "--seed": options.seed,
-        "--flame": options.flame,
-        "--principal-point": options.principal_point,
-        "--device": None if options.device == "auto" else options.device,
-    }
-    extra = next((name for name, value in given.items() if value is not None), None)
-    if extra is not None:
-        raise StgaError(f"{extra}: has no effect with a plan, which says that itself")
+    changed = [name for name in OF_CAPTURES if getattr(options, name) is not None]
+    changed += ["device"] if options.device != "auto" else []
+    if changed:
+        raise StgaError(f"--{changed[0].replace('_', '-')}: has no effect with a plan, which says that itself")
     return read_plan(options.sources[0])
 
 

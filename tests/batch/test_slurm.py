@@ -182,5 +182,5 @@ def test_without_slurm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slurm.shutil, "which", lambda name: None)
     with pytest.raises(StgaError, match="--engine slurm: the program sbatch was not found"):
         make_engine("slurm")
-    with pytest.raises(StgaError, match="--address: has no effect with --engine slurm"):
+    with pytest.raises(StgaError, match="--address: is that of a Ray cluster; expected --engine ray, got slurm"):
         make_engine("slurm", "host:1")

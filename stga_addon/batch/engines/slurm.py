@@ -50,6 +50,7 @@ class SlurmEngine:
     interval_s = 2.0
 
     def __init__(self) -> None:
+        """Raises StgaError where SLURM's programs are missing."""
         missing = next((name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None)
         if missing is not None:
             raise StgaError(f"--engine slurm: the program {missing} was not found; start it where SLURM is installed")
@@ -151,13 +152,6 @@ class SlurmEngine:
 
     def close(self) -> None:
         """The queue goes on by itself."""
-
-
-def make_slurm(address: str) -> SlurmEngine:
-    """Raises StgaError for an address, and where SLURM's programs are missing."""
-    if address:
-        raise StgaError("--address: has no effect with --engine slurm, which uses the cluster of its configuration")
-    return SlurmEngine()
 
 
 def _array(name: str) -> str:
