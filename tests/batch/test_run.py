@@ -29,10 +29,7 @@ from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, in
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
 
-AFTER = {
-    "again": {"request": "analyze", "capture": "{look}"},
-    "last": {"request": "analyze", "capture": "capture", "after": ["again"]},
-}
+LAST = {"request": "analyze", "capture": "capture", "after": [f"again-{number:05d}" for number in range(3)]}
 
 
 def states(batch: Batch) -> dict[str, JobState]:
@@ -42,7 +39,7 @@ def states(batch: Batch) -> dict[str, JobState]:
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) -> None:
     """Catches work that is repeated, and work that is not although its input or its result has changed."""
-    plan = empty_jobs(tmp_path, 3, AFTER)
+    plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
     engine = SimulatedEngine(room=2 if not takes_all else 99, takes_all=takes_all)
     batch, _ = carry_out(plan, engine)
     assert set(states(batch).values()) == {JobState.FINISHED}
@@ -97,11 +94,11 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
         return WorkerState.FINISHED, ""
 
     (tmp_path / "shot.blend").touch()
-    sweep = {"frames": {"first": 1, "last": 4, "size": 2}}
-    film = {"request": "render-blend", "blend": "shot.blend", "sweep": sweep}
-    plan = make_plan({"out": "runs", "job": {"film": film}}, tmp_path, "plan")
-    both = ["film-frames1-2", "film-frames3-4"]
-    for gone, submitted in ((None, both), ("film-frames3-4/000004.png", both[1:])):
+    both = ["film-1", "film-3"]
+    film = {"request": "render-blend", "blend": "shot.blend"}
+    jobs = {name: {**film, "frames": frames} for name, frames in zip(both, ([1, 2], [3, 4]), strict=True)}
+    plan = make_plan({"out": "runs", "job": jobs}, tmp_path, "plan")
+    for gone, submitted in ((None, both), ("film-3/000004.png", both[1:])):
         if gone is not None:
             (plan.out / gone).unlink()
         engine = SimulatedEngine(outcome)
@@ -117,7 +114,7 @@ def test_a_failed_job_fails_alone(tmp_path: Path, takes_all: bool) -> None:
         failed = job.name == "look-00001" or (takes_all and job.name == "again-00001")
         return (WorkerState.FAILED, "capture: is empty") if failed else (WorkerState.FINISHED, "")
 
-    plan = empty_jobs(tmp_path, 3, AFTER)
+    plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
     batch, said = carry_out(plan, SimulatedEngine(outcome, takes_all=takes_all))
     found = states(batch)
     assert found["look-00001"] == JobState.FAILED
@@ -195,7 +192,7 @@ def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_files_of_others_stay(tmp_path: Path, takes_all: bool) -> None:
     """Catches a batch that moves or overwrites a folder which no job of a batch wrote, or starts the jobs after it."""
-    plan = empty_jobs(tmp_path, 2, {"again": AFTER["again"]})
+    plan = empty_jobs(tmp_path, 2, again=True)
     own = tmp_path / "runs/look-00000/run.json"
     own.parent.mkdir(parents=True)
     own.write_text("mine")

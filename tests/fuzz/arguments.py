@@ -222,16 +222,16 @@ def drive(rng: random.Random, case: Path) -> list[str]:
 
 BATCH_PLANS = (
     'out = "{new}"\n[job.a]\nrequest = "train"\ncapture = "mesh"\nsettings = {{ preset = "draft" }}\n'
-    'sweep = {{ "settings.seed" = [0, 1] }}\n[job.b]\nrequest = "evaluate"\nrun = "{{a}}"\nsplit = {value}\n',
+    '[job.b]\nrequest = "evaluate"\nrun = "{new}/a"\nsplit = {value}\n',
     'out = "{new}"\n[resources]\nthreads = {value}\n[job.a]\nrequest = "track"\nminutes = {value}\n',
-    "[job.a]\nrequest = {value}\ncases = [{{ name = {value} }}]\n",
+    "[job.a]\nrequest = {value}\nafter = [{value}]\n",
     "{value}",
 )
 
 
 def batch(rng: random.Random, case: Path) -> list[str]:
     """Plans, shown or prepared: jobs themselves are requests, which `perform` is tried with."""
-    value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"{b}"', '"../x"', '""', "true"])
+    value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"../x"', '""', "true"])
     new = some_path(rng, case, "new")
     plan = rng.choice(BATCH_PLANS).format(new=new, value=value)
     (case / "plan.toml").write_bytes(plan.encode("utf-8", "surrogatepass"))
