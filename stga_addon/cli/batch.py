@@ -127,8 +127,7 @@ def _print_commands(plan: Plan) -> None:
     """Prepare the folders of the jobs that are not finished, and print a shell command for each in an order in which
     they can be done. Raises StgaError where a worker is running in a folder."""
     from ..batch.engine import job_command
-    from ..batch.folder import prepare
-    from ..batch.lease import hold_folder
+    from ..batch.folder import hold_folder, prepare
     from ..batch.run import Batch
 
     with hold_folder(plan.out):
@@ -146,8 +145,8 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     Raises StgaError where a job failed, KeyboardInterrupt after Ctrl-C when the running jobs have stopped.
     """
     from ..batch.engines.table import make_engine
+    from ..batch.folder import hold_folder
     from ..batch.forecast import forecast_seconds
-    from ..batch.lease import hold_folder
     from ..batch.report import write_report
     from ..batch.run import Batch, run_batch
     from ..batch.table import LiveTable, summary_line

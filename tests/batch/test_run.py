@@ -13,18 +13,17 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch import lease as leases
 from stga_addon.batch.engine import Ended
 from stga_addon.batch.engines import local
 from stga_addon.batch.engines.local import LocalEngine
-from stga_addon.batch.folder import is_done, prepare, read_record
+from stga_addon.batch.folder import LOCK, hold_folder, is_done, prepare, read_record
 from stga_addon.batch.job import Job, Resources
-from stga_addon.batch.lease import LEASE, hold_folder
 from stga_addon.batch.plan import make_plan
 from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.batch.table import plan_lines, table_lines
 from stga_addon.errors import StgaError
 from stga_addon.requests.values import ConvertMotion, RenderBlend
+from stga_addon.worker import lock
 from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, inspect_worker
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
@@ -279,6 +278,9 @@ def test_tables(tmp_path: Path) -> None:
 # The lease
 
 
+LEASE = f"{LOCK}.lease"
+
+
 def _hold(folder: str, held: Any) -> None:
     with hold_folder(Path(folder)):
         held.set()
@@ -290,12 +292,12 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
     """Catches two batches that write into each other's jobs, also where the storage knows no file locks."""
     if locks == "fail":
 
-        def no_lock(path: Path, beats: bool) -> None:
+        def no_lock(path: Path) -> None:
             raise OSError(errno.ENOLCK, "No locks available")
 
-        monkeypatch.setattr(leases, "hold_lock", no_lock)
-    monkeypatch.setattr(leases, "BEAT_S", 0.1)
-    monkeypatch.setattr(leases, "EXPIRY_S", 4.0)
+        monkeypatch.setattr(lock, "_hold_file_lock", no_lock)
+    monkeypatch.setattr(lock, "BEAT_S", 0.1)
+    monkeypatch.setattr(lock, "EXPIRY_S", 4.0)
     context = multiprocessing.get_context("fork")
     held = context.Event()
     other = context.Process(target=_hold, args=(str(tmp_path), held))
@@ -311,7 +313,7 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
         other.join()
         assert (tmp_path / LEASE).exists()
         with hold_folder(tmp_path) as lease:
-            assert not lease.is_lost
+            assert lease.compromise is None
     finally:
         other.kill()
         other.join()
@@ -320,11 +322,12 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
 
 def test_a_lease_that_was_taken_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a batch that goes on in a folder which another machine's batch took while this one was suspended."""
-    monkeypatch.setattr(leases, "BEAT_S", 0.05)
+    monkeypatch.setattr(lock, "BEAT_S", 0.05)
     plan = empty_jobs(tmp_path, 1)
 
     def outcome(job: Job) -> tuple[WorkerState | None, str]:
-        (plan.out / LEASE).write_text(json.dumps({"token": "another", "host": "other", "process": 1, "count": 5}))
+        os.replace(plan.out / LEASE, plan.out / "suspended")
+        (plan.out / LEASE).touch()
         time.sleep(0.5)
         return None, ""
 
