@@ -28,7 +28,7 @@ MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
 MAX_UNPACKED_BYTES = 4 << 30
-"""Of an npz: a checkpoint of five million splats."""
+"""Of an npz: a checkpoint of four million splats."""
 MAX_HEADER_BYTES = 1 << 16
 PARTIAL_NAME = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL)
 """Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
