@@ -24,7 +24,7 @@ from stga_addon import __version__
 from stga_addon.batch.plan import Plan, make_plan
 from stga_addon.cli.arguments import duration
 from stga_addon.cli.batch import add_engine, carry_out_plan, print_plan, with_threads
-from stga_addon.development.benchmark.benchmark import benchmark_table, slices_of, write_report
+from stga_addon.development.benchmark.benchmark import benchmark_jobs, slices_of, write_report
 from stga_addon.requests.values import Benchmark
 from stga_addon.worker.helpers import processors
 
@@ -94,16 +94,19 @@ def main() -> None:
 
 def results_plan(options: argparse.Namespace) -> Plan:
     """The jobs of all questions but that of extending."""
-    first, flame = options.captures[0].resolve(), flame_of(options.captures[0])
+    folder, first, flame = options.folder.resolve(), options.captures[0].resolve(), flame_of(options.captures[0])
     train = {"request": "train", "capture": str(first), "settings": {"seconds": duration(options.long)}}
-    tables: dict[str, Any] = {
+    jobs: dict[str, Any] = {
         DEFAULT: {**train, **({} if flame is None else {"flame": str(flame)})},
-        "quality": {"request": "evaluate", "run": f"{{{DEFAULT}}}", "sweep": {"split": ["val", "test"]}},
-        KNOBS: benchmark_table(slices(options.captures[0], KNOBS_BUDGET, True), 1),
+        **{
+            f"quality-{split}": {"request": "evaluate", "run": str(folder / DEFAULT), "split": split}
+            for split in ("val", "test")
+        },
+        **benchmark_jobs(KNOBS, slices(options.captures[0], KNOBS_BUDGET, True), 1),
     }
     for capture in options.captures:
-        tables[equal_time(capture)] = benchmark_table(slices(capture, options.budget), options.seeds)
-    return make_plan({"out": str(options.folder.resolve()), "job": tables}, Path.cwd(), "results")
+        jobs |= benchmark_jobs(equal_time(capture), slices(capture, options.budget), options.seeds)
+    return make_plan({"out": str(folder), "job": jobs}, Path.cwd(), "results")
 
 
 def slices(capture: Path, budget: str, knobs: bool = False) -> Benchmark:
@@ -111,7 +114,7 @@ def slices(capture: Path, budget: str, knobs: bool = False) -> Benchmark:
 
 
 def equal_time(capture: Path) -> str:
-    """Table of the plan that compares presets and strategies."""
+    """The benchmark of the plan that compares presets and strategies."""
     return f"benchmark-{capture.resolve().name}"
 
 
@@ -146,9 +149,9 @@ def default_section(capture: Path, run: Path, budget: str) -> list[str]:
     return [title, "", command, "", *rows, "", remark, ""]
 
 
-def benchmark_section(title: str, capture: Path, plan: Plan, table: str, folder: Path, arguments: str) -> list[str]:
-    """The report of the slices of a table."""
-    report = write_report(slices_of(plan, table), folder / "reports" / table).strip()
+def benchmark_section(title: str, capture: Path, plan: Plan, name: str, folder: Path, arguments: str) -> list[str]:
+    """The report of the slices of a benchmark."""
+    report = write_report(slices_of(plan, name), folder / "reports" / name).strip()
     return [f"## {title}", "", f"`stga benchmark {capture.name} {arguments}`", "", report, ""]
 
 

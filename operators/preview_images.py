@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.scene.display.display_modes import ELLIPSOIDS, LIMITS, QUADS
+from ..stga_addon.scene.display.display_modes import LIMITS, POINTS, QUADS
 from ..stga_addon.scene.display.hints import shows_nodes, use_transparent_bounces, view_transform_hint
 from ..stga_addon.scene.display.splat_nodes import DISPLAY
 from ..stga_addon.scene.display.splat_object import set_input
@@ -15,7 +15,7 @@ from .common import polled, reporting
 
 class PreviewImages(bpy.types.Operator):
     """Show all splats as images by EEVEE and Cycles show them: through the scene's camera as quads that face it,
-    without a camera as ellipsoids. Choose the display As Trained to go back"""
+    without a camera as points. Choose the display As Trained to go back"""
 
     bl_idname = ids.PREVIEW_IMAGES
     bl_label = "Preview for EEVEE/Cycles"
@@ -28,7 +28,7 @@ class PreviewImages(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         scene = context.scene
-        mode = QUADS if scene.camera is not None else ELLIPSOIDS
+        mode = QUADS if scene.camera is not None else POINTS
         for thing in _own_as_trained(context):
             set_input(thing, DISPLAY, mode)
         use_transparent_bounces(scene)

@@ -147,7 +147,7 @@ def test_hostile_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         read_npz(path)
     np.savez_compressed(path, a=np.zeros(100_000))
     assert path.stat().st_size < 10_000
-    monkeypatch.setattr("stga_addon.files.MIN_NPZ_ALLOWANCE_BYTES", 100_000)
+    monkeypatch.setattr("stga_addon.files.MAX_UNPACKED_BYTES", 100_000)
     with pytest.raises(StgaError, match=r"unpacks to \d+ bytes, more than the \d+ allowed"):
         read_npz(path)
     header = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }".ljust(

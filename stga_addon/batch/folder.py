@@ -1,22 +1,48 @@
-"""Folder of a job: what it holds from earlier starts of the batch, and how it is prepared for a worker.
+"""Folders of a batch, which one process holds, and of a job: what it holds from earlier starts, and how it is prepared.
 
 job.json   beside the request: the job's identity, how long it was expected to take, and took
 """
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+from filelock import SoftFileLease
 
 from ..errors import StgaError
 from ..files import read_json, write_json
 from ..requests.folder import has_request, write_request
 from ..schema import from_json, setting, to_json
 from ..worker.launch import prepare_status_folder
-from ..worker.lock import is_locked
+from ..worker.lock import hold_lock, is_locked, lock_owner
 from ..worker.status import LOCK_FILE, WorkerState, read_status
 from .job import Job
 from .plan import REPLACED
 
+LOCK = "batch.lock"
 JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
+
+
+@contextmanager
+def hold_folder(folder: Path) -> Iterator[SoftFileLease]:
+    """Hold a batch's folder, which is made; one batch works in it, whichever machine it is started on.
+
+    Raises StgaError while another batch works in it.
+    """
+    path = folder / LOCK
+    with ExitStack() as held:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lease = held.enter_context(hold_lock(path, leased=True))
+        except BlockingIOError as error:
+            raise StgaError(
+                f"{folder}: another batch is working in this folder (process {lock_owner(path)})"
+            ) from error
+        except OSError as error:
+            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        assert lease is not None
+        yield lease
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,17 @@ from .job import Job
 def forecast_seconds(jobs: Sequence[Job], done: Sequence[Job]) -> dict[str, float]:
     """Name -> seconds that a job is expected to take, of the jobs of which that is known.
 
-    done: jobs that are finished; those of the same table correct the forecast, and stand in where there is none.
-    What a training of so many iterations takes is measured on this machine (`pace`), once per table.
+    done: jobs that are finished; those of the same kind of request correct the forecast, and stand in where there is
+    none. What a training of so many iterations takes is measured on this machine (`pace`), once for all.
     """
-    paces: dict[str, float | None] = {}
+    paces: list[float] = []
     stated = {job.name: _stated(job, paces) for job in (*jobs, *done)}
-    taken: dict[str, list[tuple[float, float | None]]] = {}
+    taken: dict[type, list[tuple[float, float | None]]] = {}
     for job in done:
         record = read_record(job)
         if record is not None and record.seconds:
-            taken.setdefault(job.table, []).append((record.seconds, stated[job.name]))
-    found = {job.name: _corrected(stated[job.name], taken.get(job.table, ())) for job in jobs}
+            taken.setdefault(type(job.request), []).append((record.seconds, stated[job.name]))
+    found = {job.name: _corrected(stated[job.name], taken.get(type(job.request), ())) for job in jobs}
     return {name: seconds for name, seconds in found.items() if seconds is not None}
 
 
@@ -36,8 +36,11 @@ def _corrected(stated: float | None, taken: Sequence[tuple[float, float | None]]
     return stated * median(factors) if factors else stated
 
 
-def _stated(job: Job, paces: dict[str, float | None]) -> float | None:
-    """Seconds by the plan: what it says, the budget of a training, or the time that its iterations take."""
+def _stated(job: Job, paces: list[float]) -> float | None:
+    """Seconds by the plan: what it says, the budget of a training, or the time that its iterations take.
+
+    paces: seconds of an iteration, once it is measured.
+    """
     request = job.request
     if job.minutes is not None:
         return 60 * job.minutes
@@ -47,12 +50,12 @@ def _stated(job: Job, paces: dict[str, float | None]) -> float | None:
         return None
     if request.settings.seconds is not None:
         return request.settings.seconds
-    if job.table not in paces:
-        paces[job.table] = pace(job, request)
-    views_pace = paces[job.table]
+    measured = None if paces else pace(job, request)
+    if measured is not None:
+        paces.append(measured)
     # A capture of very many views takes more than its preset's own number.
     iterations = request.settings.iterations or PRESETS[str(request.settings.preset)].iterations
-    return None if views_pace is None else views_pace * iterations
+    return paces[0] * iterations if paces else None
 
 
 def pace(job: Job, request: Train) -> float | None:

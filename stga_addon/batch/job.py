@@ -1,6 +1,6 @@
 """Jobs of a batch: a request each, what it comes after and what it needs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -45,14 +45,12 @@ class Job:
     """A request in a folder of its own.
 
     name      unique in the batch, the same each time that the plan is read
-    table     name of the table in the plan that the job is of
     folder    what the request writes lies in it; the request itself in `request_folder`
     after     names of the jobs that have to be finished before
     minutes   how long the plan says that it takes
     """
 
     name: str
-    table: str
     request: Request
     folder: Path
     after: tuple[str, ...] = ()
@@ -78,17 +76,6 @@ class Job:
         if isinstance(self.request, RenderBlend):
             return all(picture.exists() for picture in self.request.pictures.values())
         return self.product is None or self.product.exists()
-
-
-def alike(jobs: Sequence[Job], most: int) -> list[list[Job]]:
-    """The jobs in groups of the same table and the same needs, of at most so many."""
-    groups: dict[tuple[str, Resources, int], list[Job]] = {}
-    for job in jobs:
-        number = 0
-        while len(groups.setdefault((job.table, job.resources, number), [])) == most:
-            number += 1
-        groups[job.table, job.resources, number].append(job)
-    return list(groups.values())
 
 
 def output_field(kind: type[Any]) -> str | None:

@@ -5,13 +5,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+from filelock import SoftFileLease
+
 from ..errors import StgaError
 from ..worker.status import WorkerState, WorkerStatus, read_status, request_cancel
 from .engine import Engine
 from .folder import is_done, is_running, prepare, read_record, write_record
 from .identity import job_digests
 from .job import Job
-from .lease import Lease
 from .plan import Plan
 
 MAX_RETRIES = 5
@@ -114,7 +115,7 @@ class Batch:
             self.entries[name].forecast_s = expected
 
 
-def run_batch(batch: Batch, engine: Engine, lease: Lease, show: Callable[[Batch], None], say: Say) -> None:
+def run_batch(batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None], say: Say) -> None:
     """Carry out the jobs that are not finished; each that fails fails alone.
 
     show: called now and then; say: told in lines what happened.
@@ -133,7 +134,9 @@ def run_batch(batch: Batch, engine: Engine, lease: Lease, show: Callable[[Batch]
 
 
 class _Loop:
-    def __init__(self, batch: Batch, engine: Engine, lease: Lease, show: Callable[[Batch], None], say: Say) -> None:
+    def __init__(
+        self, batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None], say: Say
+    ) -> None:
         self._batch, self._engine, self._lease, self._show, self._say = batch, engine, lease, show, say
         self._entries = batch.entries
         self._shown_s = 0.0
@@ -154,7 +157,7 @@ class _Loop:
     def work(self) -> None:
         self._adopt()
         while self._left:
-            if self._lease.is_lost:
+            if self._lease.compromise is not None:
                 raise StgaError(f"{self._batch.plan.out}: another batch has taken this folder; this one has ended")
             begun = self._begin()
             ended = self._collect()

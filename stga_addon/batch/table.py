@@ -106,7 +106,7 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     on_cores = sum(entry.forecast_s * min(max(entry.job.resources.threads, 1), cores) for entry in unfinished)
     shared = max(on_cores / max(1, cores), *known, 0.0)
     text += f", about {format_duration(shared)} on this machine" if known else ""
-    text += f"; of {unknown} jobs the time is not known before one of their table is finished" if unknown else ""
+    text += f"; of {unknown} jobs the time is not known before one of their kind is finished" if unknown else ""
     return [*lines, text]
 
 

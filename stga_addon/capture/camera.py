@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE = 1 << 26, 1 << 15
+MAX_IMAGE_PIXELS = 1 << 26
 """The largest machine-vision sensors have 65 million pixels; a small file that claims more could fill the memory."""
 MAX_FOCAL_PIXELS = 1e7
 MAX_COORDINATE_M = 1e5
@@ -18,11 +18,9 @@ GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_image_size(width: float, height: float) -> bool:
-    """Whether an image may have this size: whole numbers of at least one pixel, within the limits."""
+    """Whether an image may have this size: whole numbers of at least one pixel, within the limit."""
     whole = width % 1 == 0 and height % 1 == 0
-    return bool(whole and min(width, height) >= 1 and max(width, height) <= MAX_IMAGE_SIDE) and (
-        width * height <= MAX_IMAGE_PIXELS
-    )
+    return bool(whole and min(width, height) >= 1) and width * height <= MAX_IMAGE_PIXELS
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageCms, ImageOps
 
 from ..errors import StgaError
-from .camera import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, is_image_size
+from .camera import MAX_IMAGE_PIXELS, is_image_size
 from .color import is_srgb, to_srgb, with_gamma
 from .model import View
 
@@ -45,8 +45,7 @@ def image_size(path: Path) -> tuple[int, int]:
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if not is_image_size(width, height):
-        limits = f"{MAX_IMAGE_PIXELS} pixels and {MAX_IMAGE_SIDE} a side"
-        raise StgaError(f"{path}: claims {width} x {height} pixels; at most {limits} are read")
+        raise StgaError(f"{path}: claims {width} x {height} pixels; at most {MAX_IMAGE_PIXELS} are read")
     return width, height
 
 

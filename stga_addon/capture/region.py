@@ -50,7 +50,7 @@ def _find(capture: Capture, name: str) -> np.ndarray:
 
 
 def _read_weights(path: Path, faces: int) -> np.ndarray:
-    weights = read_npz(path, max_compression=1030).get(WEIGHTS)
+    weights = read_npz(path).get(WEIGHTS)
     if weights is None or weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != (faces,):
         found = "no such array" if weights is None else f"{weights.dtype} {weights.shape}"
         raise StgaError(f"{path}: expected '{WEIGHTS}', one number from 0 to 1 per triangle ({faces},), found {found}")

@@ -1,20 +1,24 @@
 """Carry out a plan of many jobs, or train many captures: on this machine, or on the engine that is there."""
 
+import shlex
 import shutil
 import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 
-from ..batch.engines.table import EMITTERS, ENGINES
+from ..batch.engines.table import ENGINES
 from ..batch.plan import Plan, plan_of_captures, read_plan
 from ..errors import StgaError
 from ..requests.open_head import OpenHead
 from ..training.settings import PRESETS
+from ..worker.launch import PACKAGES_FOLDER
 from .arguments import add_device, add_principal_point, duration, usable_path, whole_number
 from .inputs import principal_point_of
 
 NAME, HELP = "batch", "carry out a plan of many jobs, or train many captures"
 PLAN_SUFFIX = ".toml"
+OF_CAPTURES = ("out", "preset", "budget", "iterations", "seed", "flame", "principal_point")
+"""Options that a plan has in its file."""
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -31,9 +35,8 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
     add_principal_point(parser)
     add_device(parser)
     add_engine(parser)
-    files = "; ".join(f"{name}: {row.what}" for name, row in EMITTERS.items())
     parser.add_argument(
-        "--emit", choices=tuple(EMITTERS), help=f"write a file by which a farm carries out the jobs: {files}"
+        "--commands", action="store_true", help="prepare the jobs and print a command for each, for another scheduler"
     )
 
 
@@ -41,8 +44,8 @@ def add_engine(parser: ArgumentParser) -> None:
     """Options of how the jobs of a plan are carried out."""
     parser.add_argument("--threads", type=whole_number(1), metavar="N", help="threads of each job that names none")
     parser.add_argument("--dry-run", action="store_true", help="print the jobs, and how long they are expected to take")
-    what = "; ".join(f"{name}: {row.what}" for name, row in ENGINES.items())
-    parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{what} (default local)")
+    engines = "; ".join(f"{name}: {what}" for name, (_, what) in ENGINES.items())
+    parser.add_argument("--engine", choices=tuple(ENGINES), default="local", help=f"{engines} (default local)")
     parser.add_argument("--address", default="", help="of a running cluster (ray)")
 
 
@@ -51,8 +54,8 @@ def run(options: Namespace) -> None:
     plan = with_threads(plan, options.threads or _shared_threads(plan, options))
     if options.dry_run:
         print_plan(plan)
-    elif options.emit is not None:
-        _emit(plan, options.emit)
+    elif options.commands:
+        _print_commands(plan)
     else:
         carry_out_plan(plan, options.engine, options.address)
 
@@ -63,19 +66,10 @@ def batch_plan(options: Namespace) -> Plan:
         return _plan_of_captures(options)
     if len(options.sources) > 1:
         raise StgaError(f"{options.sources[1]}: cannot be given beside a plan")
-    given = {
-        "--out": options.out,
-        "--preset": options.preset,
-        "--budget": options.budget,
-        "--iterations": options.iterations,
-        "--seed": options.seed,
-        "--flame": options.flame,
-        "--principal-point": options.principal_point,
-        "--device": None if options.device == "auto" else options.device,
-    }
-    extra = next((name for name, value in given.items() if value is not None), None)
-    if extra is not None:
-        raise StgaError(f"{extra}: has no effect with a plan, which says that itself")
+    changed = [name for name in OF_CAPTURES if getattr(options, name) is not None]
+    changed += ["device"] if options.device != "auto" else []
+    if changed:
+        raise StgaError(f"--{changed[0].replace('_', '-')}: has no effect with a plan, which says that itself")
     return read_plan(options.sources[0])
 
 
@@ -104,7 +98,7 @@ def _shared_threads(plan: Plan, options: Namespace) -> int:
     """This machine's processors, shared among the jobs; 1 on every other engine."""
     from ..worker.helpers import processors
 
-    is_here = options.engine == "local" and options.emit is None
+    is_here = options.engine == "local" and not options.commands
     return max(1, processors() // len(plan.jobs)) if is_here else 1
 
 
@@ -129,17 +123,20 @@ def print_plan(plan: Plan) -> None:
     print("\n".join(plan_lines(batch, processors())))
 
 
-def _emit(plan: Plan, name: str) -> None:
-    from ..batch.engines.table import emit
-    from ..batch.lease import hold_folder
+def _print_commands(plan: Plan) -> None:
+    """Prepare the folders of the jobs that are not finished, and print a shell command for each in an order in which
+    they can be done. Raises StgaError where a worker is running in a folder."""
+    from ..batch.engine import job_command
+    from ..batch.folder import hold_folder, prepare
     from ..batch.run import Batch
 
     with hold_folder(plan.out):
         batch = Batch(plan)
-        if batch.unfinished:
-            print(f"{len(batch.unfinished)} jobs: {emit(name, batch)}")
-        else:
-            print("every job is finished")
+        for job in batch.unfinished:
+            prepare(job, batch.entries[job.name].digest, 0.0)
+            command = ["env", f"PYTHONPATH={PACKAGES_FOLDER}", *job_command(job)]
+            waits = [name for name in job.after if not batch.entries[name].state.is_over]
+            print(shlex.join(command) + (f"  # after {' '.join(waits)}" if waits else ""))
 
 
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
@@ -148,8 +145,8 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     Raises StgaError where a job failed, KeyboardInterrupt after Ctrl-C when the running jobs have stopped.
     """
     from ..batch.engines.table import make_engine
+    from ..batch.folder import hold_folder
     from ..batch.forecast import forecast_seconds
-    from ..batch.lease import hold_folder
     from ..batch.report import write_report
     from ..batch.run import Batch, run_batch
     from ..batch.table import LiveTable, summary_line

@@ -56,11 +56,10 @@ def run(options: Namespace) -> None:
 
 
 def _check_options(options: Namespace) -> None:
-    """Refuse options that the format would ignore."""
+    """Refuse options that the format would ignore, so that its file would be another than was asked for."""
     belongs_to = {
         "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
         "frames": [name for name, format in FORMATS.items() if format.source == "range"],
-        "fps": [name for name, format in FORMATS.items() if format.has_rate],
         "motion_only": ["web"],
     }
     for option, formats in belongs_to.items():
@@ -69,17 +68,5 @@ def _check_options(options: Namespace) -> None:
             raise StgaError(f"{flag} cannot be combined with --format {options.format}, only with {', '.join(formats)}")
     if options.motion is None:
         check_motion_options(options)
-    if options.head is None:
-        _check_capture_options(options)
-
-
-def _check_capture_options(options: Namespace) -> None:
-    """Refuse a capture that would not be used, and a FLAME model without a capture that it could be of."""
-    if options.motion is not None and options.capture is not None:
-        raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
-    for name in ("capture", "motion"):
-        unused = FORMATS[options.format].source == "frame" and options.timestep is None
-        if getattr(options, name) is not None and unused:
-            raise StgaError(f"--{name}: has no effect with --format {options.format} without --timestep")
-    if options.flame is not None and options.capture is None and options.motion is None and not options.avatar.is_dir():
-        raise StgaError("--flame: has no effect without --capture")
+    elif FORMATS[options.format].source == "frame" and options.timestep is None:
+        raise StgaError(f"--motion: has no effect with --format {options.format} without --timestep")

@@ -11,8 +11,6 @@ from .continuing import add_continued_run, continued_run, resumed_continuation
 
 NAME, HELP = "extend", "extend a finished avatar by further takes of the same head"
 DEFAULT_SECONDS = 60.0
-TRAINING_OPTIONS = {"out": None, "budget": None, "iterations": None, "growth": 0.0, "seed": 0, "device": "auto"}
-"""Option of the training -> its default."""
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -47,9 +45,6 @@ def run(options: Namespace) -> None:
 
 def _write_selection(options: Namespace) -> None:
     """Print and write which triangles of each frame of the take would be trained."""
-    idle = next((name for name, default in TRAINING_OPTIONS.items() if getattr(options, name) != default), None)
-    if idle is not None:
-        raise StgaError(f"--{idle}: has no effect with --select-only")
     if len(options.takes) != 1:
         raise StgaError(f"--select-only: expected one CAPTURE, got {len(options.takes)}")
     carry_out_selection(SelectForTake(options.run_folder, options.takes[0], options.flame), options.select_only)

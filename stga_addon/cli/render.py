@@ -84,43 +84,20 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    _check_film_options(options)
     head, played = options.head, None
+    output, is_video = options.out or options.video, options.video is not None
+    if options.camera is not None and not is_video and options.turntable is None:
+        raise StgaError("--camera: has no effect without --video or --turntable")
+    if options.principal_point is not None and options.cameras is None:
+        raise StgaError("--principal-point: has no effect without --cameras")
     if options.motion is None:
         check_motion_options(options)
-    if head is None:
-        _check_mesh_options(options)
-    elif options.motion is None and not is_ply(options.source):
+    if head is not None and options.motion is None and not is_ply(options.source):
         played = head.played()
     seconds = TURNTABLE_S if options.seconds is None else options.seconds
     same = {name: getattr(options, name) for name in SAME_FIELDS}
-    output, is_video = options.out or options.video, options.video is not None
     request = Render(
         options.source, output, is_video, seconds=seconds, played=played, motion_options=motion_options(options),
         light_turn=options.light_turn or 0.0, **same,
     )  # fmt: skip
     carry_out(request)
-
-
-def _check_film_options(options: Namespace) -> None:
-    """Raise StgaError for an option of a video or turntable that would have no effect."""
-    turns = options.turntable is not None
-    films = turns or options.video is not None
-    for name, has_effect, needed in (
-        ("camera", films, "--video or --turntable"),
-        ("fps", films, "--video or --turntable"),
-        ("seconds", turns, "--turntable"),
-    ):
-        if getattr(options, name) is not None and not has_effect:
-            raise StgaError(f"--{name}: has no effect without {needed}")
-
-
-def _check_mesh_options(options: Namespace) -> None:
-    """Raise StgaError for an option on meshes or cameras that would have no effect."""
-    if options.motion is not None and options.capture is not None:
-        raise StgaError("--capture: cannot be combined with --motion, whose meshes drive the avatar")
-    if options.principal_point is not None and options.cameras is None:
-        raise StgaError("--principal-point: has no effect without --cameras")
-    for name in ("capture", "flame"):
-        if is_ply(options.source) and options.motion is None and getattr(options, name) is not None:
-            raise StgaError(f"--{name}: has no effect on {options.source}, whose splats follow no mesh")

@@ -41,7 +41,6 @@ POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
 MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
 MAX_TIMESTEP = 1 << 20  # Blender's last frame
-MAX_MOTION_EXPANSION = 256  # dynamic offsets, mostly zero, compress a motion of the published FLAME 116 times
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     of `POSE_LAYOUTS`. Timesteps count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file and
     the field.
     """
-    return motion_of(path, read_npz(path, max_compression=MAX_MOTION_EXPANSION), model)
+    return motion_of(path, read_npz(path), model)
 
 
 def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameSequence:

@@ -22,12 +22,7 @@ from ..files import read_bytes
 
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22
-"""In a sparse matrix or a list of numbers; FLAME's joint regressor has 25,115."""
-MAX_INSTRUCTIONS = 1 << 18
-"""FLAME's own files have a few thousand."""
-MIN_ALLOWED_BYTES = 64 << 20
-MAX_EXPANSION = 8
-"""Bytes of arrays per byte of the file, beyond MIN_ALLOWED_BYTES: a pickle can name the same data many times."""
+"""In a sparse matrix; FLAME's joint regressor has 25,115."""
 SPARSE_CLASS = re.compile(r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)")
 
 
@@ -114,13 +109,12 @@ class _Function:
 class _RestrictedUnpickler(pickle.Unpickler):
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")
-        self.allowance = len(data)
         functions: dict[str, Callable[..., Any]] = {
             "_codecs.encode": self.encode,
-            "collections.OrderedDict": self.ordered,
+            "collections.OrderedDict": OrderedDict,
             **{f"{core}.multiarray._reconstruct": self.array_shell for core in ("numpy.core", "numpy._core")},
             **{f"{module}._reconstructor": self.rebuild for module in ("copy_reg", "copyreg")},
-            **{f"{module}.set": self.collect for module in ("__builtin__", "builtins")},
+            **{f"{module}.set": set for module in ("__builtin__", "builtins")},
         }
         self.functions = {name: _Function(call) for name, call in functions.items()}
 
@@ -151,22 +145,7 @@ class _RestrictedUnpickler(pickle.Unpickler):
     def encode(self, text: str, encoding: str = "latin1") -> bytes:
         if encoding not in ("latin1", "latin-1"):
             raise pickle.UnpicklingError(f"encodes bytes as {encoding}")
-        self.take(len(text))
         return text.encode("latin1")
-
-    def ordered(self, *items: Any) -> OrderedDict[Any, Any]:
-        self.take(sum(len(part) for part in items))
-        return OrderedDict(*items)
-
-    def collect(self, *items: Any) -> set[Any]:
-        self.take(sum(len(part) for part in items))
-        return set(*items)
-
-    def take(self, count: int) -> None:
-        """Count what is copied: a short pickle that copies one thing a thousand times would fill the memory."""
-        self.allowance -= count
-        if self.allowance < 0:
-            raise pickle.UnpicklingError("copies more than the file holds")
 
 
 def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
@@ -176,7 +155,7 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     objects replaced by their value. Raises StgaError where the file is missing, truncated, too large, no dictionary
     of arrays, or asks for any other class (named in the message).
     """
-    loaded, allowance = _load(path)
+    loaded = _load(path)
     if not isinstance(loaded, dict):
         raise StgaError(f"{path}: holds a {type(loaded).__name__}, expected a dictionary of arrays")
     arrays = {}
@@ -191,9 +170,6 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
             except Exception as error:
                 # Shapes, indices and states are whatever the file says, of any type and size.
                 raise StgaError(f"{path}: {key} is malformed ({error}), expected an array of numbers") from error
-            allowance -= arrays[key].nbytes
-            if allowance < 0:
-                raise StgaError(f"{path}: {key} and the arrays before it are larger than the file can hold")
     return arrays
 
 
@@ -205,12 +181,11 @@ def _entries(loaded: dict[Any, Any], folder: str) -> dict[Any, Any]:
     return loaded
 
 
-def _load(path: Path) -> tuple[Any, int]:
-    """What the pickle holds, and how many bytes its arrays may have."""
+def _load(path: Path) -> Any:
     data = read_bytes(path, MAX_FILE_BYTES)
     try:
         _check_instructions(data)
-        return _RestrictedUnpickler(data).load(), MIN_ALLOWED_BYTES + MAX_EXPANSION * len(data)
+        return _RestrictedUnpickler(data).load()
     except _Refused as error:
         raise StgaError(f"{path}: asks for the class {error}, refused: only arrays are read") from error
     except Exception as error:
@@ -220,12 +195,10 @@ def _load(path: Path) -> tuple[Any, int]:
 
 
 def _check_instructions(data: bytes) -> None:
-    """Refuse memo slots beyond the file's length, for which the C unpickler would allocate a table, and programs."""
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+    """Refuse memo slots beyond the file's length, for which the C unpickler would allocate a table."""
+    for opcode, argument, _ in pickletools.genops(data):
         if argument is not None and "PUT" in opcode.name and not 0 <= int(argument) <= len(data):
             raise pickle.UnpicklingError(f"memo slot {argument} in a file of {len(data)} bytes")
-        if count > MAX_INSTRUCTIONS:
-            raise pickle.UnpicklingError(f"more than {MAX_INSTRUCTIONS} instructions")
 
 
 def _dense(value: Any) -> np.ndarray:
@@ -240,8 +213,6 @@ def _dense(value: Any) -> np.ndarray:
     if isinstance(value, _Chumpy):
         return _chumpy(value)
     if isinstance(value, list | tuple | int | float):
-        if _leaves(value, {}) > MAX_DENSE_ELEMENTS:
-            raise _NotAnArray(f"a list of more than {MAX_DENSE_ELEMENTS} numbers")
         try:
             plain = np.asarray(value)
         except (ValueError, OverflowError) as error:
@@ -249,16 +220,6 @@ def _dense(value: Any) -> np.ndarray:
         if plain.dtype.kind in "biuf":
             return plain
     raise _NotAnArray(f"a {value.source if isinstance(value, _Inert) else type(value).__name__}")
-
-
-def _leaves(value: Any, known: dict[int, int]) -> int:
-    """How many numbers a nested list stands for; it may hold the same list twice, or itself."""
-    if not isinstance(value, list | tuple):
-        return 1
-    if id(value) not in known:
-        known[id(value)] = MAX_DENSE_ELEMENTS + 1
-        known[id(value)] = max(1, sum(_leaves(item, known) for item in value))
-    return known[id(value)]
 
 
 def _array(value: _Array) -> np.ndarray:

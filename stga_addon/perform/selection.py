@@ -1,7 +1,6 @@
 """Selection of triangles as requests ask for it."""
 
 from ..capture.open import open_capture
-from ..errors import StgaError
 from ..progress import Report, Say
 from ..requests.results import Selected
 from ..requests.values import Select
@@ -11,8 +10,6 @@ from ..selection import SelectionOptions, select_capture
 def select(request: Select, report: Report, say: Say) -> Selected:
     """Select by the rule; says how much each timestep selects, and which regions as a whole. Raises StgaError."""
     capture = open_capture(request.capture, request.flame, request.principal_point)
-    if request.zero_pose is not None and capture.flame is None:
-        raise StgaError(f"--zero-pose: has no effect on {request.capture}, which was not tracked with FLAME")
     options = SelectionOptions(request.threshold, request.zero_pose or SelectionOptions.zero_pose)
     selection = select_capture(capture, options)
     say(f"threshold {1000 * request.threshold:g} mm, {len(capture.faces)} triangles")

@@ -1,17 +1,13 @@
-"""Lock files that end with the process that holds them; by a heartbeat, where the storage has no working locks."""
+"""Lock files that end with the process that holds them; leases, which it renews, where the storage has no locks."""
 
 import errno
 import os
-import platform
-import secrets
 import tempfile
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import FileLock, SoftFileLease, Timeout
 
 from ..errors import StgaError
 from ..files import file_size
@@ -24,34 +20,34 @@ RETRY_INTERVAL_S = 0.002
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without working locks answers: some NFS and parallel file systems."""
 BEAT_S, EXPIRY_S = 5.0, 30.0
-"""On such a one: seconds between two heartbeats, and without one until the lock counts as left behind. A holder that
-stands still for longer than that (a suspended machine, storage that hangs) can lose it to another process."""
-CLAIM_S = 0.5
-"""After how long a process looks whether another one claimed such a lock together with it."""
+"""Seconds between two renewals of a lease, and without one until another process takes it: from a holder that was
+killed on another machine, or stands still (a suspended machine, storage that hangs)."""
+LOOK_INTERVAL_S = 0.2
 OWNER_OFFSET = 1
 """Where the owner's process number starts: on Windows, other processes cannot read the first byte, which is locked."""
 
 
 @contextmanager
-def hold_lock(path: Path, beats: bool = True) -> Iterator[None]:
-    """Hold the lock file for this process, and write the process number into it.
+def hold_lock(path: Path, leased: bool = False) -> Iterator[SoftFileLease | None]:
+    """Hold the lock file for this process, and write the process number into it; a lease where there are no locks.
 
-    beats: where the storage has no locks, hold it by a heartbeat.
+    leased: hold a lease as well, for storage whose locks other machines do not see. What is yielded is the lease: it
+    has a `compromise` once another process has taken it.
     Raises BlockingIOError while another process holds it, OSError where it cannot be written or is a symbolic link.
     """
     with ExitStack() as held:
         try:
             held.enter_context(_hold_file_lock(path))
         except OSError as error:
-            if error.errno not in NO_LOCKS or not beats:
+            if error.errno not in NO_LOCKS:
                 raise
-            held.enter_context(_hold_by_beats(path))
-        yield
+            leased = True
+        yield held.enter_context(_hold_lease(_lease_of(path))) if leased else None
 
 
 @contextmanager
 def _hold_file_lock(path: Path) -> Iterator[None]:
-    lock = FileLock(path, timeout=ACQUIRE_TIMEOUT_S, poll_interval=RETRY_INTERVAL_S)
+    lock = _file_lock(path, ACQUIRE_TIMEOUT_S)
     try:
         lock.acquire()
     except Timeout as error:
@@ -65,67 +61,72 @@ def _hold_file_lock(path: Path) -> Iterator[None]:
         lock.release()
 
 
+@contextmanager
+def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
+    """Wait until another holder is gone, or has stood still for EXPIRY_S. Raises BlockingIOError when it renews."""
+    lease = SoftFileLease(path, lease_duration=EXPIRY_S, heartbeat_interval=BEAT_S, thread_local=False)
+    before = _renewed_s(path)
+    try:
+        lease.acquire(
+            timeout=2 * EXPIRY_S,
+            poll_interval=LOOK_INTERVAL_S,
+            cancel_check=lambda: _renewed_s(path) not in (None, before),
+        )
+    except Timeout as error:
+        raise BlockingIOError(f"{path} is held by another process") from error
+    try:
+        yield lease
+    finally:
+        lease.release()
+
+
 def is_locked(path: Path) -> bool:
     """Whether a living process holds the lock; False where the file is missing or cannot be opened."""
     if not path.is_file() or path.is_symlink():
         return False
     try:
-        with FileLock(path, timeout=PROBE_TIMEOUT_S, poll_interval=RETRY_INTERVAL_S):
+        with _file_lock(path, PROBE_TIMEOUT_S):
             return False
     except Timeout:
         return True
     except OSError as error:
-        return error.errno in NO_LOCKS and _is_beating(path)
+        return error.errno in NO_LOCKS and _is_renewed(_lease_of(path))
 
 
 def lock_owner(path: Path) -> int:
-    """Number of the process that holds the lock; 0 where it is unknown."""
+    """Number of the process that holds the lock, or its lease; 0 where it is unknown."""
     try:
         file_size(path)  # refuses pipes, whose reading need never end
         with path.open("rb") as file:
             file.seek(OWNER_OFFSET)
             return int(file.read(20))
     except (StgaError, OSError, ValueError):
-        return 0
+        lease = _lease_of(path)
+        return (SoftFileLease(lease).pid or 0) if lease.is_file() else 0
 
 
-@contextmanager
-def _hold_by_beats(path: Path) -> Iterator[None]:
-    """Hold the file by renewing its time every BEAT_S. Raises BlockingIOError while another process does."""
-    content = f" {os.getpid():<20d}{platform.node()} {secrets.token_hex(8)}".encode()
-    if _is_beating(path):
-        raise BlockingIOError(f"{path} is held by another process")
-    path.write_bytes(content)
-    time.sleep(CLAIM_S)
-    if path.read_bytes() != content:  # the last of several to write has it
-        raise BlockingIOError(f"{path} was taken by another process")
-    ended = threading.Event()
+def _file_lock(path: Path, timeout_s: float) -> FileLock:
+    return FileLock(path, timeout=timeout_s, poll_interval=RETRY_INTERVAL_S, fallback_to_soft=False)
 
-    def beat() -> None:
-        while not ended.wait(BEAT_S):
-            with suppress(OSError):  # storage that does not answer for a moment
-                os.utime(path)
 
-    thread = threading.Thread(target=beat, name="stga lock", daemon=True)
-    thread.start()
+def _lease_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.lease")
+
+
+def _renewed_s(path: Path) -> float | None:
+    """When a lease was renewed last, by the clock of the storage; None where there is none."""
     try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-        with suppress(OSError):
-            if path.read_bytes() == content:
-                path.unlink()
-
-
-def _is_beating(path: Path) -> bool:
-    """Whether a process renewed the file within EXPIRY_S, by the clock of the storage."""
-    try:
-        with tempfile.TemporaryFile(dir=path.parent) as now:
-            found = path.stat()
-            return found.st_size > 0 and os.fstat(now.fileno()).st_mtime - found.st_mtime < EXPIRY_S
+        return path.stat().st_mtime
     except OSError:
-        return False
+        return None
+
+
+def _is_renewed(lease: Path) -> bool:
+    """Whether a process renewed it within EXPIRY_S, by the clock of the storage."""
+    before = _renewed_s(lease)
+    with suppress(OSError), tempfile.TemporaryFile(dir=lease.parent) as now:
+        return before is not None and os.fstat(now.fileno()).st_mtime - before < EXPIRY_S
+    return False
 
 
 def _write_owner(path: Path) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from stga_addon.batch.engine import Ended, Engine
+from stga_addon.batch.folder import hold_folder
 from stga_addon.batch.job import Job
-from stga_addon.batch.lease import hold_folder
 from stga_addon.batch.plan import Plan, make_plan
 from stga_addon.batch.run import Batch, run_batch
 from stga_addon.perform.perform import perform_in_folder
@@ -69,12 +69,15 @@ class InProcessEngine(SimulatedEngine):
         return Ended(inspect_worker(job.request_folder), False)
 
 
-def empty_jobs(base: Path, count: int, tables: Mapping[str, Any] | None = None) -> Plan:
-    """A plan of `count` analyses, which write no file but their result; and of further tables."""
+def empty_jobs(base: Path, count: int, again: bool = False, **jobs: Any) -> Plan:
+    """A plan of `count` analyses, which write no file but their result; again: each by another job after it as well;
+    and of further jobs."""
     (base / "capture").mkdir(exist_ok=True)
-    cases = [{"name": f"{number:05d}"} for number in range(count)]
-    table = {"request": "analyze", "capture": "capture", "cases": cases}
-    return make_plan({"out": "runs", "job": {"look": table, **(tables or {})}}, base, "plan")
+    for number in range(count):
+        jobs[f"look-{number:05d}"] = {"request": "analyze", "capture": "capture"}
+        if again:
+            jobs[f"again-{number:05d}"] = {"request": "analyze", "capture": f"runs/look-{number:05d}"}
+    return make_plan({"out": "runs", "job": jobs}, base, "plan")
 
 
 def carry_out(plan: Plan, engine: Engine) -> tuple[Batch, list[str]]:

@@ -4,15 +4,18 @@ import os
 import random
 import re
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
 
 import pytest
+from capture.factory import write_mesh_capture
 
 from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.job import Job
-from stga_addon.batch.run import JobState
+from stga_addon.batch.plan import read_plan
+from stga_addon.batch.run import Batch, JobState
 from stga_addon.cli.main import main
 from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
@@ -111,3 +114,20 @@ def test_captures_of_the_command(
     (tmp_path / "plan.toml").write_text("")
     assert main(["batch", str(tmp_path / "plan.toml"), "--seed", "2"]) == 2
     assert "--seed: has no effect with a plan" in capsys.readouterr().err
+
+
+def test_commands_carry_out_the_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches commands that a shell elsewhere cannot run, jobs in another order than theirs, and finished ones."""
+    write_mesh_capture(tmp_path / "a capture")
+    look = '[job.{}]\nrequest = "select"\ncapture = "a capture"\nafter = {}\n'
+    plan = tmp_path / "plan.toml"
+    plan.write_text('out = "runs"\n' + look.format("again", ["look"]) + look.format("look", []))
+    assert main(["batch", str(plan), "--commands"]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert second.endswith("  # after look")
+    subprocess.run(["sh", "-c", first], check=True, cwd="/")
+    assert main(["batch", str(plan), "--commands"]) == 0
+    (left,) = capsys.readouterr().out.splitlines()
+    assert left == second.partition("  #")[0]
+    subprocess.run(["sh", "-c", second], check=True, cwd="/")
+    assert not Batch(read_plan(plan)).unfinished

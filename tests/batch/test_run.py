@@ -13,26 +13,22 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch import lease as leases
 from stga_addon.batch.engine import Ended
 from stga_addon.batch.engines import local
 from stga_addon.batch.engines.local import LocalEngine
-from stga_addon.batch.folder import is_done, prepare, read_record
+from stga_addon.batch.folder import LOCK, hold_folder, is_done, prepare, read_record
 from stga_addon.batch.job import Job, Resources
-from stga_addon.batch.lease import LEASE, hold_folder
 from stga_addon.batch.plan import make_plan
 from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.batch.table import plan_lines, table_lines
 from stga_addon.errors import StgaError
 from stga_addon.requests.values import ConvertMotion, RenderBlend
+from stga_addon.worker import lock
 from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, inspect_worker
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
 
-AFTER = {
-    "again": {"request": "analyze", "capture": "{look}"},
-    "last": {"request": "analyze", "capture": "capture", "after": ["again"]},
-}
+LAST = {"request": "analyze", "capture": "capture", "after": [f"again-{number:05d}" for number in range(3)]}
 
 
 def states(batch: Batch) -> dict[str, JobState]:
@@ -42,7 +38,7 @@ def states(batch: Batch) -> dict[str, JobState]:
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) -> None:
     """Catches work that is repeated, and work that is not although its input or its result has changed."""
-    plan = empty_jobs(tmp_path, 3, AFTER)
+    plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
     engine = SimulatedEngine(room=2 if not takes_all else 99, takes_all=takes_all)
     batch, _ = carry_out(plan, engine)
     assert set(states(batch).values()) == {JobState.FINISHED}
@@ -97,11 +93,11 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
         return WorkerState.FINISHED, ""
 
     (tmp_path / "shot.blend").touch()
-    sweep = {"frames": {"first": 1, "last": 4, "size": 2}}
-    film = {"request": "render-blend", "blend": "shot.blend", "sweep": sweep}
-    plan = make_plan({"out": "runs", "job": {"film": film}}, tmp_path, "plan")
-    both = ["film-frames1-2", "film-frames3-4"]
-    for gone, submitted in ((None, both), ("film-frames3-4/000004.png", both[1:])):
+    both = ["film-1", "film-3"]
+    film = {"request": "render-blend", "blend": "shot.blend"}
+    jobs = {name: {**film, "frames": frames} for name, frames in zip(both, ([1, 2], [3, 4]), strict=True)}
+    plan = make_plan({"out": "runs", "job": jobs}, tmp_path, "plan")
+    for gone, submitted in ((None, both), ("film-3/000004.png", both[1:])):
         if gone is not None:
             (plan.out / gone).unlink()
         engine = SimulatedEngine(outcome)
@@ -117,7 +113,7 @@ def test_a_failed_job_fails_alone(tmp_path: Path, takes_all: bool) -> None:
         failed = job.name == "look-00001" or (takes_all and job.name == "again-00001")
         return (WorkerState.FAILED, "capture: is empty") if failed else (WorkerState.FINISHED, "")
 
-    plan = empty_jobs(tmp_path, 3, AFTER)
+    plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
     batch, said = carry_out(plan, SimulatedEngine(outcome, takes_all=takes_all))
     found = states(batch)
     assert found["look-00001"] == JobState.FAILED
@@ -195,7 +191,7 @@ def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_files_of_others_stay(tmp_path: Path, takes_all: bool) -> None:
     """Catches a batch that moves or overwrites a folder which no job of a batch wrote, or starts the jobs after it."""
-    plan = empty_jobs(tmp_path, 2, {"again": AFTER["again"]})
+    plan = empty_jobs(tmp_path, 2, again=True)
     own = tmp_path / "runs/look-00000/run.json"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
@@ -282,6 +278,9 @@ def test_tables(tmp_path: Path) -> None:
 # The lease
 
 
+LEASE = f"{LOCK}.lease"
+
+
 def _hold(folder: str, held: Any) -> None:
     with hold_folder(Path(folder)):
         held.set()
@@ -293,12 +292,12 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
     """Catches two batches that write into each other's jobs, also where the storage knows no file locks."""
     if locks == "fail":
 
-        def no_lock(path: Path, beats: bool) -> None:
+        def no_lock(path: Path) -> None:
             raise OSError(errno.ENOLCK, "No locks available")
 
-        monkeypatch.setattr(leases, "hold_lock", no_lock)
-    monkeypatch.setattr(leases, "BEAT_S", 0.1)
-    monkeypatch.setattr(leases, "EXPIRY_S", 4.0)
+        monkeypatch.setattr(lock, "_hold_file_lock", no_lock)
+    monkeypatch.setattr(lock, "BEAT_S", 0.1)
+    monkeypatch.setattr(lock, "EXPIRY_S", 4.0)
     context = multiprocessing.get_context("fork")
     held = context.Event()
     other = context.Process(target=_hold, args=(str(tmp_path), held))
@@ -314,7 +313,7 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
         other.join()
         assert (tmp_path / LEASE).exists()
         with hold_folder(tmp_path) as lease:
-            assert not lease.is_lost
+            assert lease.compromise is None
     finally:
         other.kill()
         other.join()
@@ -323,11 +322,12 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
 
 def test_a_lease_that_was_taken_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a batch that goes on in a folder which another machine's batch took while this one was suspended."""
-    monkeypatch.setattr(leases, "BEAT_S", 0.05)
+    monkeypatch.setattr(lock, "BEAT_S", 0.05)
     plan = empty_jobs(tmp_path, 1)
 
     def outcome(job: Job) -> tuple[WorkerState | None, str]:
-        (plan.out / LEASE).write_text(json.dumps({"token": "another", "host": "other", "process": 1, "count": 5}))
+        os.replace(plan.out / LEASE, plan.out / "suspended")
+        (plan.out / LEASE).touch()
         time.sleep(0.5)
         return None, ""
 

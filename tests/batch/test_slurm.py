@@ -121,7 +121,7 @@ def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -
     """Catches a batch that waits for ever for jobs that no machine of the cluster can take."""
     plan = empty_jobs(tmp_path, 2)
     huge = {"resources": {"memory_gb": 1e6, "threads": 1}}
-    plan = empty_jobs(tmp_path, 1, {"huge": {"request": "analyze", "capture": "capture", **huge}})
+    plan = empty_jobs(tmp_path, 1, huge={"request": "analyze", "capture": "capture", **huge})
     batch, _ = carry_out(plan, SlurmEngine())
     assert batch.entries["huge"].state == JobState.FAILED
     assert "sbatch: " in batch.entries["huge"].error
@@ -177,10 +177,31 @@ def test_what_waits_in_the_queue_is_submitted_once(tmp_path: Path, monkeypatch: 
         SlurmEngine().ended()
 
 
+def test_arrays_wait_for_earlier_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an array that waits for itself, as where a request reads what another of its kind writes; and a job that
+    is in no array, in two, or in one of more jobs than SLURM takes."""
+    calls = tmp_path / "calls"
+    for name, text in {"sbatch": f'echo "$@" >>{calls}; wc -l <{calls}', "squeue": "", "scancel": ""}.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(slurm, "MAX_ARRAY", 2)
+    large = {"request": "analyze", "capture": "runs/again-00002", "resources": {"memory_gb": 7}}
+    plan = empty_jobs(tmp_path, 3, again=True, last=large)
+    SlurmEngine().submit(plan.jobs)
+    lines = calls.read_text().splitlines()
+    assert [int(line.split("--array=0-")[1].split()[0]) + 1 for line in lines] == [2, 1, 2, 1, 1]
+    waits = [line.partition("afterany:")[2].split(" ")[0] for line in lines]
+    assert waits == ["", "", "1", "2", "4"]
+    assert ["--mem=7000M" in line for line in lines] == [False] * 4 + [True]
+    scripts = "".join(path.read_text() for path in (plan.out / "slurm").glob("*.sh"))
+    assert [scripts.count(f"{job.request_folder} ") for job in plan.jobs] == [1] * 7
+
+
 def test_without_slurm(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a traceback where SLURM is not installed, and an address that is silently ignored."""
     monkeypatch.setattr(slurm.shutil, "which", lambda name: None)
     with pytest.raises(StgaError, match="--engine slurm: the program sbatch was not found"):
         make_engine("slurm")
-    with pytest.raises(StgaError, match="--address: has no effect with --engine slurm"):
+    with pytest.raises(StgaError, match="--address: is that of a Ray cluster; expected --engine ray, got slurm"):
         make_engine("slurm", "host:1")

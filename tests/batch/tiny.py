@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from capture.factory import write_mesh_capture
 
@@ -36,12 +37,14 @@ def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
         write_mesh_capture(base / "capture", (0, 1, 3, 4), range(4))
     train = {
         "request": "train", "capture": "capture", "principal_point": "opencv", "device": "cpu",
-        "settings": {**SETTINGS, "iterations": iterations}, "sweep": {"settings.seed": list(range(seeds))},
         "minutes": 0.1,
     }  # fmt: skip
-    tables = {"train": train, "evaluate": {"request": "evaluate", "run": "{train}", "minutes": 0.1}}
+    jobs: dict[str, Any] = {}
+    for seed in range(seeds):
+        jobs[f"train-seed{seed}"] = {**train, "settings": {**SETTINGS, "iterations": iterations, "seed": seed}}
+        jobs[f"evaluate-seed{seed}"] = {"request": "evaluate", "run": f"runs/train-seed{seed}", "minutes": 0.1}
     resources = {"threads": 1, "memory_gb": 0.5}
-    return make_plan({"out": "runs", "resources": resources, "job": tables}, base, "plan")
+    return make_plan({"out": "runs", "resources": resources, "job": jobs}, base, "plan")
 
 
 def splats_of(plan: Plan, name: str) -> dict[str, bytes]:
@@ -63,10 +66,13 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     training and its job `train-bad` had failed."""
     (base / "bad").mkdir()
     (base / "plan.toml").write_text(
-        'out = "runs"\n[resources]\nthreads = 1\nmemory_gb = 0.5\n[job.train]\nrequest = "train"\ndevice = "cpu"\n'
-        'principal_point = "opencv"\nminutes = 0.1\n'
-        'settings = { strategy = "selective", iterations = 100000, hull_points = false }\n'
-        'cases = [{ name = "good", capture = "capture" }, { name = "bad", capture = "bad" }]\n'
+        'out = "runs"\n[resources]\nthreads = 1\nmemory_gb = 0.5\n'
+        + "".join(
+            f'[job.train-{name}]\nrequest = "train"\ndevice = "cpu"\nprincipal_point = "opencv"\nminutes = 0.1\n'
+            f'capture = "{capture}"\n'
+            'settings = { strategy = "selective", iterations = 100000, hull_points = false }\n'
+            for name, capture in (("good", "capture"), ("bad", "bad"))
+        )
     )
     command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]
     started = subprocess.Popen(

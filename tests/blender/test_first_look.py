@@ -11,7 +11,7 @@ from mathutils import Vector  # noqa: E402
 
 from stga_addon.export.ply import write_ply  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.display.display_modes import AS_TRAINED, ELLIPSOIDS, LIMITS, POINTS, QUADS  # noqa: E402
+from stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier  # noqa: E402
 from stga_addon.scene.objects import layers_of  # noqa: E402
@@ -154,7 +154,7 @@ def test_preview_for_other_engines(extension, tmp_path):
     set_input(shown, DISPLAY, AS_TRAINED)
     scene.camera = None
     assert bpy.ops.stga.preview_images() == {"FINISHED"}
-    assert display_mode(shown) == ELLIPSOIDS
+    assert display_mode(shown) == POINTS
     tree = splat_modifier(shown).node_group
     menu = next(node for node in tree.nodes if node.bl_idname == "GeometryNodeMenuSwitch")
     described = {item.name: item.description for item in menu.enum_definition.enum_items}

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy")
+mathutils = pytest.importorskip("mathutils")
 
-from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_world  # noqa: E402
+from stga_addon.avatar.embedding import CONVENTIONS, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar  # noqa: E402
 from stga_addon.avatar.splats import SH_C0, Splats  # noqa: E402
 from stga_addon.avatar.strain import edge_neighbors, rest_strain  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import ELLIPSOIDS, POINTS, QUADS  # noqa: E402
+from stga_addon.scene.display.display_modes import POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT  # noqa: E402
 from stga_addon.scene.display.splat_attributes import OPACITY, SCALE, SH, avatar_attributes  # noqa: E402
 from stga_addon.scene.display.splat_object import (  # noqa: E402
@@ -363,7 +364,7 @@ def test_no_strain_nodes_without_strain():
 
 
 def test_display_inputs():
-    """Catches inputs that are not wired: threshold, percentage and ellipsoids must each change what is shown."""
+    """Catches inputs that are not wired: threshold, percentage and quads must each change what is shown."""
     avatar = avatar_of("stga", 2000)
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     opacity = 1 / (1 + np.exp(-avatar.splats.opacity))
@@ -376,39 +377,19 @@ def test_display_inputs():
     set_input(shown, splat_nodes.PERCENTAGE, 100.0)
     assert get_input(shown, splat_nodes.SIZE) == 1.0
     assert get_input(shown, "Colour of the sea") is None
-    set_input(shown, splat_nodes.DISPLAY, ELLIPSOIDS)
-    with pytest.raises(StgaError, match="ellipsoids"):
+    set_input(shown, splat_nodes.DISPLAY, QUADS)
+    with pytest.raises(StgaError, match="quads"):
         evaluated_splats(shown)
 
 
-def test_ellipsoids_are_the_splats_own_shape():
-    """Catches ellipsoids in local instead of world rotation and scale, read from the instances' matrices."""
-    avatar = avatar_of("stga", 200)
-    head = animated_head(avatar.neutral, avatar.faces)
-    shown = show_avatar(avatar, head)
-    set_input(shown, splat_nodes.DISPLAY, ELLIPSOIDS)
-    set_input(shown, splat_nodes.SIZE, 2.0)
-    bpy.context.scene.frame_set(5)
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    world = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance])
-    frames = face_frames(evaluated_vertices(head), avatar.faces, avatar.neutral)
-    expected = to_world(avatar.splats, frames)
-    to_object = np.linalg.inv(np.array(shown.matrix_world))
-    w, x, y, z = (expected.rotation / np.linalg.norm(expected.rotation, axis=-1, keepdims=True)).T.astype(np.float64)
-    axis_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
-    local = to_object @ world
-    assert len(local) == 200
-    np.testing.assert_allclose(local[:, :3, 3], expected.xyz, atol=1e-5)
-    np.testing.assert_allclose(local[:, :3, 0], 2 * np.exp(expected.log_scale[:, :1]) * axis_x, atol=1e-5)
-
-
-def test_quads_face_the_camera_and_cover_the_ellipsoid():
-    """Catches quads seen edge-on, and quads that a stretched splat leaves behind: both cut Gaussians off."""
+def test_quads_face_the_camera_and_cover_the_splat():
+    """Catches quads seen edge-on, of another size or shape than their splats: both cut Gaussians off."""
     avatar = avatar_of("stga", 200)
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     camera = active_camera((0.4, -1.0, 1.3))
     bpy.context.scene.frame_set(5)
-    centre, _, _ = evaluated_splats(shown)
+    centre, rotation, scale = evaluated_splats(shown)
+    set_input(shown, splat_nodes.SIZE, 2.0)
     set_input(shown, splat_nodes.DISPLAY, QUADS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     quads = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64)
@@ -417,10 +398,9 @@ def test_quads_face_the_camera_and_cover_the_ellipsoid():
     # Seen from the camera each splat is a sphere in the quad's own space, right above the quad's centre.
     eye = np.linalg.solve(quads, np.broadcast_to([*camera.location, 1.0], (len(quads), 4))[..., None])[:, :3, 0]
     assert (eye[:, 2] / np.linalg.norm(eye, axis=-1)).min() > 1 - 1e-4
-    set_input(shown, splat_nodes.DISPLAY, ELLIPSOIDS)
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    spheres = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64)
-    shapes = [m[:, :3, :3] @ m[:, :3, :3].transpose(0, 2, 1) for m in (quads, spheres)]
+    turned = np.array([mathutils.Quaternion(each).to_matrix() for each in rotation], np.float64)
+    axes = to_world[:3, :3] @ turned * 2 * scale[:, None]
+    shapes = [m @ m.transpose(0, 2, 1) for m in (quads[:, :3, :3], axes)]
     np.testing.assert_allclose(shapes[0], shapes[1], rtol=2e-3, atol=1e-10)
     assert EXTENT == 3.0
 

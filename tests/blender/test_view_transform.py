@@ -38,6 +38,19 @@ def test_scenes_with_different_view_transforms():
     assert np.abs(agx.to_linear(gray) - 0.107).min() > 0.01
 
 
+def test_dark_colors_are_shown_as_trained():
+    """Catches an inverse that has not come to the end where the view transform hardly changes: in dark skin."""
+    rng = np.random.default_rng(0)
+    skin = rng.uniform(0.1, 1.3, (4000, 1)) * [0.75, 0.55, 0.45] + rng.normal(0, 0.04, (4000, 3))
+    scene, skin = scene_with("AgX"), np.clip(skin, 0, 1)
+    measure(scene)
+    agx = inverse_view(scene)
+    assert agx is not None
+    difference = 255 * np.abs(agx.show(agx.to_linear(skin)) - skin)
+    assert difference.mean() < 0.5  # 0.41; levels of 8 bits
+    assert np.percentile(difference, 99) < 6  # 4.6
+
+
 def test_an_animated_exposure_keeps_a_few(monkeypatch):
     """Catches a table per frame of an animation that stays in memory, and one of a scene that is rendered with each
     frame and displaced by them."""

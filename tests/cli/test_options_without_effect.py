@@ -1,4 +1,4 @@
-"""Options that would have no effect: refused in one sentence, before anything is written."""
+"""Options without effect where the result would be another than asked for: refused before anything is written."""
 
 from pathlib import Path
 
@@ -10,7 +10,6 @@ from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.export.ply import write_ply
 from stga_addon.training.run.folder import Run, read_run, write_run
 from stga_addon.training.settings import make_settings
 
@@ -28,37 +27,22 @@ REFUSED = {
     "avatar footage --model m.npz --out new --schedule paper --strategy gaussian-avatars": "--schedule paper: cannot "
     "be combined with --strategy gaussian-avatars",
     "avatar footage --model m.npz --out new --threshold 0.01": "--threshold: has no effect without --strategy",
-    "extend run capture --select-only s.npz --out new": "--out: has no effect with --select-only",
-    "extend run capture --select-only s.npz --budget 1m": "--budget: has no effect with --select-only",
-    "extend run capture --select-only s.npz --iterations 5": "--iterations: has no effect with --select-only",
-    "extend run capture --select-only s.npz --growth 1": "--growth: has no effect with --select-only",
-    "extend run capture --select-only s.npz --seed 1": "--seed: has no effect with --select-only",
-    "extend run capture --select-only s.npz --device cpu": "--device: has no effect with --select-only",
-    "select capture --zero-pose all": "--zero-pose: has no effect on capture, which was not tracked with FLAME",
-    "render a.npz --video v.mp4 --motion flame --flame flame/model.npz --capture capture": "--capture: cannot be "
-    "combined with --motion, whose meshes drive the avatar",
     "render a.npz --video v.mp4 --capture capture --principal-point opencv": "--principal-point: has no effect without "
     "--cameras",
-    "render a.ply --out new --cameras capture/transforms_val.json --capture capture": "--capture: has no effect on "
-    "a.ply, whose splats follow no mesh",
-    "render a.ply --out new --cameras capture/transforms_val.json --flame flame/model.npz": "--flame: has no effect on "
-    "a.ply, whose splats follow no mesh",
-    "export a.npz --format ply --out new.ply --capture capture": "--capture: has no effect with --format ply without "
+    "export a.npz --format ply --out new.ply --motion take.csv": "--motion: has no effect with --format ply without "
     "--timestep",
-    "export a.npz --format web --out new.html --flame flame/model.npz": "--flame: has no effect without --capture",
 }
 """Command line -> the sentence, or how it begins."""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Captures, an avatar of the first and the same splats as a PLY, and a run that has not begun."""
+    """Captures, an avatar of the first, and a run that has not begun."""
     folder = tmp_path_factory.mktemp("options")
     capture = open_capture(factory.write_mesh_capture(folder / "capture", (0, 1), range(2)))
     factory.write_flame_capture(folder / "flame", (0, 1), range(2))
     splats = lattice_splats(capture.neutral, capture.faces, order=0)
     write_avatar(folder / "a.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces))
-    write_ply(folder / "a.ply", splats)
     write_run(folder / "run", Run(capture.root, None, "vhap", make_settings(iterations=1)))
     (folder / "footage").mkdir()
     return folder
@@ -68,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_options_without_effect_are_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
-    """Catches an option that changes nothing without a message, and one that is refused after an hour of tracking."""
+    """Catches an option that is ignored without a message, and one that is refused after an hour of tracking."""
     monkeypatch.chdir(folder)
     before = sorted(folder.rglob("*"))
     assert main(line.split()) == 2

@@ -19,7 +19,6 @@ REFUSALS = [
     ("export {run} --format usd --timestep 1 --out {o}", "--timestep cannot be combined with --format usd"),
     ("export {run} --format ply --motion-only --out {o}",
      "--motion-only cannot be combined with --format ply, only with web"),
-    ("export {run} --format spz --fps 30 --out {o}", "--fps cannot be combined with --format spz, only with usd, web"),
     ("export {run} --format usd --out {o}.usda", "o.usda: expected a name that ends in .usdc or .usdz"),
     ("refine {run}", "--region: is missing"),
     ("refine {none} --region mouth --growth 1e9",

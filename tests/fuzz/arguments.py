@@ -222,20 +222,20 @@ def drive(rng: random.Random, case: Path) -> list[str]:
 
 BATCH_PLANS = (
     'out = "{new}"\n[job.a]\nrequest = "train"\ncapture = "mesh"\nsettings = {{ preset = "draft" }}\n'
-    'sweep = {{ "settings.seed" = [0, 1] }}\n[job.b]\nrequest = "evaluate"\nrun = "{{a}}"\nsplit = {value}\n',
+    '[job.b]\nrequest = "evaluate"\nrun = "{new}/a"\nsplit = {value}\n',
     'out = "{new}"\n[resources]\nthreads = {value}\n[job.a]\nrequest = "track"\nminutes = {value}\n',
-    "[job.a]\nrequest = {value}\ncases = [{{ name = {value} }}]\n",
+    "[job.a]\nrequest = {value}\nafter = [{value}]\n",
     "{value}",
 )
 
 
 def batch(rng: random.Random, case: Path) -> list[str]:
-    """Plans, and what a farm is given: jobs themselves are requests, which `perform` is tried with."""
-    value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"{b}"', '"../x"', '""', "true"])
+    """Plans, shown or prepared: jobs themselves are requests, which `perform` is tried with."""
+    value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"../x"', '""', "true"])
     new = some_path(rng, case, "new")
     plan = rng.choice(BATCH_PLANS).format(new=new, value=value)
     (case / "plan.toml").write_bytes(plan.encode("utf-8", "surrogatepass"))
-    arguments = ["--dry-run"] if rng.random() < 0.7 else ["--emit", rng.choice(["openjd", "flamenco"])]
+    arguments = ["--dry-run"] if rng.random() < 0.7 else ["--commands"]
     if rng.random() < 0.6:
         return [str(case / "plan.toml"), *arguments, *option(rng, 0.3, "--threads", *NUMBERS)]
     arguments += ["--iterations", rng.choice(["3", *NUMBERS]), *option(rng, 0.3, "--seed", *NUMBERS)]

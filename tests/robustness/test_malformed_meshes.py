@@ -1,8 +1,7 @@
-"""Meshes made to break their readers: bombs, lies about size, references, parsers that do not end."""
+"""Meshes made to break their readers: lies about size, references, parsers that do not end."""
 
 import json
 import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -49,42 +48,6 @@ def accessors(**changes: Any) -> list[dict[str, Any]]:
     return [kept, {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"}]
 
 
-def bomb_picture() -> bytes:
-    """A PNG of 12,000 x 12,000 white pixels in 140 kB."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">L", len(data)) + kind + data + struct.pack(">L", zlib.crc32(kind + data))
-
-    size = 12_000
-    rows = zlib.compress(bytes(size * (size // 8 + 1)), 1)
-    head = struct.pack(">2L5B", size, size, 1, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-
-
-def with_texture() -> bytes:
-    picture = bomb_picture()
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
-    data = points + np.array([0, 1, 2], "<u4").tobytes() + np.zeros((3, 2), "<f4").tobytes() + picture
-    data += bytes(-len(data) % 4)
-    views = [(0, 36), (36, 12), (48, 24), (72, len(picture))]
-    attributes = {"POSITION": 0, "TEXCOORD_0": 2}
-    return glb(
-        {
-            "asset": {"version": "2.0"},
-            "scenes": [{"nodes": [0, 1]}],
-            "nodes": [{"mesh": 0}, {"mesh": 1}],
-            "meshes": [{"primitives": [{"attributes": attributes, "indices": 1, "material": n}]} for n in (0, 1)],
-            "accessors": [*accessors(), {"bufferView": 2, "componentType": 5126, "count": 3, "type": "VEC2"}],
-            "bufferViews": [{"buffer": 0, "byteOffset": at, "byteLength": size} for at, size in views],
-            "buffers": [{"byteLength": len(data)}],
-            "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": n}}} for n in (0, 1)],
-            "textures": [{"source": 0}, {"source": 0}],
-            "images": [{"bufferView": 3, "mimeType": "image/png"}],
-        },
-        data,
-    )
-
-
 PLY_LIST = "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
 
 
@@ -100,7 +63,6 @@ MESHES: dict[str, tuple[str, bytes]] = {
     "glb of negative counts": ("glb", gltf(accessors=accessors(count=-3))),
     "glb of a count as text": ("glb", gltf(accessors=accessors(count="3"))),
     "glb of matrices": ("glb", gltf(accessors=accessors(type="MAT4"))),
-    "glb that repeats one mesh": ("glb", gltf(nodes=[{"mesh": 0}] * 30_000, scenes=[{"nodes": list(range(30_000))}])),
     "glb whose nodes form a ring": ("glb", gltf(nodes=[{"mesh": 0, "children": [1]}, {"children": [0]}])),
     "glb whose node is its child": ("glb", gltf(nodes=[{"mesh": 0, "children": [0]}])),
     "glb that doubles itself": (
@@ -112,7 +74,6 @@ MESHES: dict[str, tuple[str, bytes]] = {
     "glb of huge matrices": ("glb", gltf(nodes=[{"mesh": 0, "matrix": [1e308] * 16}])),
     "glb of few matrices": ("glb", gltf(nodes=[{"mesh": 0, "matrix": [1] * 3}])),
     "glb of a huge chunk": ("glb", struct.pack("<5L", 0x46546C67, 2, 100, 2**32 - 1, 0x4E4F534A)),
-    "glb with bombs as textures": ("glb", with_texture()),
     "ply of a billion vertices": ("ply", ply(GIGA, b"end_header\n" + bytes(36))),
     "ply of a billion lines": ("ply", ply(GIGA, PLY_LIST.format(GIGA).encode() + b"0 0 0\n" * 3, "ascii")),
     "ply of a billion triangles": ("ply", ply(3, PLY_LIST.format(GIGA).encode() + bytes(36) + b"\x03" + bytes(12))),
@@ -132,11 +93,11 @@ MESHES: dict[str, tuple[str, bytes]] = {
 
 @pytest.mark.parametrize("name", MESHES)
 def test_meshes(tmp_path: Path, name: str) -> None:
-    """Catches memory allocated on a header's word, meshes multiplied by references, textures that are unpacked though
-    nobody looks at them, files read or servers asked because a mesh names them, and parsers that do not end."""
+    """Catches memory allocated on a header's word, files read or servers asked because a mesh names them, and parsers
+    that do not end."""
     suffix, content = MESHES[name]
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(content)
     message = behaves(lambda: read_mesh(path), tmp_path)
-    loads = ("glb", "glb of huge matrices", "glb with bombs as textures", "obj that includes", "obj of one polygon")
+    loads = ("glb", "glb of huge matrices", "obj that includes", "obj of one polygon")
     assert (message == "") == (name in loads)

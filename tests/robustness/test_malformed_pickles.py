@@ -1,4 +1,4 @@
-"""Pickles of FLAME models made to break their reader: bombs, lies about size, code that must not be executed."""
+"""Pickles of FLAME models made to break their reader: lies about size, code that must not be executed."""
 
 import pickle
 import struct
@@ -15,32 +15,13 @@ from stga_addon.flame.unpickle import read_pickled_arrays
 from .limits import behaves
 
 
-def doubled(inner: bytes, times: int) -> bytes:
-    """Pickle code of [[…[x, x], …], …]: a list that stands for 2^times things."""
-    code = inner
-    for slot in range(1, times + 1):
-        code += b"q" + bytes([slot]) + b"0]h" + bytes([slot]) + b"ah" + bytes([slot]) + b"a"
-    return code
-
-
 def pickled(value: bytes, key: bytes = b"v_template") -> bytes:
     return b"\x80\x02}U" + bytes([len(key)]) + key + value + b"s."
 
 
-TEXT = b"X" + struct.pack("<L", 1_000_000) + b"x" * 1_000_000 + b"q\x01"
 PICKLES = {
-    "list of a billion numbers": pickled(doubled(b"]K\x01a", 30)),
-    "list of a billion lists": pickled(doubled(b"]", 30)),
     "list of itself": pickled(b"]q\x01h\x01a"),
-    "text encoded ten thousand times": pickled(
-        b"c_codecs\nencode\nq\x02" + TEXT + b"0(" + b"h\x02h\x01X\x06\0\0\0latin1\x86R" * 10_000 + b"l"
-    ),
-    "set copied ten thousand times": pickled(
-        b"c__builtin__\nset\nq\x02](" + b"".join(b"M" + struct.pack("<H", n) for n in range(60_000)) + b"eq\x010("
-        + b"h\x02h\x01\x85R" * 10_000 + b"l"
-    ),
     "changes a function": pickled(b"c_codecs\nencode\nN}U\x0c__defaults__K\x05\x85s\x86b"),
-    "millions of instructions": pickled(b"N0" * 3_000_000 + b"N"),
     "bytes of gigabytes": pickled(b"\x8e" + struct.pack("<Q", 10**15)),
     "array of gigabytes": pickled(b"\x96" + struct.pack("<Q", 10**12)),
     "frame of gigabytes": b"\x80\x04\x95" + struct.pack("<Q", 10**15) + b"N.",
@@ -55,7 +36,7 @@ PICKLES = {
 
 @pytest.mark.parametrize("name", PICKLES)
 def test_pickles(tmp_path: Path, name: str) -> None:
-    """Catches pickles that stand for far more than they hold, that run what they name, or that never end."""
+    """Catches pickles whose size is a lie, that run what they name, or that never end."""
     path = tmp_path / "a.pkl"
     path.write_bytes(PICKLES[name])
     assert behaves(lambda: read_flame(path), tmp_path)
@@ -85,14 +66,6 @@ def test_sparse_matrices_that_would_be_large(
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps({"v_template": matrix}, 4))
     assert "v_template" in behaves(lambda: read_pickled_arrays(path, ("v_template",)), tmp_path)
-
-
-def test_one_array_by_a_thousand_names(tmp_path: Path) -> None:
-    """Catches masks whose regions all name the same data: 1 MB that becomes 1 GB."""
-    array = np.zeros(1 << 17)
-    path = tmp_path / "masks.pkl"
-    path.write_bytes(pickle.dumps({f"region{n}": array for n in range(1000)}, 2))
-    assert "larger than the file can hold" in behaves(lambda: read_pickled_arrays(path), tmp_path)
 
 
 @pytest.mark.parametrize("shape", [(-1, -6), ("a",), (10**400,), (2, 3, None), (1,) * 70])

@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ...errors import StgaError
 from ...requests.folder import worker_arguments
 from ...worker.helpers import processors
 from ...worker.launch import start_worker
@@ -79,13 +78,6 @@ class LocalEngine:
 def _is_kill(code: int | None) -> bool:
     """Whether an exit status, of a worker without a final status, is that of a kill; a mistake's is 2, a bug's 1."""
     return not code or code < 0 or (IS_WINDOWS and code != 2)
-
-
-def make_local(address: str) -> LocalEngine:
-    """Raises StgaError for an address."""
-    if address:
-        raise StgaError("--address: has no effect with --engine local")
-    return LocalEngine()
 
 
 def free_memory_gb() -> float:

@@ -34,7 +34,10 @@ class RayEngine:
     interval_s = 0.2
 
     def __init__(self, address: str) -> None:
-        """Raises StgaError where Ray is not installed, or the cluster cannot be reached."""
+        """Use the cluster at an address; "": one that is started here and ends with the batch.
+
+        Raises StgaError where Ray is not installed, or the cluster cannot be reached.
+        """
         if find_spec("ray") is None:
             raise StgaError("--engine ray: the package ray is not installed (it is the extra `ray` of stga-addon)")
         if not address and TOKEN_MODE not in os.environ:  # other users of this machine cannot submit to it
@@ -106,11 +109,6 @@ class RayEngine:
 
     def close(self) -> None:
         self._ray.shutdown()
-
-
-def make_ray(address: str) -> RayEngine:
-    """The engine of the cluster at an address; "": one that is started here and ends with the batch."""
-    return RayEngine(address)
 
 
 def _task(python_variable: str) -> Callable[[list[str], str, str], int]:

@@ -1,4 +1,4 @@
-"""Engine of a SLURM cluster: one sbatch array per table of the plan and needs, with dependencies between the arrays.
+"""Engine of a SLURM cluster: an sbatch array of jobs of the same kind and needs, with dependencies between the arrays.
 
 https://slurm.schedmd.com/sbatch.html. The jobs of a machine that dies are put back into the queue (--requeue), and
 continue from their checkpoints. Liveness is squeue's, state and figures are those of the jobs' folders. The batch's
@@ -19,7 +19,7 @@ from ...files import read_json, replacing, write_json
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, WorkerState, inspect_worker
 from ..engine import Ended, job_command
-from ..job import Job, alike
+from ..job import Job, Resources, kind_name
 
 TIMEOUT_S = 60.0
 MAX_ARRAY = 1000
@@ -50,6 +50,7 @@ class SlurmEngine:
     interval_s = 2.0
 
     def __init__(self) -> None:
+        """Raises StgaError where SLURM's programs are missing."""
         missing = next((name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None)
         if missing is not None:
             raise StgaError(f"--engine slurm: the program {missing} was not found; start it where SLURM is installed")
@@ -73,8 +74,8 @@ class SlurmEngine:
         for job in jobs:
             if names[job.name] in queued:
                 self.adopt(job)
-        for group in _ordered(alike([job for job in jobs if names[job.name] not in queued], MAX_ARRAY)):
-            self._submit_array(group)
+        for array in _in_arrays([job for job in jobs if names[job.name] not in queued]):
+            self._submit_array(array)
 
     def _name(self, job: Job) -> str:
         """The job's name in SLURM when it was submitted last; "" where it never was."""
@@ -86,14 +87,14 @@ class SlurmEngine:
         return str(self._names.get(job.name, ""))
 
     def _submit_array(self, jobs: Sequence[Job]) -> None:
-        script = jobs[0].folder.parent / FOLDER / f"{jobs[0].table}-{time.time_ns()}.sh"
+        kind, needs = kind_name(type(jobs[0].request)), jobs[0].resources
+        script = jobs[0].folder.parent / FOLDER / f"{kind}-{time.time_ns()}.sh"
         with replacing(script) as partial:
             partial.write_text(_script(jobs), encoding="utf-8")
         names = {self._jobs[other].name for job in jobs for other in job.after if other in self._jobs}
         waits = sorted({_array(name) for name in names if name})
-        needs = jobs[0].resources
         command = [
-            "sbatch", "--parsable", "--requeue", f"--job-name=stga-{jobs[0].table}", f"--array=0-{len(jobs) - 1}",
+            "sbatch", "--parsable", "--requeue", f"--job-name=stga-{kind}", f"--array=0-{len(jobs) - 1}",
             f"--cpus-per-task={needs.threads or 1}", f"--mem={round(1000 * needs.memory_gb)}M", "--output=/dev/null",
             *(["--gres=gpu:1"] if needs.gpu else []),
             *([f"--dependency=afterany:{':'.join(waits)}"] if waits else []),
@@ -153,36 +154,23 @@ class SlurmEngine:
         """The queue goes on by itself."""
 
 
-def make_slurm(address: str) -> SlurmEngine:
-    """Raises StgaError for an address, and where SLURM's programs are missing."""
-    if address:
-        raise StgaError("--address: has no effect with --engine slurm, which uses the cluster of its configuration")
-    return SlurmEngine()
-
-
 def _array(name: str) -> str:
     """ "12" of the job "12_3"."""
     return name.partition("_")[0]
 
 
-def _ordered(groups: list[list[Job]]) -> list[list[Job]]:
-    """The groups, each after those whose jobs it comes after, as the jobs of a plan are sorted by what they wait for.
-
-    Tables wait for tables, so that groups have no circle.
-    """
-    group_of = {job.name: number for number, group in enumerate(groups) for job in group}
-    placed: list[int] = []
-
-    def place(number: int) -> None:
-        if number in placed:
-            return
-        for other in {group_of[name] for job in groups[number] for name in job.after if name in group_of} - {number}:
-            place(other)
-        placed.append(number)
-
-    for number in range(len(groups)):
-        place(number)
-    return [groups[number] for number in placed]
+def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
+    """The jobs, which follow those that they come after, in arrays of the same kind and needs, in an order in which no
+    array waits for a later one: jobs of an array are as many steps from the first."""
+    step: dict[str, int] = {}
+    arrays: dict[tuple[int, str, Resources, int], list[Job]] = {}
+    for job in jobs:
+        step[job.name] = 1 + max((step[other] for other in job.after if other in step), default=0)
+        key, number = (step[job.name], kind_name(type(job.request)), job.resources), 0
+        while len(arrays.setdefault((*key, number), [])) == MAX_ARRAY:
+            number += 1
+        arrays[*key, number].append(job)
+    return [arrays[key] for key in sorted(arrays, key=lambda key: key[0])]
 
 
 def _script(jobs: Sequence[Job]) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...batch.plan import MAX_JOBS, Plan
+from ...batch.plan import Plan
 from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
@@ -32,6 +32,7 @@ from .variants import STANDARD, variants_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+MAX_SEEDS = 1000
 MEMORY_GB = 1.0
 """Of a variant's process; all variants of a slice have one at the same time."""
 COLUMNS = {
@@ -54,30 +55,26 @@ COLUMNS = {
 Unfitted: without fitted exposure."""
 
 
-def benchmark_table(request: Benchmark, seeds: int) -> dict[str, Any]:
-    """The table of a plan that carries out a benchmark: a slice for each seed.
+def benchmark_jobs(name: str, request: Benchmark, seeds: int) -> dict[str, Any]:
+    """Jobs of a plan that carry out a benchmark: a slice for each seed, called NAME-seed0 and so on.
 
-    request: its folder counts for nothing, and its seed. Raises StgaError for unknown variants, and more seeds than
-    a plan can have jobs.
+    request: its folder counts for nothing, and its seed. Raises StgaError for unknown variants, and too many seeds.
     """
-    if seeds > MAX_JOBS:
-        raise StgaError(f"--seeds {seeds}: expected up to {MAX_JOBS}")
+    if seeds > MAX_SEEDS:
+        raise StgaError(f"--seeds {seeds}: expected up to {MAX_SEEDS}")
     count = len(variants_of(request))
-    given = {name: value for name, value in to_json(request).items() if name not in ("out", "seed", "flame")}
+    given = {key: value for key, value in to_json(request).items() if key not in ("out", "seed", "flame")}
     if request.flame is not None:
         given["flame"] = str(request.flame)
-    return {
-        "request": "benchmark",
-        **given,
-        "sweep": {"seed": list(range(seeds))},
-        "minutes": count * request.seconds / 60,
-        "resources": {"memory_gb": MEMORY_GB * count},
-    }
+    needs = {"minutes": count * request.seconds / 60, "resources": {"memory_gb": MEMORY_GB * count}}
+    return {f"{name}-seed{seed}": {"request": "benchmark", **given, "seed": seed, **needs} for seed in range(seeds)}
 
 
-def slices_of(plan: Plan, table: str) -> list[Benchmark]:
-    """The slices of a table of the plan, by seed."""
-    found = [job.request for job in plan.jobs if job.table == table and isinstance(job.request, Benchmark)]
+def slices_of(plan: Plan, name: str) -> list[Benchmark]:
+    """The slices of a benchmark of the plan, by seed."""
+    found = [
+        job.request for job in plan.jobs if isinstance(job.request, Benchmark) and job.name.startswith(f"{name}-seed")
+    ]
     return sorted(found, key=lambda request: request.seed)
 
 

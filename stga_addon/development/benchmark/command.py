@@ -17,7 +17,7 @@ from ...worker.helpers import processors
 
 NAME, HELP = "benchmark", "compare accuracy and training time of strategies and presets on the CPU"
 SLICES = "benchmark"
-"""Table of the plan, and start of the folders of the slices."""
+"""How the names of the jobs, and of their folders, begin."""
 
 
 def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
@@ -33,7 +33,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from .benchmark import benchmark_table, slices_of, write_report
+    from .benchmark import benchmark_jobs, slices_of, write_report
 
     capture = open_named_capture(options)
     for split, purpose in (("train", "train on"), ("val", "measure with")):
@@ -42,7 +42,7 @@ def run(options: Namespace) -> None:
     flame = None if options.flame is None else options.flame.resolve()
     out, root, only = options.out.resolve(), options.capture.resolve(), tuple(options.only or ())
     request = Benchmark(out, root, options.budget, flame, principal_point_of(options), knobs=options.knobs, only=only)
-    values = {"out": str(out), "job": {SLICES: benchmark_table(request, options.seeds)}}
+    values = {"out": str(out), "job": benchmark_jobs(SLICES, request, options.seeds)}
     plan = with_threads(make_plan(values, out, "stga benchmark"), options.threads or processors())
     if options.dry_run:
         print_plan(plan)

@@ -1,4 +1,4 @@
-"""Node groups for the display modes: as trained, points, ellipsoids, camera quads and, from 5.3, native splats."""
+"""Node groups for the display modes: as trained, points, camera quads and, from 5.3, native splats."""
 
 from functools import partial
 from typing import Any
@@ -8,7 +8,7 @@ import bpy
 from ...avatar.splats import SH_C0
 from ..compat import native_splats
 from .color_nodes import LINEAR_TO_SRGB
-from .materials import DISPLAY_COLOR, EXTENT, ellipsoid_material, point_material
+from .materials import DISPLAY_COLOR, EXTENT, gaussian_material, point_material
 from .node_builder import NodeGroup, Nodes
 from .splat_attributes import OPACITY, RELIT_COLOR, SH
 
@@ -20,14 +20,12 @@ RADIANCE_SH = "radiance:sh_{}"  # coefficients of degrees 1 to 3
 
 AS_TRAINED = "As Trained"
 POINTS = "Points"
-ELLIPSOIDS = "Ellipsoids"
 QUADS = "Camera Quads"
 NATIVE = "Native Splats"
 LIMITS = {
     AS_TRAINED: "Exact in viewports and by the engine STGA Splats; EEVEE and Cycles render camera quads",
     POINTS: "Fast: round, of each splat's mean size",
-    ELLIPSOIDS: "For EEVEE and Cycles, from all sides, in the colors that the scene's camera sees",
-    QUADS: "For EEVEE and Cycles, faster; right through the scene's camera only",
+    QUADS: "For EEVEE and Cycles; right through the scene's camera only",
     NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; not tried in Blender 5.3",
 }
 """What each display is for and what it is not, in its tooltip and in the panel."""
@@ -67,32 +65,15 @@ def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Nod
     return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": point_material()})
 
 
-def _ellipsoids(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
-    """Instances of one sphere; realizing them would take twenty times as long."""
-    sphere = nodes.out("GeometryNodeMeshIcoSphere", {"Radius": EXTENT, "Subdivisions": 2})
-    sphere = nodes.out("GeometryNodeSetShadeSmooth", {"Geometry": sphere})
-    sphere = nodes.out("GeometryNodeSetMaterial", {"Geometry": sphere, "Material": ellipsoid_material()})
-    return nodes.out(
-        "GeometryNodeInstanceOnPoints",
-        {
-            "Points": splats,
-            "Selection": visible,
-            "Instance": sphere,
-            "Rotation": nodes.attribute(WORLD_ROTATION, "QUATERNION"),
-            "Scale": nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size),
-        },
-    )
-
-
 def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
     """Two triangles per splat, which cover its ellipsoid as the scene's active camera sees it.
 
-    In the ellipsoid's own space it is a sphere, and the quad faces the camera there. The ellipsoid material applies
-    unchanged, because it evaluates rays and not the surface they hit.
+    In the ellipsoid's own space it is a sphere, and the quad faces the camera there. Instances: realizing
+    them would take twenty times as long.
     """
     side = 2 * EXTENT
     quad = nodes.out("GeometryNodeMeshGrid", {"Size X": side, "Size Y": side, "Vertices X": 2, "Vertices Y": 2})
-    quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": ellipsoid_material()})
+    quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": gaussian_material()})
     quads = nodes.out("GeometryNodeInstanceOnPoints", {"Points": splats, "Selection": visible, "Instance": quad})
     transform = _quad_transform(nodes, size)
     return nodes.out("GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": transform})
@@ -145,7 +126,6 @@ def _native(
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
 MODES = {
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
-    ELLIPSOIDS: NodeGroup("STGA Ellipsoids", _INPUTS, "Geometry", _ellipsoids),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }
 NATIVE_GROUPS = tuple(

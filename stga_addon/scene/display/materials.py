@@ -9,10 +9,10 @@ from .node_builder import Nodes, new_material
 from .splat_attributes import OPACITY
 
 POINT_MATERIAL = "STGA Points"
-ELLIPSOID_MATERIAL = "STGA Ellipsoids"
+GAUSSIAN_MATERIAL = "STGA Gaussians"
 DISPLAY_COLOR = "stga_display_color"  # attribute that the splat nodes store
 EXTENT = 3.0
-"""Standard deviations from an ellipsoid's center to its surface; beyond, a Gaussian is below 1.2 % of its maximum."""
+"""Standard deviations from a quad's center to its sides; beyond, a Gaussian is below 1.2 % of its maximum."""
 
 
 def point_material() -> bpy.types.Material:
@@ -21,16 +21,16 @@ def point_material() -> bpy.types.Material:
     return _splat_material(POINT_MATERIAL, _point_shader, "DITHERED")
 
 
-def ellipsoid_material() -> bpy.types.Material:
-    """Renders instances of a sphere of radius EXTENT as Gaussians; the instance's scale is the standard deviation.
+def gaussian_material() -> bpy.types.Material:
+    """Renders instances of a quad as Gaussians; the instance's scale is the standard deviation.
 
-    Along a ray with unit direction D through a surface point P of the sphere, both in the instance's space, the
+    Along a ray with unit direction D through a point P of the quad, both in the instance's space, the
     Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² − (P·D)²; its density
     there is taken for the whole splat. Exact for Cycles up to the order of overlapping splats, and for EEVEE up to
     their order by centers.
     """
     # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come as close.
-    return _splat_material(ELLIPSOID_MATERIAL, _ellipsoid_shader, "BLENDED")
+    return _splat_material(GAUSSIAN_MATERIAL, _gaussian_shader, "BLENDED")
 
 
 def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bpy.types.Material:
@@ -47,7 +47,7 @@ def _point_shader(nodes: Nodes) -> Any:
     return _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY"))
 
 
-def _ellipsoid_shader(nodes: Nodes) -> Any:
+def _gaussian_shader(nodes: Nodes) -> Any:
     color, opacity = _color_and_opacity(nodes, "INSTANCER")
     geometry = nodes.add("ShaderNodeNewGeometry").outputs
     position = nodes.add("ShaderNodeTexCoord").outputs["Object"]
@@ -59,7 +59,7 @@ def _ellipsoid_shader(nodes: Nodes) -> Any:
     length2 = nodes.vector("DOT_PRODUCT", position, position)
     distance2 = nodes.math("SUBTRACT", length2, nodes.math("MULTIPLY", along, along))
     density = nodes.math("EXPONENT", nodes.math("MULTIPLY", distance2, -0.5))
-    # A ray enters and leaves a sphere: only the front surface counts.
+    # Whatever is behind a quad sees through it.
     front = nodes.math("SUBTRACT", 1.0, geometry["Backfacing"])
     return _emission(nodes, color, nodes.math("MULTIPLY", nodes.math("MULTIPLY", density, front), opacity))
 

@@ -212,7 +212,7 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
 
     Returns position (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32.
     Splats displayed as trained are posed by the GPU display: here they are evaluated as points.
-    Raises StgaError where it displays ellipsoids, which are instances and not one geometry.
+    Raises StgaError where it displays quads, which are instances and not one geometry.
     """
     if display_mode(splat_object) == AS_TRAINED:
         set_input(splat_object, splat_nodes.DISPLAY, POINTS)
@@ -230,7 +230,7 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
                 read_values(attributes[WORLD_ROTATION].data, "value", 4),
                 read_values(attributes[WORLD_SCALE].data, "vector", 3),
             )
-    raise StgaError(f"{splat_object.name}: shows ellipsoids or noobj, expected points")
+    raise StgaError(f"{splat_object.name}: shows quads or nothing, expected points")
 
 
 def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:

@@ -21,7 +21,8 @@ GRID, INVERSE_GRID = 41, 25
 """Samples along an axis of the table measured, and of its inverse."""
 DARKEST, BRIGHTEST = -14.0, 6.0
 """Range of the scene-linear samples, in log2; the first sample is 0."""
-INVERSE_STEPS = 15
+INVERSE_STEPS, MAX_STEP, DAMPING = 15, 4, 1e-3
+"""Of finding a color of the inverse; a step is in samples, and damped where colors hardly change: in the dark."""
 CHUNK = 1 << 16
 """Pixels converted at a time, which bounds the memory."""
 MAIN_THREAD_TIMEOUT_S = 10.0
@@ -58,22 +59,17 @@ class InverseView:
         return linear.reshape(srgb.shape)
 
     def _solve(self, target: np.ndarray) -> np.ndarray:
-        """Places (M, 3) in the table, in samples, that show colors (M, 3) most nearly, by Levenberg-Marquardt steps."""
+        """Places (M, 3) in the table, in samples, that show colors (M, 3) most nearly, by damped Gauss-Newton steps."""
         last = len(self._axis) - 1
         gray = np.maximum.accumulate(np.einsum("iiic->i", self._shown) / 3)
         place = np.interp(target, gray, np.arange(last + 1))
-        rest, damping = interpolate(self._shown, place) - target, np.full((len(target), 1, 1), 1e-4)
+        slopes = np.stack(np.gradient(self._shown, axis=(0, 1, 2)), -1).reshape(*self._shown.shape[:3], 9)
         for _ in range(INVERSE_STEPS):
-            ends = [np.clip(place + step, 0, last) for step in (*np.eye(3), *-np.eye(3))]
-            values = np.stack([interpolate(self._shown, end) for end in ends], -1)
-            jacobian = (values[..., :3] - values[..., 3:]) / 2
+            rest = interpolate(self._shown, place) - target
+            jacobian = interpolate(slopes, place).reshape(-1, 3, 3)
             transposed = jacobian.transpose(0, 2, 1)
-            step = np.linalg.solve(transposed @ jacobian + damping * np.eye(3), transposed @ rest[..., None])[..., 0]
-            moved = np.clip(place - np.clip(step, -4, 4), 0, last)
-            rest_moved = interpolate(self._shown, moved) - target
-            better = (rest_moved**2).sum(-1) < (rest**2).sum(-1)
-            place[better], rest[better] = moved[better], rest_moved[better]
-            damping = np.clip(np.where(better[:, None, None], damping / 4, damping * 8), 1e-7, 1e3)
+            step = np.linalg.solve(transposed @ jacobian + DAMPING * np.eye(3), transposed @ rest[..., None])[..., 0]
+            place = np.clip(place - np.clip(step, -MAX_STEP, MAX_STEP), 0, last)
         return place
 
 

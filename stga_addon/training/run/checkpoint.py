@@ -59,7 +59,7 @@ def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity:
 def read_selection(folder: Path, faces: int, identity: str | None = None) -> dict[int, np.ndarray]:
     """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh, or has not this `identity`."""
     path = folder / SELECTION
-    arrays = read_npz(path, max_compression=faces // 100 + 16)  # an entry of a zip has some 200 bytes
+    arrays = read_npz(path)
     stored = arrays.pop(IDENTITY, None)
     if identity is not None and (stored is None or stored.tobytes() != identity.encode()):
         raise StgaError(f"{path}: {OTHER_RUN}")

@@ -9,7 +9,6 @@ export class DataError extends Error {}
 
 const VERSION = 1;
 const MAX_BYTES = 1 << 30;
-const MAX_HEADER_BYTES = 1 << 24;
 const MAX_VIEW_SIZE = 1 << 16; // pixels
 const CHANNELS = 3;
 
@@ -28,7 +27,7 @@ export async function readData(bytes) {
   if (version !== VERSION)
     throw new DataError(`The avatar has format version ${version}; this player reads ${VERSION}.`);
   const length = view.getUint32(8, true);
-  if (length > MAX_HEADER_BYTES || 12 + length > raw.length) throw new DataError('The avatar data is cut off.');
+  if (12 + length > raw.length) throw new DataError('The avatar data is cut off.');
   const header = parseHeader(raw.subarray(12, 12 + length));
   const arrays = readArrays(header, raw.subarray(12 + length));
   checkData(header, arrays);
