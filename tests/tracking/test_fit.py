@@ -8,7 +8,8 @@ from flame.conftest import random_arrays, random_frame
 
 from stga_addon.capture.camera import look_at
 from stga_addon.development.demo.head import synthetic_flame
-from stga_addon.flame.forward import FlameFrame, flame_forward, frame_of
+from stga_addon.flame.forward import RIGID_SIZE, FlameFrame, flame_forward, frame_of
+from stga_addon.flame.teeth import flame_model
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import (
     Similarity,
@@ -21,7 +22,15 @@ from stga_addon.tracking.fit import (
 )
 from stga_addon.tracking.head_model import HeadModel, linear_model
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints
-from stga_addon.tracking.solve import Observation, in_order, person, solve_take
+from stga_addon.tracking.solve import (
+    WEIGHT_EXCESS_SIGMA,
+    Observation,
+    in_order,
+    parameter_precision,
+    person,
+    prior_terms,
+    solve_take,
+)
 from stga_addon.tracking.track import interpolated
 from stga_addon.tracking.triangulation import rays, triangulate
 from stga_addon.tracking.write_capture import posed_mesh
@@ -308,3 +317,29 @@ def test_nearest_points_of_a_mesh(head):
     samples = np.einsum("sk,fkc->fsc", weights, corners).reshape(-1, 3)
     for point, found in zip(points, distance, strict=True):
         assert found <= np.linalg.norm(samples - point, axis=1).min() + 1e-9
+
+
+def test_prior_keeps_weights_between_0_and_1():
+    """Catches a pull of the wrong sign or size, and one on models whose coefficients are no weights: the right-hand
+    side is minus the slope of the penalty, by differences."""
+    named = HeadModel(flame_model(None), "flame")
+    count, rng = named.model.n_expression, np.random.default_rng(0)
+    values = np.concatenate([rng.uniform(-1, 2, count), np.zeros(RIGID_SIZE)])
+
+    def penalty(head, at):
+        total = (parameter_precision(head) * at**2).sum() / 2
+        if head.model.expression_names:
+            beyond = np.maximum(at[:count] - 1, 0) + np.maximum(-at[:count], 0)
+            total += (beyond**2).sum() / 2 / WEIGHT_EXCESS_SIGMA**2
+        return total
+
+    for head in (named, replace(named, model=replace(named.model, expression_names=()))):
+        precision, right = prior_terms(head, values)
+        for column in range(count):
+            step = np.zeros_like(values)
+            step[column] = 1e-6
+            slope = (penalty(head, values + step) - penalty(head, values - step)) / 2e-6
+            assert right[column] == pytest.approx(-slope, rel=1e-4, abs=1e-6)
+        assert ((precision[:count] > 1) == ((values[:count] < 0) | (values[:count] > 1))).all() == bool(
+            head.model.expression_names
+        )

@@ -21,7 +21,7 @@ from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.schedule import view_order
-from stga_addon.training.settings import STRATEGIES
+from stga_addon.training.settings import MAX_FINE_TRIANGLES, STRATEGIES
 
 from .toys import bits, quick_settings
 
@@ -225,6 +225,15 @@ def test_initial_splats_with_hull_points(tmp_path: Path) -> None:
     assert full.unbound[len(bare) :].all()
     for name, value in vars(bare).items():
         np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
+
+
+@pytest.mark.parametrize(("triangles", "splats"), [(MAX_FINE_TRIANGLES, 6), (MAX_FINE_TRIANGLES + 1, 3)])
+def test_splats_of_a_triangle_by_the_mesh(toy: Capture, triangles: int, splats: int) -> None:
+    """Catches a fine mesh that starts with twice the splats, and a lattice that was chosen and is not used."""
+    rows = np.resize(np.arange(len(toy.faces)), triangles)
+    fine = replace(toy, faces=toy.faces[rows])
+    assert len(initial_splats(fine, quick_settings(lattice=None))) == splats * triangles
+    assert len(initial_splats(fine, quick_settings(lattice=0))) == triangles
 
 
 def test_unseen_share(toy: Capture) -> None:
