@@ -36,6 +36,7 @@ from .fit import (
     is_face,
     is_metric,
 )
+from .focal_length import solved_focal
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
 from .footage.model import Footage, FootageCamera
 from .head_model import HeadModel, read_head_model
@@ -76,6 +77,7 @@ class TrackingReport:
     image_misfit     region of the face -> timestep -> share of the images' points that are not explained, from 0 to 1;
                      empty for takes too short for dense tracking
     torso            how the torso moves; None where that cannot be told
+    focal_px, focal  focal length of a single camera without a calibration, else None; and `Footage.focal`
     """
 
     reprojection_px: Mapping[str, Mapping[int, float]]
@@ -84,6 +86,8 @@ class TrackingReport:
     warnings: tuple[str, ...]
     image_misfit: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     torso: TorsoMotion | None = None
+    focal_px: float | None = None
+    focal: str = "calibration"
 
     @property
     def median_px(self) -> float:
@@ -134,10 +138,13 @@ def track(
     if np.ptp(neutral[reliable], axis=0).max() < MIN_FACE_M:
         raise StgaError(f"{places_file}: face: its landmarks lie in one point of the head model; expected a face")
     detected, found = found, _reliable(found, reliable)
-    everything = {timestep: _at(footage, found, timestep, len(places)) for timestep in footage.timesteps}
-    take = {timestep: own for timestep, own in everything.items() if determines_pose(own, reliable, neutral)}
+    take = _take(footage, found, reliable, neutral)
     if not take:
         raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
+    if footage.focal == "usual":
+        report("Focal length", 0, 1)
+        footage = _with_focal(footage, solved_focal(head, places, reliable, take))
+        take = _take(footage, found, reliable, neutral)
     keep = world == "keep" or (world == "auto" and footage.keeps_world)
     metric = keep and is_metric(head, places, reliable, take)
     fit = fit_head(head, places, reliable, take, report, metric)
@@ -168,6 +175,8 @@ def track(
         + matte_warnings,
         misfits,
         torso.motion,
+        None if footage.focal == "calibration" else footage.cameras[0].camera.fl_x,
+        footage.focal,
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
@@ -292,6 +301,23 @@ def _row(camera: CameraLandmarks, timestep: int) -> int | None:
     return int(rows[0])
 
 
+def _take(
+    footage: Footage, found: Mapping[str, CameraLandmarks], reliable: np.ndarray, neutral: np.ndarray
+) -> dict[int, TimestepLandmarks]:
+    """The timesteps that the head is fitted to; neutral (N, 3): the landmarks on the neutral head."""
+    everything = {timestep: _at(footage, found, timestep, len(neutral)) for timestep in footage.timesteps}
+    return {timestep: own for timestep, own in everything.items() if determines_pose(own, reliable, neutral)}
+
+
+def _with_focal(footage: Footage, pixels: float | None) -> Footage:
+    """Footage of one camera with a solved focal length; as it is where there is none."""
+    if pixels is None:
+        return footage
+    (camera,) = footage.cameras
+    moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
+    return replace(footage, cameras=(moved,), focal="solved")
+
+
 def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, count: int) -> TimestepLandmarks:
     cameras = {camera.name: camera.camera for camera in footage.cameras}
     rows = {name: row for name, own in found.items() if (row := _row(own, timestep)) is not None}
@@ -362,8 +388,8 @@ def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadF
             f"the cameras' world is kept but for its scale: in meters, the head would be more than "
             f"{MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by {fit.to_capture.scale:.4g}"
         )
-    if not footage.calibrated:
-        warnings.append("the focal length is a guess; give it if it is known")
+    if footage.focal == "usual":
+        warnings.append("the focal length is a guess, as the head turns too little to tell; give it if it is known")
     return tuple(warnings)
 
 
@@ -375,6 +401,8 @@ def _as_json(result: TrackingReport) -> dict[str, Any]:
         "warnings": list(result.warnings),
         "reprojection_px": _rounded(result.reprojection_px),
         "image_misfit": _rounded(result.image_misfit),
+        "focal_length_px": None if result.focal_px is None else round(result.focal_px, 1),
+        "focal_length_from": result.focal,
         TORSO_KEY: None if result.torso is None else to_json(result.torso),
     }
 
