@@ -37,8 +37,9 @@ from .fit import (
     is_metric,
 )
 from .focal_length import solved_focal
-from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
+from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, image_name, is_written
 from .footage.model import Footage, FootageCamera
+from .footage.stored import StoredFrames, with_stored
 from .head_model import HeadModel, read_head_model
 from .landmarks import (
     CameraLandmarks,
@@ -108,10 +109,10 @@ def track(
 
     landmarks: folder of landmark files in place of the networks'.
     mattes: whether they are made for frames without a mask (`with_mattes`).
-    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks: called again after an interruption, those
-    cameras and frames are not worked on again. world: "head": meters as the head's size says, y up, the head near the
-    origin; "keep": that of the cameras, which is scaled about its origin where it is not in meters; "auto": as the
-    calibration says, else "head".
+    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks, frames of videos in OUT/images: called again
+    after an interruption, those cameras and frames are not worked on again. world: "head": meters as the head's size
+    says, y up, the head near the origin; "keep": that of the cameras, which is scaled about its origin where it is not
+    in meters; "auto": as the calibration says, else "head".
     Raises StgaError.
     """
     if is_written(out):
@@ -119,15 +120,20 @@ def track(
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
     head = read_head_model(head_file)
+    footage, source = _stored(footage, out), _source(footage, head_file, landmarks)
     if landmarks is not None:
         found = read_landmarks(footage, landmarks)
         places_file = landmarks / PLACES_FILE
         places, reliable = read_places(places_file, len(head.model.faces))
+        _begin(out, source)
+        for timestep, camera in footage.views():
+            if isinstance(camera.frames, StoredFrames):
+                camera.image(timestep)  # in order, before helping processes ask for some
     else:
         detector = FaceNetworks()
         report("Head model", 0, 1)
         places, reliable = calibrate(head.model, detector, str(head_file))
-        _begin(out, _source(footage, head_file))
+        _begin(out, source)
         places_file = out / LANDMARKS_FOLDER / PLACES_FILE
         write_places(places_file, places, reliable)
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
@@ -163,7 +169,7 @@ def track(
             return silhouette(posed_mesh(fit, parameters[timestep]), fit.head.model.faces, cameras[camera.name])
 
         plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
-        source = {**_source(footage, head_file, landmarks), "plates": [list(map(str, plates)), _state(plates)]}
+        source = {**source, "plates": [list(map(str, plates)), _state(plates)]}
         footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
     torso = follow_torso(fit, parameters, footage, report)
     result = TrackingReport(
@@ -267,6 +273,15 @@ def _begin(out: Path, source: dict[str, Any]) -> None:
     if path.exists() and read_json(path) != source:
         raise StgaError(f"{out}: holds landmarks of other footage; give another --out, or delete it")
     write_json(path, source)
+
+
+def _stored(footage: Footage, out: Path) -> Footage:
+    """The footage whose videos are decoded once: their frames are kept as the capture's images."""
+    images = {
+        camera.name: {t: out / image_name(t, number) for t in camera.timesteps}
+        for number, camera in enumerate(footage.cameras)
+    }
+    return with_stored(footage, images)
 
 
 def _recording(camera: FootageCamera) -> list[Any]:

@@ -7,12 +7,16 @@ import pytest
 from PIL import Image
 
 from stga_addon.capture.camera import camera_from_gl
-from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.development.demo.head import synthetic_flame, write_flame
+from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking.fit import TimestepLandmarks
 from stga_addon.tracking.focal_length import solved_focal
 from stga_addon.tracking.footage.open import open_footage, usual_focal
+from stga_addon.tracking.footage.video import VideoFrames
 from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.landmarks import write_places
+from stga_addon.tracking.track import track
 
 from .scenes import write_image, write_video
 from .test_fit import places_on
@@ -119,26 +123,25 @@ def test_damaged_metadata(tmp_path):
     assert open_footage(tmp_path / "photo").focal == "usual"
 
 
-def turning(head, focal, turn_deg, noise_px=1.0):
-    """Places, and landmarks of a head that turns that far to either side 0.6 m before a camera of 1080 x 1920 pixels.
+def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
+    """Places, and landmarks of a head that turns that far to either side 0.6 m before a camera.
 
     Each landmark lies 2 mm beside its place on the model, in all frames alike, as a detector's do.
     """
     rng = np.random.default_rng(3)
     places, shape = places_on(head, 300), rng.normal(0, 0.7, head.model.n_identity)
     own = rng.normal(0, 0.002, (300, 3))
-    camera = camera_from_gl(np.eye(4), 1080, 1920, focal, focal, 540, 960)
-    usual = usual_focal(1080, 1920)
-    guessed = camera_from_gl(np.eye(4), 1080, 1920, usual, usual, 540, 960)
+    usual, (width, height) = usual_focal(*size), size
+    camera, guessed = (camera_from_gl(np.eye(4), *size, f, f, width / 2, height / 2) for f in (focal, usual))
     take = {}
-    for timestep, share in enumerate(np.sin(np.linspace(0, 7, 30))):
+    for timestep, share in enumerate(np.sin(np.linspace(0, 7, count))):
         angle, expression = np.radians(turn_deg) * share, np.zeros(head.model.n_expression)
         expression[timestep % 3] = 0.5
         zero, pose = np.zeros(3), np.array([0.1 * share**2, angle, 0.0])
         frame = FlameFrame(expression, pose, zero, zero, np.array([0.02 * share, 0.0, -0.6]), np.zeros(6))
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         points = places.on(flame_forward(head.model, shape, frame), head.model.faces) + own @ turn.T
-        pixels = camera.project(points)[0] + rng.normal(0, noise_px, (300, 2))
+        pixels = camera.project(points)[0] + rng.normal(0, width / 1080, (300, 2))
         take[timestep] = TimestepLandmarks((guessed,), pixels[None], np.ones((1, 300)))
     return places, take
 
@@ -158,3 +161,30 @@ def test_a_head_that_does_not_turn_tells_no_focal_length():
     head = HeadModel(synthetic_flame(0), "flame")
     places, take = turning(head, 1.6 * usual_focal(1080, 1920), 7)
     assert solved_focal(head, places, np.ones(300, bool), take) is None
+
+
+def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, monkeypatch):
+    """Catches a video that is decoded for each stage, backwards or by seeking, and a solved focal length that the
+    capture does not have."""
+    pytest.importorskip("av")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # no helping processes, whose decoders would not be seen
+    size, count, head = (108, 192), 8, HeadModel(synthetic_flame(0), "flame")
+    places, take = turning(head, 1.6 * usual_focal(*size), 30, size, count)
+    write_video(tmp_path / "phone.mp4", range(60, 60 + 10 * count, 10), size=size, gop=count)
+    write_flame(head.model, tmp_path / "head.npz")
+    write_places(tmp_path / "points/head_model.npz", places, np.ones(300, bool))
+    points = np.concatenate([take[t].points for t in range(count)])
+    write_npz(tmp_path / "points/phone.npz", {"timesteps": np.arange(count), "points": points})
+    decoded, decode = [], VideoFrames._frame
+    monkeypatch.setattr(VideoFrames, "_frame", lambda self, number: decoded.append(number) or decode(self, number))
+    footage = open_footage(tmp_path / "phone.mp4")
+    found = track(footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points", mattes=False)
+    assert decoded == list(range(count))
+    assert found.focal == "solved"
+    assert found.focal_px == pytest.approx(1.6 * usual_focal(*size), rel=0.1)
+    report = read_json(tmp_path / "out/tracking.json")
+    assert (report["focal_length_px"], report["focal_length_from"]) == (round(found.focal_px, 1), "solved")
+    frame = read_json(tmp_path / "out/transforms_train.json")["frames"][5]
+    assert frame["fl_x"] == pytest.approx(found.focal_px)
+    written = np.asarray(Image.open(tmp_path / "out" / frame["file_path"]))
+    np.testing.assert_array_equal(written, footage.cameras[0].image(5))
