@@ -27,7 +27,9 @@ class TrackOptions:
     )
     directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
     focal: bpy.props.FloatProperty(
-        name="Focal Length", description="In pixels, of a single camera without calibration; 0: a guess", min=0.0
+        name="Focal Length",
+        description="In pixels, of a single camera without calibration; 0: as its file says, or from the head's turns",
+        min=0.0,
     )
     start: bpy.props.IntProperty(name="Start", description="First frame of the footage, counted from 0", min=0)
     stop: bpy.props.IntProperty(name="Stop", description="Frame to stop before; 0: all", min=0)

@@ -28,6 +28,10 @@ class View:
     mask: Path | None = None
 
 
+ViewExposure = Callable[[View], np.ndarray | None]
+"""View -> gain and offset (2, 3), in levels, of red, green and blue in its image; None where they are not known."""
+
+
 @dataclass(frozen=True)
 class Capture:
     """A multi-view recording with a tracked mesh of constant topology per timestep.

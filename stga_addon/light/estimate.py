@@ -1,13 +1,12 @@
 """The light of a capture, from its images and meshes."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..avatar.light import AvatarLight
 from ..capture.mesh_geometry import connected_parts
-from ..capture.model import Capture
+from ..capture.model import Capture, ViewExposure
 from ..errors import StgaError
 from ..progress import Report, ignore
 from .bounce import Bounce
@@ -52,13 +51,13 @@ class Known:
     card       (K, 3) linear colors of a gray card of 18 % at the face that faces `toward`, or of a gray ball where that
                is its normal; None: the level is unknown
     toward     (K, 3) unit vectors
-    exposure   camera's index -> gain and offset (2, 3), in levels, of its images; none of other cameras
+    exposure   gain and offset of images
     """
 
     radiance: np.ndarray | None = None
     card: np.ndarray | None = None
     toward: np.ndarray | None = None
-    exposure: Mapping[int, np.ndarray] = field(default_factory=dict)
+    exposure: ViewExposure = lambda view: None
 
 
 def estimate_light(capture: Capture, known: Known = Known(), report: Report = ignore) -> AvatarLight:

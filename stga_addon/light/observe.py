@@ -1,13 +1,12 @@
 """Colors of a capture's triangles: what the light of a recording is estimated from."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..capture.color import srgb_to_linear
 from ..capture.images import read_view
-from ..capture.model import Capture, View, evenly_spread
+from ..capture.model import Capture, View, ViewExposure, evenly_spread
 from ..progress import Progress, Report, ignore
 from .shadows import ShadowMap
 from .values import Light
@@ -44,7 +43,7 @@ def views_by_time(capture: Capture) -> dict[int, list[View]]:
     return {time: evenly_spread(found[time], MAX_CAMERAS) for time in evenly_spread(sorted(found), MAX_TIMESTEPS)}
 
 
-def observe(capture: Capture, exposure: Mapping[int, np.ndarray], report: Report = ignore) -> Observed:
+def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -> Observed:
     """Mean color of each triangle in the darker half of the cameras that face it, which have the fewest highlights.
 
     T are those of `views_by_time`, in its order; reads all their images. exposure: as in `estimate.Known`.
@@ -54,7 +53,7 @@ def observe(capture: Capture, exposure: Mapping[int, np.ndarray], report: Report
     for n, (time, views) in enumerate(by_time.items()):
         report(Progress(n / max(len(by_time), 1), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
-        seen = np.stack([_view_colors(capture, mesh, view, exposure.get(view.camera_index)) for view in views])
+        seen = np.stack([_view_colors(capture, mesh, view, exposure(view)) for view in views])
         colors.append(_darker_half(seen))
         cameras.append(np.isfinite(seen[..., 0]).sum(0))
     return Observed(np.stack(colors), np.stack(cameras))

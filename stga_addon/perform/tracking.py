@@ -15,7 +15,8 @@ STAGES = {
     "Opening the footage": (0.0, 0.0),
     "Head model": (0.0, 0.05),
     "Landmarks": (0.05, 0.6),
-    "Fit": (0.6, 0.65),
+    "Focal length": (0.6, 0.61),
+    "Fit": (0.61, 0.65),
     "Dense tracking": (0.65, 0.72),
     "Surface": (0.72, 0.79),
     "Refinement": (0.79, 0.85),
@@ -26,6 +27,13 @@ STAGES = {
     "Heads": (0.97, 1.0),
 }
 """Stage of `tracking.track` -> the share of the progress that it begins and ends with."""
+FOCAL_SOURCES = {
+    "given": "as given",
+    "file": "as the file says",
+    "solved": "solved from the turns of the head",
+    "usual": "a guess, that of a phone",
+}
+"""What a person reads of where a focal length is from (`Footage.focal`)."""
 
 
 def perform_tracking(request: Track, report: Report, say: Say) -> Written:
@@ -45,6 +53,7 @@ def perform_tracking(request: Track, report: Report, say: Say) -> Written:
     lines = [
         *(f"warning: {warning}" for warning in found.warnings),
         f"reprojection error: {found.median_px:.2f} px (median); by camera and timestep in tracking.json",
+        *([] if found.focal_px is None else [f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}"]),
         *([] if found.torso is None else [f"torso: {found.torso.description}"]),
         f"capture: {request.out}",
     ]

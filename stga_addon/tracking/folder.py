@@ -14,6 +14,11 @@ REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER, PLACES_FILE, MATTES_FILE = (
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 
 
+def image_name(timestep: int, camera: int, suffix: str = ".png") -> str:
+    """Path of a view's image below the capture; camera: its number."""
+    return f"images/{timestep:05d}_{camera:02d}{suffix}"
+
+
 def mask_name(timestep: int, camera: int) -> str:
     """Path of a view's mask below the capture; camera: its number."""
     return f"fg_masks/{timestep:05d}_{camera:02d}.png"

@@ -39,8 +39,10 @@ from .fit import (
     is_face,
     is_metric,
 )
-from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, is_written
+from .focal_length import solved_focal
+from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, image_name, is_written
 from .footage.model import Footage, FootageCamera
+from .footage.stored import StoredFrames, with_stored
 from .head_model import HeadModel, read_head_model
 from .landmarks import (
     CameraLandmarks,
@@ -79,6 +81,7 @@ class TrackingReport:
     image_misfit     region of the face -> timestep -> share of the images' points that are not explained, from 0 to 1;
                      empty for takes too short for dense tracking
     torso            how the torso moves; None where that cannot be told
+    focal_px, focal  focal length of a single camera without a calibration, else None; and `Footage.focal`
     """
 
     reprojection_px: Mapping[str, Mapping[int, float]]
@@ -87,6 +90,8 @@ class TrackingReport:
     warnings: tuple[str, ...]
     image_misfit: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     torso: TorsoMotion | None = None
+    focal_px: float | None = None
+    focal: str = "calibration"
 
     @property
     def median_px(self) -> float:
@@ -108,10 +113,10 @@ def track(
     head_file: a head model; None: the bundled one, which is copied into the capture.
     landmarks: folder of landmark files in place of the networks'.
     mattes: whether they are made for frames without a mask (`with_mattes`).
-    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks: called again after an interruption, those
-    cameras and frames are not worked on again. world: "head": meters as the head's size says, y up, the head near the
-    origin; "keep": that of the cameras, which is scaled about its origin where it is not in meters; "auto": as the
-    calibration says, else "head".
+    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks, frames of videos in OUT/images: called again
+    after an interruption, those cameras and frames are not worked on again. world: "head": meters as the head's size
+    says, y up, the head near the origin; "keep": that of the cameras, which is scaled about its origin where it is not
+    in meters; "auto": as the calibration says, else "head".
     Raises StgaError.
     """
     if is_written(out):
@@ -119,15 +124,20 @@ def track(
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
     head = read_head_model(head_file)
+    footage, source = _stored(footage, out), _source(footage, head_file, landmarks)
     if landmarks is not None:
         found = read_landmarks(footage, landmarks)
         places_file = landmarks / PLACES_FILE
         places, reliable = read_places(places_file, len(head.model.faces))
+        _begin(out, source)
+        for timestep, camera in footage.views():
+            if isinstance(camera.frames, StoredFrames):
+                camera.image(timestep)  # in order, before helping processes ask for some
     else:
         detector = FaceNetworks()
         report("Head model", 0, 1)
         places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
-        _begin(out, _source(footage, head_file))
+        _begin(out, source)
         places_file = out / LANDMARKS_FOLDER / PLACES_FILE
         write_places(places_file, places, reliable)
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
@@ -138,10 +148,13 @@ def track(
     if np.ptp(neutral[reliable], axis=0).max() < MIN_FACE_M:
         raise StgaError(f"{places_file}: face: its landmarks lie in one point of the head model; expected a face")
     detected, found = found, _reliable(found, reliable)
-    everything = {timestep: _at(footage, found, timestep, len(places)) for timestep in footage.timesteps}
-    take = {timestep: own for timestep, own in everything.items() if determines_pose(own, reliable, neutral)}
+    take = _take(footage, found, reliable, neutral)
     if not take:
         raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
+    if footage.focal == "usual":
+        report("Focal length", 0, 1)
+        footage = _with_focal(footage, solved_focal(head, places, reliable, take))
+        take = _take(footage, found, reliable, neutral)
     keep = world == "keep" or (world == "auto" and footage.keeps_world)
     metric = keep and is_metric(head, places, reliable, take)
     fit = fit_head(head, places, reliable, take, report, metric)
@@ -160,7 +173,7 @@ def track(
             return silhouette(posed_mesh(fit, parameters[timestep]), fit.head.model.faces, cameras[camera.name])
 
         plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
-        source = {**_source(footage, head_file, landmarks), "plates": [list(map(str, plates)), _state(plates)]}
+        source = {**source, "plates": [list(map(str, plates)), _state(plates)]}
         footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
     torso = follow_torso(fit, parameters, footage, report)
     result = TrackingReport(
@@ -172,6 +185,8 @@ def track(
         + matte_warnings,
         misfits,
         torso.motion,
+        None if footage.focal == "calibration" else footage.cameras[0].camera.fl_x,
+        footage.focal,
     )
     write_json(out / REPORT_FILE, _as_json(result))
     report("Contact sheet", 0, 1)
@@ -267,6 +282,15 @@ def _begin(out: Path, source: dict[str, Any]) -> None:
     write_json(path, source)
 
 
+def _stored(footage: Footage, out: Path) -> Footage:
+    """The footage whose videos are decoded once: their frames are kept as the capture's images."""
+    images = {
+        camera.name: {t: out / image_name(t, number) for t in camera.timesteps}
+        for number, camera in enumerate(footage.cameras)
+    }
+    return with_stored(footage, images)
+
+
 def _recording(camera: FootageCamera) -> list[Any]:
     """The first frame, the state of all files, and how frames are undistorted; it changes with offset and lens."""
     pinhole = camera.camera
@@ -297,6 +321,23 @@ def _row(camera: CameraLandmarks, timestep: int) -> int | None:
     if not len(rows) or not is_face(camera.points[rows[0]][camera.confidence[rows[0]] > 0]):
         return None
     return int(rows[0])
+
+
+def _take(
+    footage: Footage, found: Mapping[str, CameraLandmarks], reliable: np.ndarray, neutral: np.ndarray
+) -> dict[int, TimestepLandmarks]:
+    """The timesteps that the head is fitted to; neutral (N, 3): the landmarks on the neutral head."""
+    everything = {timestep: _at(footage, found, timestep, len(neutral)) for timestep in footage.timesteps}
+    return {timestep: own for timestep, own in everything.items() if determines_pose(own, reliable, neutral)}
+
+
+def _with_focal(footage: Footage, pixels: float | None) -> Footage:
+    """Footage of one camera with a solved focal length; as it is where there is none."""
+    if pixels is None:
+        return footage
+    (camera,) = footage.cameras
+    moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
+    return replace(footage, cameras=(moved,), focal="solved")
 
 
 def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, count: int) -> TimestepLandmarks:
@@ -369,8 +410,8 @@ def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadF
             f"the cameras' world is kept but for its scale: in meters, the head would be more than "
             f"{MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by {fit.to_capture.scale:.4g}"
         )
-    if not footage.calibrated:
-        warnings.append("the focal length is a guess; give it if it is known")
+    if footage.focal == "usual":
+        warnings.append("the focal length is a guess, as the head turns too little to tell; give it if it is known")
     return tuple(warnings)
 
 
@@ -382,6 +423,8 @@ def _as_json(result: TrackingReport) -> dict[str, Any]:
         "warnings": list(result.warnings),
         "reprojection_px": _rounded(result.reprojection_px),
         "image_misfit": _rounded(result.image_misfit),
+        "focal_length_px": None if result.focal_px is None else round(result.focal_px, 1),
+        "focal_length_from": result.focal,
         TORSO_KEY: None if result.torso is None else to_json(result.torso),
     }
 

@@ -15,7 +15,7 @@ from ..files import replacing, write_json, write_npz
 from ..flame.forward import flame_forward, frame_of
 from ..flame.sequence import FRAME_FIELDS
 from .fit import HeadFit
-from .folder import SPLIT_FILES, mask_name
+from .folder import SPLIT_FILES, image_name, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 
@@ -75,12 +75,13 @@ def _middle_camera(footage: Footage) -> str:
 def _entry(out: Path, timestep: int, source: FootageCamera, number: int, camera: Camera) -> dict[str, Any]:
     """Copy image and mask; the entry of the transforms."""
     file = source.file(timestep)
-    name = f"images/{timestep:05d}_{number:02d}" + (".png" if file is None else file.suffix.lower())
-    with replacing(out / name) as partial:
-        if file is None:
-            Image.fromarray(source.image(timestep)).save(partial, format="PNG")
-        else:
-            shutil.copyfile(file, partial)
+    name = image_name(timestep, number, ".png" if file is None else file.suffix.lower())
+    if file != out / name:  # which a frame of a video is already
+        with replacing(out / name) as partial:
+            if file is None:
+                Image.fromarray(source.image(timestep)).save(partial, format="PNG")
+            else:
+                shutil.copyfile(file, partial)
     entry: dict[str, Any] = {
         "timestep_index": timestep,
         "camera_index": number,

@@ -24,8 +24,8 @@ MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
 MAX_RATE = 1e3
 MAX_GROWTH = 100
-EXPOSURE_SIZE = 7
-"""Numbers of a row of `TrainingSettings.exposure`."""
+EXPOSURE_SIZES = 7, 8
+"""Numbers of a row of `TrainingSettings.exposure`: of a whole recording, and of a timestep of one that drifts."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class TrainingSettings:
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     torso          hull points below the neck follow FLAME's root joint, not the head's nearest triangle
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
-                   images, which are corrected when they are read
+                   images, which are corrected when they are read; where it drifts, several rows with their timestep
     tracking       refine FLAME's expression, joints and translation of each training timestep (`tracking`)
     effects        effect -> "on" or "off" where the user has decided; the others are decided from the capture
                    (`effects.plan`). None: these settings are final
@@ -181,8 +181,8 @@ class TrainingSettings:
         if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")
         for row in self.exposure:
-            if len(row) != EXPOSURE_SIZE or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
-                expected = "rows of a camera index, three gains above 0, three offsets"
+            if len(row) not in EXPOSURE_SIZES or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
+                expected = "rows of a camera index, three gains above 0, three offsets, and a timestep where they drift"
                 raise StgaError(complaint("exposure", expected, row))
         if not set(self.driven_offsets) <= set(OFFSETS):
             raise StgaError(complaint("driven_offsets", f"names among {', '.join(OFFSETS)}", self.driven_offsets))

@@ -208,10 +208,11 @@ def test_one_video_without_calibration(tmp_path):
     write_video(tmp_path / "phone.mp4", [60, 90, 120], size=(64, 48), rate=30)
     for path in (tmp_path, tmp_path / "phone.mp4"):
         footage = open_footage(path)
-        assert (footage.calibrated, footage.fps, footage.timesteps) == (False, 30, (0, 1, 2))
+        assert (footage.focal, footage.fps, footage.timesteps) == ("usual", 30, (0, 1, 2))
+        assert footage.cameras[0].camera.fl_x == pytest.approx(40 / np.tan(np.radians(32.5)))
         assert [camera.name for camera in footage.cameras] == ["phone"]
     known = open_footage(tmp_path, focal=55.0)
-    assert known.calibrated
+    assert known.focal == "given"
     assert (known.cameras[0].camera.fl_x, known.cameras[0].camera.cx) == (55.0, 32.0)
 
 
@@ -231,7 +232,7 @@ def test_folders_named_as_calibrations(tmp_path):
     write_image(tmp_path / "a/1.png", 90)
     (tmp_path / "old.xml").mkdir()
     (tmp_path / "old.csv").mkdir()
-    assert not open_footage(tmp_path).calibrated
+    assert open_footage(tmp_path).focal == "usual"
 
 
 def test_distorted_frames_are_undistorted(tmp_path):

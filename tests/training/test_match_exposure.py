@@ -58,7 +58,7 @@ def test_evaluation_reports_both(tmp_path: Path) -> None:
     view = View(0, 0, Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4)), "0.png", tmp_path / "0.png")
     views = [EvaluationView(view, (255 * target).round().astype(np.uint8), {"mask": head}, head)]
     plain = evaluate(lambda view: image, views)
-    matched = evaluate(lambda view: image, views, exposure={})
+    matched = evaluate(lambda view: image, views, exposure=known_exposure((), ()))
     assert plain.psnr_unmatched is None
     assert matched.psnr_unmatched == pytest.approx(plain.psnr)
     assert matched.psnr > plain.psnr + 20

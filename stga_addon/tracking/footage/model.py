@@ -100,7 +100,8 @@ class Footage:
     timesteps   all that any camera has a frame of, ascending
     fps         frames per second of the videos, the average where it varies; None where not known, as for most images.
                 Timesteps are numbers of frames
-    calibrated  False for one camera whose focal length is a guess, not read from a file or given
+    focal       where focal lengths are from: "calibration"; of a single camera without one, "given" (in the request),
+                "file" (its EXIF or QuickTime's tags), "usual" (a phone's) or "solved" (by tracking)
     keeps_world  whether the calibration says that the capture is to keep its world
     warnings    one sentence each
     """
@@ -109,7 +110,7 @@ class Footage:
     cameras: tuple[FootageCamera, ...]
     timesteps: tuple[int, ...]
     fps: float | None = None
-    calibrated: bool = True
+    focal: str = "calibration"
     keeps_world: bool = False
     warnings: tuple[str, ...] = ()
 

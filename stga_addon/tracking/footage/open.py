@@ -1,5 +1,6 @@
 """Opening footage: a calibration and the frames of its cameras."""
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -16,6 +17,7 @@ from . import video
 from .calibrations import EXPECTED, find_calibration, read_calibration
 from .clocks import clock_offsets
 from .file_types import is_video
+from .focal_tags import photo_focal, video_focal
 from .given_masks import with_masks
 from .image_frames import ImageFrames
 from .lens import Lens
@@ -34,8 +36,8 @@ from .sources import Sources, find_sources, sequence_files, sequence_names, stil
 from .undistort import undistortion
 
 ALL_FRAMES = FrameRange()
-GUESSED_FOCAL_SHARE = 1.2
-"""Focal length of an unknown camera, as a share of the image's longer side: that of a phone's, or a 43 mm lens."""
+USUAL_VIEW_DEG = 65.0
+"""Angle of view of an unknown camera over the image's diagonal: that of a phone."""
 
 
 def open_footage(
@@ -49,7 +51,8 @@ def open_footage(
 
     path     folder with an image, a folder of images or a video for each camera; or one video
     cameras  calibration file or folder; None: the one in `path` (`find_calibration`)
-    focal    focal length in pixels of a single camera without a calibration; None: a guess, and not `calibrated`
+    focal    focal length in pixels of a single camera without a calibration; None: what its file says, else
+             `usual_focal`
     mattes   folder of masks that stand in for the footage's own, named as its images; those of a video's frames by
              camera and number, counted from 0, as in left/00012.png
     Cameras with a folder or video show sequences; where all have one image, it shows one timestep.
@@ -154,13 +157,27 @@ def _single_camera(root: Path, sources: Sources, frames: FrameRange, focal: floa
         raise StgaError(f"{root}: has {found} and no calibration; expected {EXPECTED}, or one camera")
     sequence: Sequence = open_sequence(sequence_files(sources, names[0]))
     width, height = sequence_size(sequence)
-    pixels = focal if focal is not None else GUESSED_FOCAL_SHARE * max(width, height)
+    pixels, known = (focal, "given") if focal is not None else _stated_focal(sequence, width, height)
     if pixels < 1:
         raise StgaError(f"Focal length: expected at least 1 pixel, not {pixels:g}")
     camera = camera_from_gl(np.eye(4), width, height, pixels, pixels, width / 2, height / 2)
     name = names[0] or root.name
     shot = Shot(name, camera, Lens(), str(root))
-    return replace(_rig(root, sources, {name: sequence}, {name: shot}, frames), calibrated=focal is not None)
+    return replace(_rig(root, sources, {name: sequence}, {name: shot}, frames), focal=known)
+
+
+def _stated_focal(sequence: Sequence, width: int, height: int) -> tuple[float, str]:
+    """Pixels of the recording, and where they are from (`Footage.focal`)."""
+    if isinstance(sequence, video.Video):
+        stated = video_focal(sequence.path, width, height)
+    else:
+        stated = photo_focal(sequence[0], width, height)
+    return (usual_focal(width, height), "usual") if stated is None else (stated, "file")
+
+
+def usual_focal(width: int, height: int) -> float:
+    """Focal length in pixels of a phone's images of that size."""
+    return math.hypot(width, height) / 2 / math.tan(math.radians(USUAL_VIEW_DEG / 2))
 
 
 # Images that the calibration lists

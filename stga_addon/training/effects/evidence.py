@@ -16,6 +16,8 @@ CAMERA_PRIOR_SAMPLES = 5.0
 """Weight, in samples, of the prior that a camera is like the others."""
 TYPICAL_LEVEL = 100.0
 """Of a color, in levels of 255; scales the prior of a gain."""
+MIN_EXPOSURE_LEVELS = 1.5
+"""Gain in levels of 255 from which differences between cameras, or in time, are corrected."""
 OFFSET_PENALTY = 0.05
 """Favors gains over offsets: cameras differ in exposure and white balance more than in their black level, and where
 all colors are alike, nothing else separates the two."""
@@ -114,6 +116,34 @@ def stable_colors(color: np.ndarray) -> np.ndarray:
     judged = count >= MIN_SAMPLES_PER_TRIANGLE
     limit = np.median(scatter[judged]) if judged.any() else -1.0
     return np.where((judged & (scatter <= limit))[:, None], color, np.nan)
+
+
+def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
+    """Gains (S, 3) of the views against their camera's mean, from color (S, K, 3), NaN where not seen."""
+    known, gain = ~np.isnan(color), np.ones((len(color), 3))
+    prior = CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2
+    _, row = np.unique(samples.camera, return_inverse=True)
+    for _ in range(CAMERA_FIT_ITERATIONS):
+        mean = np.where(known, _mean(color / gain[:, None]), 0)
+        gain = (np.where(known, color * mean, 0).sum(1) + prior) / ((mean**2).sum(1) + prior)
+        usual = np.stack([gain[row == camera].mean(0) for camera in range(row.max() + 1)])
+        gain /= usual[row]
+    return gain
+
+
+def drift_evidence(samples: Samples, color: np.ndarray) -> Evidence:
+    """Whether gains fitted to one half of the triangles, at the timesteps before and after, make the images of the
+    other half agree: takes in no order, and expressions, do not drift."""
+    half = np.arange(len(samples.faces)) % 2 == 0
+    gain = fit_drift(samples, np.where(half[:, None], color, np.nan))
+    predicted = np.ones_like(gain)
+    for row, (camera, timestep) in enumerate(zip(samples.camera, samples.timestep, strict=True)):
+        others = np.flatnonzero((samples.camera == camera) & (samples.timestep != timestep))
+        others = others[np.argsort(samples.timestep[others])]
+        if len(others):
+            predicted[row] = [np.interp(timestep, samples.timestep[others], column) for column in gain[others].T]
+    other = color[:, ~half]
+    return compare(_scatter(other), _scatter(other / predicted[:, None]))
 
 
 def _scatter(color: np.ndarray) -> np.ndarray:

@@ -15,12 +15,15 @@ from ...flame.teeth import lip_pairs
 from ...selection import select_capture
 from ..settings import TrainingSettings
 from .evidence import (
+    MIN_EXPOSURE_LEVELS,
     CameraColors,
     Evidence,
     Fold,
     camera_evidence,
     consecutive_folds,
+    drift_evidence,
     fit_cameras,
+    fit_drift,
     linear_evidence,
     scattered_folds,
     stable_colors,
@@ -68,8 +71,18 @@ class CaptureFacts:
 
     @cached_property
     def matched_colors(self) -> np.ndarray:
-        """(S, K, 3) sampled colors without the differences between cameras."""
-        return self.camera_colors.undo(self.samples.color.astype(np.float64), self.samples.camera)
+        """(S, K, 3) sampled colors without the differences between cameras, and in time."""
+        colors = self.camera_colors.undo(self.samples.color.astype(np.float64), self.samples.camera)
+        return colors / self.drift[:, None] if self.drifts.gain >= MIN_EXPOSURE_LEVELS else colors
+
+    @cached_property
+    def drift(self) -> np.ndarray:
+        """(S, 3) gains of the sampled views against their camera's mean."""
+        return fit_drift(self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera))
+
+    @cached_property
+    def drifts(self) -> Evidence:
+        return drift_evidence(self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera))
 
     @cached_property
     def camera_difference(self) -> Evidence:

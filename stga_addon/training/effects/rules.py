@@ -9,15 +9,13 @@ import numpy as np
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG
 from ...tracking.folder import is_tracked
 from ...tracking.torso_motion import read_torso_motion
-from .evidence import Evidence
+from .evidence import MIN_EXPOSURE_LEVELS, Evidence
 from .facts import CaptureFacts
 
 MIN_CAMERAS_FOR_VIEW_COLOR = 4
 """With fewer, view-dependent color is not constrained between the cameras."""
 MIN_VIEW_DEPENDENCE_LEVELS = 1.0
 """Gain in levels of 255 from which color depends on the direction of view."""
-MIN_CAMERA_DIFFERENCE_LEVELS = 1.5
-"""Gain in levels of 255 from which differences between cameras are corrected."""
 MIN_STRAIN_DEPENDENCE_LEVELS = 1.0
 """Gain in levels of 255, in frames and in cameras that are left out, from which splats follow deformation."""
 MIN_TIMESTEPS_FOR_STRAIN = 4
@@ -77,15 +75,23 @@ def view_color(facts: CaptureFacts) -> Verdict:
 
 
 def exposure(facts: CaptureFacts) -> Verdict:
-    if facts.cameras == 1:
-        return Verdict(False, "a single camera has no other to differ from", fixed=True)
-    found, colors = facts.camera_difference, facts.camera_colors
-    rows = tuple(
-        (float(camera), *gain, *offset)
-        for camera, gain, offset in zip(colors.camera, colors.gain.tolist(), colors.offset.tolist(), strict=True)
-    )
-    reason = f"{facts.cameras} cameras show the same colors {found.gain:.1f} of 255 levels apart"
-    return Verdict(found.gain >= MIN_CAMERA_DIFFERENCE_LEVELS, reason, changes={"exposure": rows})
+    if facts.cameras == 1 and facts.timesteps == 1:
+        return Verdict(False, "a single image has no other to differ from", fixed=True)
+    colors, samples = facts.camera_colors, facts.samples
+    exposures = zip(colors.camera.tolist(), colors.gain, colors.offset, strict=True)
+    rows = tuple((float(camera), *gain.tolist(), *offset.tolist()) for camera, gain, offset in exposures)
+    found = facts.camera_difference.gain
+    reason = f"{facts.cameras} cameras show the same colors {found:.1f} of 255 levels apart"
+    if facts.drifts.gain >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
+        own = {row[0]: np.array(row[1:7]) for row in rows}
+        drifting = zip(samples.camera.tolist(), facts.drift, samples.timestep.tolist(), strict=True)
+        rows = tuple(
+            (float(camera), *(own[camera] * [*gain, 1, 1, 1]).tolist(), float(timestep))
+            for camera, gain, timestep in drifting
+        )
+        found = max(found, facts.drifts.gain)
+        reason = f"a camera shows the same colors {facts.drifts.gain:.1f} of 255 levels apart over time"
+    return Verdict(found >= MIN_EXPOSURE_LEVELS, reason, changes={"exposure": rows})
 
 
 def antialiasing(facts: CaptureFacts) -> Verdict:

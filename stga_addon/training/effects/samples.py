@@ -76,7 +76,8 @@ class Samples:
 
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
     """MAX_VIEWS of them, or one of each camera where that is more: timesteps evenly spread, cameras equally often."""
-    timesteps = evenly_spread(sorted({view.timestep for view in views}), MAX_TIMESTEPS)
+    cameras = len({view.camera_index for view in views})
+    timesteps = evenly_spread(sorted({view.timestep for view in views}), max(MAX_TIMESTEPS, MAX_VIEWS // cameras))
     rng = np.random.default_rng(seed)
     left: dict[int, list[View]] = {t: [view for view in views if view.timestep == t] for t in timesteps}
     used = dict.fromkeys((view.camera_index for view in views), 0)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.model import View
+from ...capture.model import View, ViewExposure
 from ..settings import TrainingSettings
 from .evaluation_views import EvaluationView
 from .forecast import DETAIL, UNMATCHED, curve_of, describe_forecast, flat_since, next_forecast
@@ -60,7 +60,7 @@ class Evaluator:
     settings: TrainingSettings
     views: Sequence[EvaluationView]
     keeps_latest: bool = False
-    exposure: Mapping[int, np.ndarray] | None = None
+    exposure: ViewExposure | None = None
     lines: list[dict[str, Any]] = field(default_factory=list)
     count: int = 0
     best_difference: float = math.inf

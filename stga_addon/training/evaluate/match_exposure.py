@@ -4,7 +4,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ...capture.model import View
+from ...capture.model import View, ViewExposure
+from ..optimize.image_preparation import view_exposure
 
 PRIOR_SHARE = 1e-3
 """Weight of the prior (gain 1, offset 0), as a share of the fitted pixels; decides where a rendering is one color."""
@@ -13,13 +14,18 @@ PRIOR_SHARE = 1e-3
 NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 
 
-def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> dict[int, np.ndarray]:
-    """Training camera's index -> gain and offset (2, 3), in levels, of red, green and blue in its images.
+def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> ViewExposure:
+    """Exposure of the training cameras' views.
 
     rows: `TrainingSettings.exposure`. A camera that they do not list was trained as it is.
     """
-    known = {view.camera_index: NO_CORRECTION for view in training_views}
-    return {**known, **{int(row[0]): np.array(row[1:], np.float64).reshape(2, 3) for row in rows}}
+    trained, listed = {view.camera_index for view in training_views}, view_exposure(rows)
+
+    def exposure(view: View) -> np.ndarray | None:
+        found = listed(view)
+        return NO_CORRECTION if found is None and view.camera_index in trained else found
+
+    return exposure
 
 
 def with_exposure(image: np.ndarray, exposure: np.ndarray, head: np.ndarray | None = None) -> np.ndarray:

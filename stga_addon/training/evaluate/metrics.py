@@ -13,7 +13,7 @@ from scipy.ndimage import prewitt, uniform_filter
 from ...avatar.file import Avatar
 from ...avatar.splats import Splats
 from ...capture.images import read_image
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, ViewExposure
 from ...render.render import render_avatar
 from ..optimize.losses import mean_ssim
 from . import lpips
@@ -61,7 +61,7 @@ def evaluate(
     render: Callable[[View], np.ndarray],
     evaluation_views: Iterable[EvaluationView],
     perceptual: bool = False,
-    exposure: Mapping[int, np.ndarray] | None = None,
+    exposure: ViewExposure | None = None,
 ) -> Quality:
     """Mean quality of `render(view)` (3, H, W) float32, clipped to 0…1.
 
@@ -71,13 +71,14 @@ def evaluate(
     scores: dict[str, list[tuple[float, float, float]]] = {"": []}
     differences, unmatched, fitted = [], [], False
     for evaluation_view in evaluation_views:
-        target, camera = evaluation_view.target, evaluation_view.view.camera_index
+        target = evaluation_view.target
         image = np.clip(render(evaluation_view.view), 0, 1)
         if exposure is not None:
             head, interior = evaluation_view.regions.get("mask"), evaluation_view.interior
-            image, plain = exposed_rendering(image, target, exposure.get(camera), head, interior)
+            known = exposure(evaluation_view.view)
+            image, plain = exposed_rendering(image, target, known, head, interior)
             unmatched.append(psnr(plain, target))
-            fitted = fitted or camera not in exposure
+            fitted = fitted or known is None
         differences.append(detail_difference(image, target, evaluation_view.interior))
         parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
         for region, where in parts.items():
@@ -124,8 +125,9 @@ def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -
     for view in capture.views[split]:
         mesh = np.asarray(capture.mesh(view.timestep))
         image = render_avatar(avatar, mesh, view.camera, avatar.background, behind=world)
-        exposure = known.get(view.camera_index, NO_CORRECTION)
-        found.append(psnr(with_exposure(image, exposure), read_image(view)))
+        exposure = known(view)
+        exposed = with_exposure(image, NO_CORRECTION if exposure is None else exposure)
+        found.append(psnr(exposed, read_image(view)))
     return float(np.mean(found))
 
 

@@ -1,12 +1,12 @@
 """What is done to the captured images before they are trained on or compared with: the backdrop is taken away, and
 exposure and white balance of the training cameras are corrected."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from ...capture.loader import Preparation
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, ViewExposure
 from ..backdrop import without_backdrop
 from ..settings import TrainingSettings
 
@@ -27,6 +27,22 @@ def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparati
     return prepare
 
 
+def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
+    """Exposure of the cameras in `TrainingSettings.exposure`, where it drifts interpolated between timesteps."""
+    listed: dict[int, list[Sequence[float]]] = {}
+    for row in rows:
+        listed.setdefault(int(row[0]), []).append(row[1:])
+    curves = {camera: np.array(sorted(((*row, 0.0)[6], *row[:6]) for row in own)).T for camera, own in listed.items()}
+
+    def exposure(view: View) -> np.ndarray | None:
+        if view.camera_index not in curves:
+            return None
+        timesteps, *columns = curves[view.camera_index]
+        return np.array([np.interp(view.timestep, timesteps, column) for column in columns]).reshape(2, 3)
+
+    return exposure
+
+
 def exposure_correction(settings: TrainingSettings) -> Correction | None:
     """The correction that inverts the settings' `exposure`; None if there is none.
 
@@ -35,13 +51,14 @@ def exposure_correction(settings: TrainingSettings) -> Correction | None:
     """
     if not settings.exposure:
         return None
-    rows = {int(row[0]): np.array(row[1:], np.float32).reshape(2, 3) for row in settings.exposure}
+    exposure = view_exposure(settings.exposure)
     background = 255 * np.array(settings.background, np.float32)
 
     def correct(view: View, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-        if view.camera_index not in rows:
+        known = exposure(view)
+        if known is None:
             return image
-        gain, offset = rows[view.camera_index]
+        gain, offset = known.astype(np.float32)
         cover = np.float32(1) if mask is None else mask[..., None].astype(np.float32) / 255
         background_part = (1 - cover) * background
         corrected = (image - background_part - cover * offset) / gain + background_part

@@ -13,7 +13,7 @@ import numpy as np
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...avatar.splats import ADDED
 from ...capture.loader import ViewLoader
-from ...capture.model import Capture, evenly_spread
+from ...capture.model import Capture, ViewExposure, evenly_spread
 from ...errors import StgaError
 from ...files import replacing
 from ...schema import to_json
@@ -261,7 +261,7 @@ def _evaluation_views(capture: Capture, run: Run, trainer: Trainer) -> list[Eval
     return [read_evaluation_view(capture, view, background, backdrop) for view in choose_evaluation_views(capture)]
 
 
-def _exposure(capture: Capture, run: Run) -> dict[int, np.ndarray] | None:
+def _exposure(capture: Capture, run: Run) -> ViewExposure | None:
     """`known_exposure` where images are corrected for it."""
     rows = run.settings.exposure
     return known_exposure(rows, capture.views["train"]) if rows else None

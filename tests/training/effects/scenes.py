@@ -43,14 +43,15 @@ def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class Scene:
-    """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, what else colors depend on, the color
-    behind the ball, and how far timesteps deform it."""
+    """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, gain over time (timesteps, 3), what else
+    colors depend on, the color behind the ball, and how far timesteps deform it."""
 
     cameras: int = 8
     timesteps: int = 8
     paint: Paint = nothing
     gain: np.ndarray | None = None
     offset: np.ndarray | None = None
+    drift: np.ndarray | None = None
     background: tuple[int, int, int] = (255, 255, 255)
     deformed: float = 1.0
     masks: bool = True
@@ -73,6 +74,8 @@ def photograph(folder: Path, scene: Scene) -> Capture:
             camera = _camera(c, scene.cameras)
             away = mesh[faces].mean(1) - camera.position
             seen = colors + scene.paint(strain, away / np.linalg.norm(away, axis=1, keepdims=True), place)[:, None]
+            if scene.drift is not None:
+                seen = seen * scene.drift[t]
             if scene.gain is not None:
                 seen = seen * scene.gain[c]
             if scene.offset is not None:

@@ -1,0 +1,147 @@
+"""Focal length of a single camera, from landmarks of a head that turns: a near head changes its shape in the image."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..capture.model import evenly_spread
+from ..capture.rigid import Similarity
+from ..flame.forward import RIGID_SIZE
+from .fit import TimestepLandmarks, by_visibility, observed_landmarks, rigid_start, triangulated
+from .head_model import HeadModel
+from .posed_points import PosedPoints, SurfacePoints, head_rotation
+from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
+
+CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
+"""Timesteps among which those of the most different turns are chosen, and how many; landmarks that are used."""
+MIN_TURN_DEG = 20.0
+"""Between two timesteps, below which the head does not turn: what lies nearer cannot be told from what is larger."""
+USUAL_SIGMA = 0.35
+"""Standard deviation of the inverse focal length about that of a phone, relative."""
+NEAREST, FARTHEST = 2.0, 0.2
+"""Largest and smallest inverse focal length, relative to that of a phone: 104° and 15° over the diagonal."""
+OWN_SIGMA_M, NOISE_SIGMA_M = LANDMARK_SIGMA_M, 0.0006
+"""Standard deviations of what a landmark misses the head by in all timesteps alike, which says nothing of focal
+lengths, and beyond that in one of them."""
+SOLVES, ROUNDS, CONVERGED = 6, 2, 0.01
+"""Inverse focal lengths that are tried; fits of the head for each, as its depth is that of the fit before; and the
+relative change after which no more are tried."""
+HERE = Similarity(1.0, np.eye(3), np.zeros(3))
+"""The head is fitted in the camera's own world, in meters."""
+
+
+def solved_focal(
+    head: HeadModel, places: SurfacePoints, reliable: np.ndarray, take: Mapping[int, TimestepLandmarks]
+) -> float | None:
+    """Focal length in pixels of the only camera of `take`, whose own is that of a phone (`open.usual_focal`).
+
+    The maximum of its posterior, by the secant method; the inverse has a normal prior about the camera's own. None
+    where the head turns too little, or where landmarks say less of it than the prior.
+    """
+    rows = np.array(evenly_spread(np.flatnonzero(reliable).tolist(), LANDMARKS))
+    seen = {
+        t: replace(own, points=own.points[:, rows], confidence=own.confidence[:, rows])
+        for t, own in take.items()
+        if (own.confidence[:, rows] > 0).all()
+    }
+    own_head, own_places = _with_own_places(head, SurfacePoints(places.face[rows], places.barycentric[rows]))
+    timesteps = _turned(own_head, own_places, seen)
+    if not timesteps:
+        return None
+    views = [seen[t] for t in timesteps]
+
+    def slope(inverse: float) -> float:
+        return _slope(own_head, own_places, views, inverse) + (inverse - 1) / USUAL_SIGMA**2
+
+    tried = [1.0, 0.6]
+    slopes = [slope(inverse) for inverse in tried]
+    rise = (slopes[1] - slopes[0]) / (tried[1] - tried[0])
+    while len(tried) < SOLVES and rise > 0:
+        inverse = float(np.clip(tried[-1] - slopes[-1] / rise, FARTHEST, NEAREST))
+        if abs(inverse - tried[-1]) < CONVERGED:
+            break
+        tried.append(inverse)
+        slopes.append(slope(inverse))
+        rise = (slopes[-1] - slopes[-2]) / (tried[-1] - tried[-2])
+    by_landmarks = rise - 1 / USUAL_SIGMA**2
+    return views[0].cameras[0].fl_x / tried[-1] if by_landmarks > 1 / USUAL_SIGMA**2 else None
+
+
+def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
+    """The head at its landmarks alone, with components of identity that move each of them by OWN_SIGMA_M."""
+    model, count = head.model, len(places)
+    corners = model.faces[places.face].ravel()
+    own = OWN_SIGMA_M * np.eye(3 * count).reshape(count, 1, 3, 3 * count).repeat(3, axis=1)
+    template, known = model.v_template[corners], model.n_identity
+    dirs = np.split(model.shapedirs[corners], [known], axis=2)
+    small = replace(
+        model,
+        v_template=template,
+        shapedirs=np.concatenate([dirs[0], own.reshape(3 * count, 3, 3 * count), dirs[1]], axis=2),
+        n_identity=known + 3 * count,
+        posedirs=model.posedirs[corners],
+        j_regressor=model.j_regressor @ model.v_template @ np.linalg.pinv(template),
+        weights=model.weights[corners],
+        faces=np.arange(3 * count, dtype=np.int32).reshape(count, 3),
+    )
+    return replace(head, model=small), SurfacePoints(np.arange(count), places.barycentric)
+
+
+def _turned(head: HeadModel, places: SurfacePoints, take: Mapping[int, TimestepLandmarks]) -> list[int]:
+    """Timesteps at which the head is turned most differently; none where it does not turn."""
+    timesteps = evenly_spread(sorted(take), CANDIDATES)
+    if len(timesteps) < 2:
+        return []
+    starts = _observed(head, places, [take[t] for t in timesteps])[1]
+    turns = np.stack([head_rotation(start) for start in starts])
+    cosine = (np.einsum("aij,bij->ab", turns, turns) - 1) / 2
+    apart = np.arccos(np.clip(cosine, -1, 1))
+    if np.degrees(apart.max()) < MIN_TURN_DEG:
+        return []
+    chosen = [int(number) for number in np.unravel_index(apart.argmax(), apart.shape)]
+    while len(chosen) < min(TIMESTEPS, len(timesteps)):
+        chosen.append(int(apart[chosen].min(axis=0).argmax()))
+    return sorted({timesteps[number] for number in chosen})
+
+
+def _observed(
+    head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
+) -> tuple[list[Observation], np.ndarray]:
+    """Landmarks in the camera's world at the depth of the head, and the poses (T, 18) that bring it there."""
+    neutral, used = places.on(head.model.v_template, head.model.faces), np.ones(len(places), bool)
+    found = [observed_landmarks(triangulated(view, used, neutral, 1.0), HERE, used) for view in views]
+    return found, np.stack([rigid_start(neutral, own) for own in found])
+
+
+def _slope(head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks], inverse: float) -> float:
+    """Derivative of the negative log-likelihood by the inverse focal length; both are relative to the cameras' own.
+
+    At the best fit of the head it is that with a head that stays: rays turn away from its points.
+    """
+    camera = views[0].cameras[0]
+    trial = replace(camera, fl_x=camera.fl_x / inverse, fl_y=camera.fl_y / inverse)
+    views = [replace(view, cameras=(trial,)) for view in views]
+    subject, frames = person(head, np.zeros(head.model.n_identity)), np.zeros(0)
+    observed: list[Observation] = []
+    for _ in range(ROUNDS):
+        seen, starts = _observed(subject, places, views)
+        frames = frames if len(frames) else np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
+        sides = (by_visibility(view, subject, places, own, HERE) for view, own in zip(views, frames, strict=True))
+        observed = [
+            replace(own, root=own.root * (LANDMARK_SIGMA_M / NOISE_SIGMA_M), weight=own.weight * side.confidence[0])
+            for own, side in zip(seen, sides, strict=True)
+        ]
+        identity = solve_identity(head, places, observed, starts, metric=True)
+        subject, frames = person(head, identity.shape), identity.frames
+    points, total = PosedPoints(subject.model, places), 0.0
+    rotation = camera.world_to_camera[:3, :3]
+    for view, own, values in zip(views, observed, frames, strict=True):
+        at = points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+        residual = np.einsum("nij,nj->ni", own.root, at - own.position) / LANDMARK_SIGMA_M
+        _, depth = camera.project(at)
+        flat = (view.points[0] - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y] * depth[:, None]
+        away = np.einsum("nij,nj->ni", own.root, flat @ rotation[:2]) / LANDMARK_SIGMA_M
+        weight = own.weight / np.sqrt(1 + (residual**2).sum(1))
+        total -= float((weight * (residual * away).sum(1)).sum())
+    return total

@@ -1,0 +1,113 @@
+"""Focal lengths that recordings state: EXIF of photos, metadata of the tracks of QuickTime and MP4 files."""
+
+import re
+import struct
+from collections.abc import Iterator
+from math import hypot
+from pathlib import Path
+
+from PIL import Image
+
+from ...capture.images import FORMATS
+
+FULL_FRAME_DIAGONAL_MM = 43.27
+"""Of 36 x 24 mm; equivalent focal lengths have the same angle of view over the diagonal (CIPA DCG-001)."""
+MIN_EQUIVALENT_MM, MAX_EQUIVALENT_MM = 5.0, 2000.0
+EXIF, EQUIVALENT, FOCAL, PER_UNIT, UNIT, WIDTH, HEIGHT = 0x8769, 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002, 0xA003
+"""Tags of EXIF 2.32: the directory, FocalLengthIn35mmFilm, FocalLength, FocalPlaneXResolution and its unit, and the
+size of the picture as taken."""
+UNITS_MM = {2: 25.4, 3: 10.0}
+MAX_ASPECT_DIFFERENCE = 0.01
+"""Relative; beyond it, a photo has been cropped, and its tags are those of the whole picture."""
+EQUIVALENT_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
+VALUE_FORMATS = {21: ">i", 22: ">I", 23: ">f", 24: ">d", 67: ">i", 77: ">I"}
+"""Well-known types of QuickTime's metadata, but for text."""
+MAX_BOXES, MAX_HEADER_BYTES = 1000, 1 << 26
+
+
+def photo_focal(path: Path, width: int, height: int) -> float | None:
+    """Focal length in pixels of an image of that size, as its EXIF says; None where it does not."""
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            tags = image.getexif().get_ifd(EXIF)
+        equivalent, focal = float(tags.get(EQUIVALENT) or 0), float(tags.get(FOCAL) or 0)
+        taken = sorted((float(tags.get(WIDTH) or width), float(tags.get(HEIGHT) or height)))
+        shown = sorted((float(width), float(height)))
+        if abs(taken[0] * shown[1] / (taken[1] * shown[0]) - 1) > MAX_ASPECT_DIFFERENCE:
+            return None
+        if not equivalent and focal and tags.get(PER_UNIT):
+            pixels = focal * float(tags[PER_UNIT]) / UNITS_MM[tags.get(UNIT, 2)]
+            equivalent = pixels / hypot(*taken) * FULL_FRAME_DIAGONAL_MM
+    except Exception:  # damaged metadata does not concern the pixels
+        return None
+    return _pixels(equivalent, width, height)
+
+
+def video_focal(path: Path, width: int, height: int) -> float | None:
+    """Focal length in pixels of a video of that size, as its metadata says; None where it does not.
+
+    Phones write it into the video's track, where FFmpeg does not look.
+    """
+    try:
+        movie = _movie(path)
+        tracks = [movie[first:end] for kind, first, end in _boxes(movie) if kind == b"trak"]
+        found = [value for part in (*tracks, movie) if (value := _equivalent(part)) is not None]
+    except (OSError, struct.error):
+        return None
+    return _pixels(found[0], width, height) if found else None
+
+
+def _pixels(equivalent_mm: float, width: int, height: int) -> float | None:
+    plausible = MIN_EQUIVALENT_MM <= equivalent_mm <= MAX_EQUIVALENT_MM
+    return equivalent_mm / FULL_FRAME_DIAGONAL_MM * hypot(width, height) if plausible else None
+
+
+def _movie(path: Path) -> bytes:
+    """What the box "moov" of a file holds; nothing where there is none."""
+    with path.open("rb") as stream:
+        for _ in range(MAX_BOXES):
+            head = stream.read(8)
+            if len(head) < 8:
+                break
+            size, kind = struct.unpack(">I4s", head)
+            size = struct.unpack(">Q", stream.read(8))[0] - 16 if size == 1 else size - 8
+            if kind == b"moov":
+                return stream.read(max(0, min(size, MAX_HEADER_BYTES)))
+            if not 0 <= size < 1 << 62:
+                break
+            stream.seek(size, 1)
+    return b""
+
+
+def _boxes(data: bytes, start: int = 0) -> Iterator[tuple[bytes, int, int]]:
+    """(kind, first byte of the content, end) of the boxes that follow each other from `start` on."""
+    while start + 8 <= len(data):
+        size, kind = struct.unpack_from(">I4s", data, start)
+        if size < 8:
+            return
+        yield kind, start + 8, start + size
+        start += size
+
+
+def _equivalent(data: bytes) -> float | None:
+    """Millimeters in the metadata of a movie or track."""
+    for kind, first, end in _boxes(data):
+        if kind != b"meta":
+            continue
+        meta = data[first:end]
+        parts = {k: meta[f:e] for k, f, e in _boxes(meta, 0 if meta[4:8] == b"hdlr" else 4)}  # MP4's has a version
+        keys = [parts.get(b"keys", b"")[f:e] for _, f, e in _boxes(parts.get(b"keys", b""), 8)]
+        if EQUIVALENT_KEY in keys:
+            number = struct.pack(">I", keys.index(EQUIVALENT_KEY) + 1)
+            entries = parts.get(b"ilst", b"")
+            return next((_value(entries[f:e]) for k, f, e in _boxes(entries) if k == number), None)
+    return None
+
+
+def _value(item: bytes) -> float | None:
+    """The number in an entry of a list of metadata: one box "data"."""
+    kind, value = struct.unpack_from(">I", item, 8)[0], item[16:]
+    if kind in VALUE_FORMATS:
+        return float(struct.unpack_from(VALUE_FORMATS[kind], value)[0])
+    found = re.match(rb"[0-9.]+", value)
+    return float(found[0]) if found and found[0].count(b".") < 2 and found[0] != b"." else None

@@ -1,0 +1,190 @@
+"""Focal lengths of a single camera: stated by files, and solved from landmarks."""
+
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.capture.camera import camera_from_gl
+from stga_addon.development.demo.head import synthetic_flame, write_flame
+from stga_addon.files import read_json, write_npz
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.tracking.fit import TimestepLandmarks
+from stga_addon.tracking.focal_length import solved_focal
+from stga_addon.tracking.footage.open import open_footage, usual_focal
+from stga_addon.tracking.footage.video import VideoFrames
+from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.landmarks import write_places
+from stga_addon.tracking.track import track
+
+from .scenes import write_image, write_video
+from .test_fit import places_on
+
+EQUIVALENT_MM = 28.0
+WIDTH, HEIGHT = 64, 48
+EXPECTED = EQUIVALENT_MM / np.hypot(36, 24) * 80
+QUICKTIME_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
+
+
+def write_photo(path, tags, size=(WIDTH, HEIGHT)):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    Image.new("RGB", size).save(path, exif=exif)
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({0xA405: 28}, EXPECTED),
+        ({0xA405: 28, 0xA002: 4000, 0xA003: 3000}, EXPECTED),  # made smaller
+        ({0xA405: 28, 0xA002: 3000, 0xA003: 4000}, EXPECTED),  # turned
+        ({0xA405: 28, 0xA002: 4000, 0xA003: 2000}, None),  # cropped
+        # 6.4 mm wide at 4000 pixels: f = 4.8 mm is 3000 pixels there.
+        ({0x920A: 4.8, 0xA20E: 4000 / 6.4 * 25.4, 0xA210: 2, 0xA002: 4000, 0xA003: 3000}, 3000 * WIDTH / 4000),
+        ({0x920A: 4.8, 0xA20E: 4000 / 6.4 * 10, 0xA210: 3, 0xA002: 4000, 0xA003: 3000}, 3000 * WIDTH / 4000),
+        ({0x920A: 4.8}, None),
+        ({0xA405: 0}, None),
+        ({}, None),
+    ],
+)
+def test_focal_length_of_photos(tmp_path, tags, expected):
+    """Catches a photo's lens that is not read, is related to the wrong side, or survives a crop."""
+    write_photo(tmp_path / "a.jpg", tags)
+    footage = open_footage(tmp_path)
+    camera = footage.cameras[0].camera
+    assert camera.fl_x == camera.fl_y == pytest.approx(expected or usual_focal(WIDTH, HEIGHT), rel=2e-3)
+    assert footage.focal == ("file" if expected else "usual")
+    assert open_footage(tmp_path, focal=50.0).cameras[0].camera.fl_x == 50
+
+
+def box(kind, content):
+    return struct.pack(">I4s", 8 + len(content), kind) + content
+
+
+def with_metadata(path, value, kind, where, versioned):
+    """Append QuickTime's metadata to the movie or to its track, behind whose boxes nothing lies that they point to."""
+    hdlr = box(b"hdlr", bytes(8) + b"mdta" + bytes(13))
+    names = [b"com.apple.quicktime.camera.lens_model", QUICKTIME_KEY]
+    listed = b"".join(box(b"mdta", name) for name in names)
+    items = [box(struct.pack(">I", n), box(b"data", struct.pack(">II", *own))) for n, own in ((1, (1, 0)),)]
+    items.append(box(struct.pack(">I", 2), box(b"data", struct.pack(">II", kind, 0) + value)))
+    keys = box(b"keys", struct.pack(">II", 0, len(names)) + listed)
+    meta = box(b"meta", bytes(4 * versioned) + hdlr + keys + box(b"ilst", b"".join(items)))
+    data = bytearray(path.read_bytes())
+    holders, start = [], 0
+    for name in (b"moov", b"trak")[: 1 + (where == "trak")]:
+        while data[start + 4 : start + 8] != name:
+            start += struct.unpack_from(">I", data, start)[0]
+        holders.append(start)
+        start += 8
+    end = holders[-1] + struct.unpack_from(">I", data, holders[-1])[0]
+    data[end:end] = meta
+    for holder in holders:
+        struct.pack_into(">I", data, holder, struct.unpack_from(">I", data, holder)[0] + len(meta))
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("where", ["moov", "trak"])
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("a.mov", b"28", 1),
+        ("a.mov", b"28.00mm", 1),
+        ("a.mov", struct.pack(">i", 28), 21),
+        ("a.mp4", struct.pack(">f", 28), 23),
+        ("a.mp4", struct.pack(">d", 28), 24),
+    ],
+)
+def test_focal_length_of_videos(tmp_path, name, value, kind, where):
+    """Catches a phone's lens that is not read, as by FFmpeg, which leaves out the metadata of tracks."""
+    av = pytest.importorskip("av")
+    path = tmp_path / name
+    write_video(path, [60, 90, 120], size=(WIDTH, HEIGHT))
+    with_metadata(path, value, kind, where, versioned=name.endswith("mp4"))
+    with av.open(str(path)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 3
+    footage = open_footage(path)
+    assert footage.focal == "file"
+    assert footage.cameras[0].camera.fl_x == pytest.approx(EXPECTED, rel=1e-3)
+
+
+def test_damaged_metadata(tmp_path):
+    """Catches a traceback, or an endless loop, for tags that are cut off or no numbers."""
+    pytest.importorskip("av")
+    for number, (value, kind) in enumerate([(b"", 1), (b"..", 1), (b"\0", 23), (b"\xff\xff\xff\xff", 23), (b"-3", 1)]):
+        path = tmp_path / f"{number}/a.mov"
+        write_video(path, [60, 90, 120], size=(WIDTH, HEIGHT))
+        with_metadata(path, value, kind, "trak", versioned=False)
+        assert open_footage(path).focal == "usual"
+    write_image(tmp_path / "photo/a.jpg")
+    whole = (tmp_path / "photo/a.jpg").read_bytes()
+    (tmp_path / "photo/a.jpg").write_bytes(whole[:2] + b"\xff\xe1\x00\x10Exif\0\0MM\0*\0\0\0\x08" + whole[2:])
+    assert open_footage(tmp_path / "photo").focal == "usual"
+
+
+def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
+    """Places, and landmarks of a head that turns that far to either side 0.6 m before a camera.
+
+    Each landmark lies 2 mm beside its place on the model, in all frames alike, as a detector's do.
+    """
+    rng = np.random.default_rng(3)
+    places, shape = places_on(head, 300), rng.normal(0, 0.7, head.model.n_identity)
+    own = rng.normal(0, 0.002, (300, 3))
+    usual, (width, height) = usual_focal(*size), size
+    camera, guessed = (camera_from_gl(np.eye(4), *size, f, f, width / 2, height / 2) for f in (focal, usual))
+    take = {}
+    for timestep, share in enumerate(np.sin(np.linspace(0, 7, count))):
+        angle, expression = np.radians(turn_deg) * share, np.zeros(head.model.n_expression)
+        expression[timestep % 3] = 0.5
+        zero, pose = np.zeros(3), np.array([0.1 * share**2, angle, 0.0])
+        frame = FlameFrame(expression, pose, zero, zero, np.array([0.02 * share, 0.0, -0.6]), np.zeros(6))
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        points = places.on(flame_forward(head.model, shape, frame), head.model.faces) + own @ turn.T
+        pixels = camera.project(points)[0] + rng.normal(0, width / 1080, (300, 2))
+        take[timestep] = TimestepLandmarks((guessed,), pixels[None], np.ones((1, 300)))
+    return places, take
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.6])
+def test_focal_length_of_a_head_that_turns(factor):
+    """Catches a head that is taken for one at a phone's distance: its depth would be that much too large or small."""
+    head = HeadModel(synthetic_flame(0), "flame")
+    truth = factor * usual_focal(1080, 1920)
+    places, take = turning(head, truth, 30)
+    found = solved_focal(head, places, np.ones(300, bool), take)
+    assert found == pytest.approx(truth, rel=0.1)
+
+
+def test_a_head_that_does_not_turn_tells_no_focal_length():
+    """Catches the shape of a face taken for perspective, which is off by a factor of two on people who sit still."""
+    head = HeadModel(synthetic_flame(0), "flame")
+    places, take = turning(head, 1.6 * usual_focal(1080, 1920), 7)
+    assert solved_focal(head, places, np.ones(300, bool), take) is None
+
+
+def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, monkeypatch):
+    """Catches a video that is decoded for each stage, backwards or by seeking, and a solved focal length that the
+    capture does not have."""
+    pytest.importorskip("av")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # no helping processes, whose decoders would not be seen
+    size, count, head = (108, 192), 8, HeadModel(synthetic_flame(0), "flame")
+    places, take = turning(head, 1.6 * usual_focal(*size), 30, size, count)
+    write_video(tmp_path / "phone.mp4", range(60, 60 + 10 * count, 10), size=size, gop=count)
+    write_flame(head.model, tmp_path / "head.npz")
+    write_places(tmp_path / "points/head_model.npz", places, np.ones(300, bool))
+    points = np.concatenate([take[t].points for t in range(count)])
+    write_npz(tmp_path / "points/phone.npz", {"timesteps": np.arange(count), "points": points})
+    decoded, decode = [], VideoFrames._frame
+    monkeypatch.setattr(VideoFrames, "_frame", lambda self, number: decoded.append(number) or decode(self, number))
+    footage = open_footage(tmp_path / "phone.mp4")
+    found = track(footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points", mattes=False)
+    assert decoded == list(range(count))
+    assert found.focal == "solved"
+    assert found.focal_px == pytest.approx(1.6 * usual_focal(*size), rel=0.1)
+    report = read_json(tmp_path / "out/tracking.json")
+    assert (report["focal_length_px"], report["focal_length_from"]) == (round(found.focal_px, 1), "solved")
+    frame = read_json(tmp_path / "out/transforms_train.json")["frames"][5]
+    assert frame["fl_x"] == pytest.approx(found.focal_px)
+    written = np.asarray(Image.open(tmp_path / "out" / frame["file_path"]))
+    np.testing.assert_array_equal(written, footage.cameras[0].image(5))

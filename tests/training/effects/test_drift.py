@@ -1,0 +1,72 @@
+"""Exposure of a camera that drifts while it records, as a phone's does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.training.effects.plan import plan_effects
+from stga_addon.training.evaluate.metrics import evaluate_avatar
+from stga_addon.training.optimize.image_preparation import view_exposure
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.loop import train
+from stga_addon.training.settings import make_settings
+
+from .scenes import Scene, photograph
+
+TIMESTEPS, LEFT_OUT = 24, (3, 8, 14, 19)
+PHASES = np.array([0.0, 0.5, 2.0])
+DRIFT = 1 + 0.12 * np.sin(np.arange(TIMESTEPS)[:, None] / 5 + PHASES)
+
+
+def recorded(folder, drift):
+    """One camera; some timesteps are left out of the training."""
+    capture = photograph(folder, Scene(cameras=1, timesteps=TIMESTEPS, drift=drift))
+    split = {"train": lambda t: t not in LEFT_OUT, "val": lambda t: t in LEFT_OUT}
+    views = {name: tuple(v for v in capture.views["train"] if use(v.timestep)) for name, use in split.items()}
+    return replace(capture, views=views)
+
+
+def planned(capture, iterations=1, **choices):
+    settings, plan = plan_effects(capture, make_settings(iterations=iterations, effects=choices))
+    return settings, next(decision for decision in plan if decision.effect == "exposure")
+
+
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory):
+    return recorded(tmp_path_factory.mktemp("drift"), DRIFT)
+
+
+def test_drift_is_found(drifting):
+    """Catches drift that is not seen, or wrong at the timesteps in between by more than 1 %."""
+    settings, decision = planned(drifting)
+    assert decision.on
+    assert "over time" in decision.reason
+    exposure = view_exposure(settings.exposure)
+    views = [*drifting.views["train"], *drifting.views["val"]]
+    found = np.array([exposure(view)[0] for view in views])
+    truth = DRIFT[[view.timestep for view in views]]
+    np.testing.assert_allclose(found / found.mean(0), truth / truth.mean(0), atol=0.012)
+    assert (exposure(replace(views[0], timestep=-5)) == exposure(views[0])).all()
+    assert exposure(replace(views[0], camera_index=1)) is None
+
+
+def test_images_in_no_order_do_not_drift(tmp_path_factory):
+    """Catches gains that are interpolated between images that have nothing to do with each other."""
+    shuffled = np.random.default_rng(1).permutation(DRIFT)
+    for drift in (shuffled, None):
+        decision = planned(recorded(tmp_path_factory.mktemp("no_drift"), drift))[1]
+        assert not decision.on, decision.reason
+
+
+def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path):
+    """Catches drift that is averaged into the avatar, or not given to renderings of other timesteps."""
+    psnr = {}
+    for choice in ("on", "off"):
+        settings, _ = planned(drifting, iterations=200, exposure=choice)
+        avatar = train(drifting, tmp_path / choice, Run(drifting.root, None, "vhap", replace(settings, effects=None)))
+        quality = evaluate_avatar(read_avatar(avatar), drifting, "val")
+        assert quality.psnr_unmatched is None
+        psnr[choice] = quality.psnr
+    assert psnr["on"] > psnr["off"] + 1.5
