@@ -1,5 +1,6 @@
 """Statistics of sampled colors: how much of their variation an effect could explain."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,33 +24,41 @@ OFFSET_PENALTY = 0.05
 all colors are alike, nothing else separates the two."""
 RELATIVE_CHANGE_BIAS_LEVELS = 32.0
 """Added to a color before its change is taken relative to it."""
+ROUNDING_LEVELS = 12**-0.5
+"""Root mean square error of colors in whole levels; none is known better."""
 RIDGE_WEIGHT = 1.0
 """Of a triangle's coefficients, in units of a feature's variance over all triangles."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a model explains of colors that it was not fitted to.
+    """Root mean square errors, in levels of 255, of colors that a model was not fitted to: without it and with it."""
 
-    gain   root mean square, in levels of 255, of the error that the model removes; 0 where it adds error
-    error  root mean square error without the model
-    """
+    before: float
+    after: float
 
-    gain: float
-    error: float
+    @property
+    def gain(self) -> float:
+        """Root mean square, in levels of 255, of the error that the model removes; 0 where it adds error."""
+        return math.sqrt(max(0.0, self.before**2 - self.after**2))
 
     @property
     def share(self) -> float:
         """Explained share of the error's variance."""
-        return (self.gain / max(self.error, 1e-9)) ** 2
+        return (self.gain / max(self.before, 1e-9)) ** 2
+
+    @property
+    def decibels(self) -> float:
+        """By how much PSNR rises with the model; negative where it adds error."""
+        before, after = (max(error, ROUNDING_LEVELS) for error in (self.before, self.after))
+        return 20 * math.log10(before / after)
 
 
 def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
     """Evidence from the errors (…) on the same samples without and with a model; zero without samples."""
     if not before.size:
         return Evidence(0.0, 0.0)
-    least, most = float(np.mean(before**2)), float(np.mean(after**2))
-    return Evidence(float(np.sqrt(max(0.0, least - most))), float(np.sqrt(least)))
+    return Evidence(float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2))))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Measurements of a capture that the rules of effects ask for, each made once and only if asked."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, cached_property
 
@@ -18,7 +17,6 @@ from .evidence import (
     MIN_EXPOSURE_LEVELS,
     CameraColors,
     Evidence,
-    Fold,
     camera_evidence,
     consecutive_folds,
     drift_evidence,
@@ -95,33 +93,23 @@ class CaptureFacts:
         return linear_evidence(self.matched_colors, self.samples.direction, folds, MAX_VIEW_ERROR_RATIO)
 
     @cached_property
-    def strain_dependence(self) -> Evidence:
-        """In timesteps that are left out, as in unseen expressions."""
-        return self._strain_evidence(consecutive_folds(self.samples.timestep))
+    def strain_dependence(self) -> dict[str, Evidence]:
+        """Of colors on their triangle's strain, within the range that a training on the other views would write."""
+        return self._strain_evidence(self.samples.strain, rest_strain(color_range(len(self.samples.faces))))
 
     @cached_property
-    def strain_dependence_known(self) -> Evidence | None:
-        """In cameras that are left out, as in other views of known expressions; None with a single one."""
-        return self._strain_evidence(scattered_folds(self.samples.camera)) if self.cameras > 1 else None
-
-    @cached_property
-    def smoothed_strain_dependence(self) -> Evidence:
-        """As `strain_dependence`, on the strain around a triangle: what moves over it changes its color as well."""
-        return self._smoothed_strain_evidence(consecutive_folds(self.samples.timestep))
-
-    @cached_property
-    def smoothed_strain_dependence_known(self) -> Evidence | None:
-        """As `strain_dependence_known`, on the strain around a triangle."""
-        return self._smoothed_strain_evidence(scattered_folds(self.samples.camera)) if self.cameras > 1 else None
-
-    def _strain_evidence(self, folds: Sequence[Fold]) -> Evidence:
-        """Within the range of strain that a training on the views that are not left out would write."""
-        rest = rest_strain(color_range(len(self.samples.faces)))
-        return linear_evidence(self.matched_colors, self.samples.strain, folds, rest=rest)
-
-    def _smoothed_strain_evidence(self, folds: Sequence[Fold]) -> Evidence:
+    def smoothed_strain_dependence(self) -> dict[str, Evidence]:
+        """Of colors on the strain around their triangle: what moves over it changes its color as well."""
         smoothed = self.samples.smoothed_strain
-        return linear_evidence(self.matched_colors, smoothed, folds, rest=np.zeros_like(smoothed[0]))
+        return self._strain_evidence(smoothed, np.zeros_like(smoothed[0]))
+
+    def _strain_evidence(self, strain: np.ndarray, rest: np.ndarray) -> dict[str, Evidence]:
+        """In "frames" that are left out, as unseen expressions, and in "cameras" that are, as other views of known
+        expressions; a single camera is not left out."""
+        folds = {"frames": consecutive_folds(self.samples.timestep)}
+        if self.cameras > 1:
+            folds["cameras"] = scattered_folds(self.samples.camera)
+        return {kind: linear_evidence(self.matched_colors, strain, each, rest=rest) for kind, each in folds.items()}
 
     @cached_property
     def pixel_range(self) -> float:

@@ -1,5 +1,6 @@
 """Effect plan: decided once, printed, stored with the run and kept on resume."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -71,14 +72,16 @@ def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
-def test_info_shows_the_plan(root, capsys):
-    """Catches an overview without the plan, or with choices that it does not heed."""
+def test_info_shows_the_plan(tmp_path, capsys):
+    """Catches an overview without the plan or the figures behind it, or with choices that it does not heed."""
+    root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 2, 3, 4, 5), range(3))
     assert main(["info", str(root), "--effect", "strain-color=on"]) == 0
     lines = capsys.readouterr().out.splitlines()
     (strain,) = [line for line in lines if line.startswith("strain-color")]
     assert "on, as asked: " in strain
     assert "coefficients more a splat" in strain
-    assert any(line.startswith("exposure") and "off: " in line for line in lines)
+    assert re.search(r"[+-]\d\.\d\d dB in left-out frames and [+-]\d\.\d\d dB in left-out cameras", strain)
+    assert any(line.startswith("view-color") and "off: " in line for line in lines)
 
 
 @pytest.mark.parametrize(
