@@ -35,17 +35,13 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.viewports import open_sidebar
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.training.run.tracking_file import TRACKING
-from ..stga_addon.worker.environment import status_folder
 from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker, refuse_running_worker, request_cancel
 from . import ids
-from .common import environment_folder, is_head
+from .common import is_head
 from .results import KINDS, loader
 
 Curve = tuple[np.ndarray, str, str]
 """Pixels of a run's curve, the ranges of its axes and of the detail difference."""
-
-NO_SCENE = 0
-"""Stands for the session id of a scene, of the training environment, which belongs to none."""
 
 _states: dict[tuple[int, Kind], RequestState] = {}
 """Session id of a scene and kind -> its request."""
@@ -159,10 +155,7 @@ def _check_requests() -> float | None:
     if _watched and now < _requests_due:
         return _requests_due - now
     scenes = [scene for scene in bpy.data.scenes if scene.library is None]
-    intervals = [_check_safely(scene, kind) for scene in scenes for kind in Kind if kind != Kind.ENVIRONMENT]
-    environment = _states.get((NO_SCENE, Kind.ENVIRONMENT))
-    if environment is None or environment.is_running:
-        intervals.append(_check_safely(None, Kind.ENVIRONMENT))
+    intervals = [_check_safely(scene, kind) for scene in scenes for kind in Kind]
     interval = min((interval for interval in intervals if interval is not None), default=None)
     _requests_due = now + (CHECK_INTERVAL_S if interval is None else interval)
     return interval
@@ -209,7 +202,7 @@ def _describe(error: Exception) -> str:
 
 
 def _key(scene: Any, kind: Kind) -> tuple[int, Kind]:
-    return NO_SCENE if kind == Kind.ENVIRONMENT else scene.session_uid, kind
+    return scene.session_uid, kind
 
 
 def _is_edited(scene: Any, kind: Kind) -> bool:
@@ -219,8 +212,6 @@ def _is_edited(scene: Any, kind: Kind) -> bool:
 
 def _stored_state(scene: Any, kind: Kind) -> RequestState:
     """A request that was not seen yet, as it is stored."""
-    if kind == Kind.ENVIRONMENT:
-        return RequestState(kind, environment_folder(), status_folder(environment_folder()))
     state = RequestState(kind)
     if kind in STORED:
         subject, result_shown = _read_stored(scene, kind)
@@ -395,7 +386,7 @@ def _after_load(_: Any) -> None:
     loader.close()
     _close_watched()
     _end_unawaited()
-    for key in [key for key in _states if key[1] not in (Kind.VIDEO, Kind.ENVIRONMENT)]:
+    for key in [key for key in _states if key[1] != Kind.VIDEO]:
         del _states[key]  # of scenes of the file before; its videos are still rendered
     for scene in bpy.data.scenes:
         if scene.library is None:

@@ -13,9 +13,9 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.folder import check_request, request_folder, worker_arguments, write_request
 from ..stga_addon.requests.monitor_state import DISMISSIBLE, STORED, SUBJECTS, TRANSIENT, Kind
 from ..stga_addon.requests.values import Request
-from ..stga_addon.worker.environment import missing_packages
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, failure_report, inspect_worker
+from ..stga_addon.worker.training_python import missing_packages
 from . import ids, monitor
 from .common import polled, reporting
 from .results import KINDS

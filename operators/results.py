@@ -229,8 +229,5 @@ KINDS = {
     Kind.VIDEO: RequestKind(
         "The video", "Stop making the video; nothing is written, or the PNGs that are finished stay"
     ),
-    Kind.ENVIRONMENT: RequestKind(
-        "Set-up of the training environment", "Stop making the training environment, and remove the incomplete one"
-    ),
 }
 """The only table of what depends on the kind of a request in Blender."""

@@ -19,7 +19,7 @@ from ..stga_addon.worker.status import WorkerState
 from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .train_panel import draw_environment_setup, draw_train_button
+from .train_panel import draw_missing_python, draw_train_button
 
 
 class NextStepPanel(SidebarPanel, bpy.types.Panel):
@@ -54,12 +54,8 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, context, "Train an avatar, or choose a trained one under 4 Show")
             draw_train_button(layout, settings)
         else:
-            draw_text(
-                layout,
-                context,
-                "Training needs a Python environment; to show a trained avatar, go to 4 Show",
-            )
-            draw_environment_setup(layout)
+            draw_text(layout, context, "Training needs a Python; to show a trained avatar, go to 4 Show")
+            draw_missing_python(layout, context)
 
 
 def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:

@@ -28,7 +28,7 @@ SLICE_INTERVAL_S = 0.02
 
 
 class Kind(StrEnum):
-    """What is asked for; a scene has at most one request of each kind, the environment belongs to no scene."""
+    """What is asked for; a scene has at most one request of each kind."""
 
     TRAINING = "training"
     TRACKING = "tracking"
@@ -37,7 +37,6 @@ class Kind(StrEnum):
     PERFORMANCE = "performance"
     LIGHT = "light"
     VIDEO = "video"
-    ENVIRONMENT = "environment"
 
 
 SUBJECTS: dict[type[Request], tuple[Kind, str]] = {
@@ -67,7 +66,6 @@ SHOWN_STATES: dict[Kind, tuple[WorkerState, ...]] = {
     Kind.PERFORMANCE: (WorkerState.FINISHED,),
     Kind.LIGHT: (WorkerState.FINISHED,),
     Kind.VIDEO: (),
-    Kind.ENVIRONMENT: (),
 }
 """Final states of a worker whose result changes the scene."""
 
@@ -88,7 +86,7 @@ class RunFiles:
 class RequestState:
     """What is known of a scene's request of one kind.
 
-    subject         run, capture, video or environment that the request is about, as the scene names it; None: none
+    subject         run, capture or video that the request is about, as the scene names it; None: none
     folder          of the request, as found now: a run may have moved along with the .blend file
     snapshot        the worker's status as last read
     files           of a run, as last seen

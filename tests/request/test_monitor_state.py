@@ -90,7 +90,7 @@ def test_a_running_request_of_any_kind(kind):
 def test_any_end_of_any_kind_stops_the_timer(kind, end):
     """Catches a timer that runs for ever, a result shown twice, and a failure or a cancelled request that is shown."""
     state, _ = after(START, status(WorkerState.WORKING), status(end, error="why"), state=RequestState(kind))
-    shown = {Kind.TRAINING: ENDS[:2], Kind.VIDEO: (), Kind.ENVIRONMENT: ()}.get(kind, ENDS[:1])
+    shown = {Kind.TRAINING: ENDS[:2], Kind.VIDEO: ()}.get(kind, ENDS[:1])
     assert (state.loading is not None) == (end in shown)
     if state.loading is not None:
         assert state.interval_s == CHECK_INTERVAL_S
