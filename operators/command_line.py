@@ -84,12 +84,12 @@ def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> in
 
 def _make_avatar(arguments: list[str], options: Any) -> int:
     """Track and train in the Python for it, which needs no bpy, and write the .blend file here."""
-    from ..stga_addon.cli.avatar import RUN, write_blend
+    from ..stga_addon.cli.avatar import RUN_FOLDER, write_blend
 
     code = _delegate([*arguments, "--no-blend"], None, played=False)
     if code or options.no_blend:
         return code
-    refined = options.out / RUN / TRACKING
+    refined = options.out / RUN_FOLDER / TRACKING
 
     def apply_refined(head: Any) -> None:
         scene_settings(bpy.context).head = head

@@ -1,5 +1,6 @@
 """Identifiers that this extension registers."""
 
+AVATAR_FROM_VIDEO = "stga.avatar_from_video"
 TRACK_FOOTAGE = "stga.track_footage"
 VIEW_FOOTAGE = "stga.view_footage"
 MARK_KEY = "stga.mark_key"
