@@ -24,8 +24,6 @@ FIRST_CAMERAS = 3
 """Most cameras of the first frame's fit."""
 COLUMNS = 2
 """Most frames of a picture, in each direction."""
-MARGIN = 1.3
-"""Side of the part of a frame that is shown, in sizes of the head."""
 
 Show = Callable[[np.ndarray], None]
 """Called with a picture (SIZE, SIZE, 3) uint8."""
@@ -68,7 +66,7 @@ def show_fit(fit: HeadFit, footage: Footage, show: Show) -> None:
 def _square(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
     """The head in the image with the mesh over it, (side, side, 3); black beyond the image."""
     left, top, right, bottom = head_box(camera, vertices)
-    size = max(int(MARGIN * max(right - left, bottom - top)), 1)
+    size = max(right - left, bottom - top)
     left, top = (left + right - size) // 2, (top + bottom - size) // 2
     cut = replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top).scaled(side / size)
     cropped = Image.fromarray(image).crop((left, top, left + size, top + size))

@@ -73,7 +73,7 @@ def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match=r"gone\.mp4: is not a file; expected a video"):
         bpy.ops.stga.avatar_from_video(filepath=str(tmp_path / "gone.mp4"))
     (tmp_path / "out/capture").mkdir(parents=True)
-    (tmp_path / "out/inputs.json").write_text('{"footage": "/shots/ben.mp4"}')
+    (tmp_path / "out/inputs.json").write_text('{"footage": "/shots/ben.mp4", "model": null}')
     with pytest.raises(RuntimeError, match=r"footage: .*out began with .*ben\.mp4"):
         bpy.ops.stga.avatar_from_video(filepath=str(video), directory=str(tmp_path / "out"), python=sys.executable)
 
