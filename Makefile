@@ -8,7 +8,7 @@ PARALLEL := -n auto --dist worksteal
 # assertions, anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo demo-footage test kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-platform extension-complete repository clean
+.PHONY: demo demo-footage test kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-complete repository clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -53,9 +53,6 @@ fuzz: .venv/ready
 
 extension: .venv/ready
 	$(BIN)/python -m stga_addon.development.package --out dist
-
-extension-platform: .venv/ready
-	$(BIN)/python -m stga_addon.development.package --edition platform --out dist
 
 # BLENDER: the command that starts a Blender, for the Python of that Blender alone; ALL=1: for every platform;
 # CUDA=1: with PyTorch's CUDA build where its CPU build cannot be had

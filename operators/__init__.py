@@ -5,16 +5,15 @@ from typing import Any
 
 import bpy
 
-from ..stga_addon.requests.environment_job import CAN_MAKE
 from . import drive, ids, monitor, prepare
 from .common import register_classes, unregister_classes
 
 MODULES = (
-    ".track", ".track_correct", ".export_head_model", ".open_demo", ".import_capture", ".import_motion",
-    ".import_meshes", ".select", ".analyze", ".train", ".continue_run", ".select_extension", ".request",
-    ".failure_report", *([".make_environment"] if CAN_MAKE else []), ".environment", ".pose", ".show", ".light",
-    ".preview_images", ".render_video", ".apply_motion", ".arkit_controls", ".drive", ".drive_video", ".import_ply",
-    ".export", ".export_cameras", ".export_performance", ".drop",
+    ".avatar_from_video", ".track", ".track_correct", ".export_head_model", ".open_demo", ".import_capture",
+    ".import_motion", ".import_meshes", ".select", ".analyze", ".train", ".continue_run", ".select_extension",
+    ".request", ".failure_report", ".training_python", ".pose", ".show", ".light", ".preview_images", ".render_video",
+    ".apply_motion", ".arkit_controls", ".drive", ".drive_video", ".import_ply", ".export", ".export_cameras",
+    ".export_performance", ".drop",
 )  # fmt: skip
 """Whose operators and file handlers are registered."""
 CLASSES = tuple(
@@ -27,6 +26,7 @@ CLASSES = tuple(
 
 
 def _import_menu(menu: Any, context: Any) -> None:
+    menu.layout.operator(ids.AVATAR_FROM_VIDEO, text="Avatar from Video (STGA)…")
     menu.layout.operator(ids.IMPORT_CAPTURE, text="Head Capture (STGA)")
     menu.layout.operator(ids.IMPORT_MOTION, text="FLAME Motion (.npz)")
     menu.layout.operator(ids.IMPORT_MESHES, text="Mesh Sequence (STGA)")

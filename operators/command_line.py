@@ -1,6 +1,5 @@
 """`blender --command stga …`: the commands of `python -m stga_addon`, by default about the open file's head."""
 
-import os
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,15 +17,14 @@ from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.tracking_file import TRACKING
-from ..stga_addon.worker.environment import PYTHON_VARIABLE
 from ..stga_addon.worker.launch import start_python
 from . import ids
-from .common import capture_of, capture_source, environment_folder, file_path, is_head, scene_settings
-from .training_python import preferred_python, training_python
+from .common import capture_of, capture_source, file_path, is_head, scene_settings
+from .training_python import training_python
 
-IN_BLENDER = ("select", "export", "demo", "environment")
+IN_BLENDER = ("select", "export", "demo")
 """Commands that need none of the packages that Blender's Python may lack, or need Blender itself; all others run in the
-training environment, also where that is Blender's own Python: as `stga_addon`, whose kernels are compiled."""
+Python that trains, also where that is Blender's own: as `stga_addon`, whose kernels are compiled."""
 
 if TYPE_CHECKING:
     from ..stga_addon.requests.open_head import OpenHead
@@ -41,8 +39,6 @@ def _run(arguments: list[str]) -> int:
         head = _open_head()
         options = make_parser(head).parse_args(arguments)
         command = options.command
-        if command == "environment":
-            _prepare_environment_command(options)
         if command in IN_BLENDER:
             return main(arguments, head)
         if command == "avatar":
@@ -51,17 +47,6 @@ def _run(arguments: list[str]) -> int:
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2
-
-
-def _prepare_environment_command(options: Any) -> None:
-    """Pass Blender's folder and preferences on. Raises StgaError for a download while Blender is offline."""
-    from ..stga_addon.cli.environment import FOLDER_VARIABLE
-
-    os.environ[FOLDER_VARIABLE] = str(environment_folder(create=True))
-    if preferred_python(bpy.context):
-        os.environ.setdefault(PYTHON_VARIABLE, preferred_python(bpy.context))
-    if options.action == "make" and options.wheels is None and not bpy.app.online_access:
-        raise StgaError("Blender is offline: start it with --online-mode, or give a folder of --wheels")
 
 
 def _open_head() -> "OpenHead | None":
@@ -84,7 +69,7 @@ def _open_head() -> "OpenHead | None":
 
 
 def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
-    """Run the command in the training environment; returns its exit code. Raises StgaError where there is none."""
+    """Run the command in the Python that trains; returns its exit code. Raises StgaError where there is none."""
     from ..stga_addon.requests.open_head import FOLDER, write_head
 
     python = training_python(bpy.context)
@@ -98,13 +83,13 @@ def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> in
 
 
 def _make_avatar(arguments: list[str], options: Any) -> int:
-    """Track and train in the training environment, which needs no bpy, and write the .blend file here."""
-    from ..stga_addon.cli.avatar import RUN, write_blend
+    """Track and train in the Python for it, which needs no bpy, and write the .blend file here."""
+    from ..stga_addon.cli.avatar import RUN_FOLDER, write_blend
 
     code = _delegate([*arguments, "--no-blend"], None, played=False)
     if code or options.no_blend:
         return code
-    refined = options.out / RUN / TRACKING
+    refined = options.out / RUN_FOLDER / TRACKING
 
     def apply_refined(head: Any) -> None:
         scene_settings(bpy.context).head = head

@@ -48,14 +48,6 @@ def package() -> str:
     return str(__package__).rpartition(".")[0]
 
 
-def environment_folder(create: bool = False) -> Path:
-    """The folder of the training environment; a checkout, which is no extension, has it among Blender's user data."""
-    try:
-        return Path(bpy.utils.extension_path_user(package(), path="environment", create=create))
-    except ValueError:
-        return Path(bpy.utils.user_resource("DATAFILES", path="stga_environment", create=create))
-
-
 def head_of(context: Any) -> Any:
     """The scene's head. Raises StgaError where it has none."""
     head = scene_settings(context).head

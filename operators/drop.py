@@ -1,4 +1,4 @@
-"""Files dropped into the 3D viewport: a capture, an avatar or FLAME motion, a face performance, Gaussian splats."""
+"""Files dropped into the 3D viewport: video, capture, avatar or FLAME motion, face performance, Gaussian splats."""
 
 import zipfile
 from pathlib import Path
@@ -8,6 +8,7 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
+from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
 from . import ids
 from .apply_motion import ApplyMotion
 from .common import file_path, is_head, path_property, reporting, scene_settings
@@ -62,6 +63,13 @@ class _ViewportDrop:
     @classmethod
     def poll_drop(cls, context: Any) -> bool:
         return context.area is not None and context.area.type == "VIEW_3D"
+
+
+class VideoDrop(_ViewportDrop, bpy.types.FileHandler):
+    bl_idname = "STGA_FH_video"
+    bl_label = "Avatar from Video (STGA)"
+    bl_import_operator = ids.AVATAR_FROM_VIDEO
+    bl_file_extensions = ";".join(VIDEO_SUFFIXES)
 
 
 class CaptureDrop(_ViewportDrop, bpy.types.FileHandler):

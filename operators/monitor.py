@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from subprocess import Popen
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any, Protocol
 
 import bpy
@@ -18,9 +18,10 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ..stga_addon.errors import StgaError
+from ..stga_addon.files import read_npz
 from ..stga_addon.report.curve_image import curve_image
 from ..stga_addon.requests import monitor_state as states
-from ..stga_addon.requests.folder import PREVIEW, remove_request, request_folder
+from ..stga_addon.requests.folder import PICTURE, PREVIEW, remove_request, request_folder
 from ..stga_addon.requests.monitor_state import (
     CHECK_INTERVAL_S,
     SLICE_INTERVAL_S,
@@ -31,26 +32,25 @@ from ..stga_addon.requests.monitor_state import (
     RunFiles,
     transition,
 )
+from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.viewports import open_sidebar
+from ..stga_addon.tracking.folder import SPLIT_FILES
+from ..stga_addon.training.run.folder import AVATAR
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.training.run.tracking_file import TRACKING
-from ..stga_addon.worker.environment import status_folder
 from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker, refuse_running_worker, request_cancel
 from . import ids
-from .common import environment_folder, is_head
+from .common import is_head
 from .results import KINDS, loader
 
 Curve = tuple[np.ndarray, str, str]
-"""Pixels of a run's curve, the ranges of its axes and of the detail difference."""
-
-NO_SCENE = 0
-"""Stands for the session id of a scene, of the training environment, which belongs to none."""
+"""Pixels of a run's curve, the ranges of its axes and of the detail difference; or those of a tracking's picture."""
 
 _states: dict[tuple[int, Kind], RequestState] = {}
 """Session id of a scene and kind -> its request."""
 _curves: dict[Path, Curve | None] = {}
-"""Run folder -> its curve as last read."""
+"""Run or capture folder -> its curve as last read."""
 _processes: dict[Path, "Popen[bytes]"] = {}
 """Folder of a request -> worker that this Blender started, whose exit code is known."""
 
@@ -97,7 +97,7 @@ def state_of(scene: Any, kind: Kind) -> RequestState:
 
 
 def curve(run: Path) -> Curve | None:
-    """The curve of a run as the timer last read it; None before two evaluations."""
+    """The curve of a run as the timer last read it, or the picture of a tracking; None before there is one."""
     return _curves.get(run)
 
 
@@ -110,9 +110,15 @@ def follow(scene: Any, kind: Kind, subject: Path, folder: Path, process: "Popen[
 
 
 def finish(scene: Any, kind: Kind) -> RequestState:
-    """Bring the result of a request that was waited for into the scene; a trained avatar is stored, not shown."""
-    state = _handle(scene, kind, _read_status(scene, _states[_key(scene, kind)], show_result=False))
-    return _handle(scene, kind, states.SceneFree()) if state.loading is not None else state
+    """Bring the result of a request that was waited for into the scene; what `Train` made is stored, not shown."""
+    state = _handle(scene, kind, _read_status(scene, _states[_key(scene, kind)], kind != Kind.TRAINING))
+    while state.loading is not None:
+        state = _handle(scene, kind, states.SceneFree())
+        if state.loading is not None:
+            sleep(SLICE_INTERVAL_S)
+        elif state.has_result:
+            state = _handle(scene, kind, _read_status(scene, state, True))
+    return state
 
 
 def cancel(scene: Any, kind: Kind) -> None:
@@ -159,10 +165,7 @@ def _check_requests() -> float | None:
     if _watched and now < _requests_due:
         return _requests_due - now
     scenes = [scene for scene in bpy.data.scenes if scene.library is None]
-    intervals = [_check_safely(scene, kind) for scene in scenes for kind in Kind if kind != Kind.ENVIRONMENT]
-    environment = _states.get((NO_SCENE, Kind.ENVIRONMENT))
-    if environment is None or environment.is_running:
-        intervals.append(_check_safely(None, Kind.ENVIRONMENT))
+    intervals = [_check_safely(scene, kind) for scene in scenes for kind in Kind]
     interval = min((interval for interval in intervals if interval is not None), default=None)
     _requests_due = now + (CHECK_INTERVAL_S if interval is None else interval)
     return interval
@@ -209,7 +212,7 @@ def _describe(error: Exception) -> str:
 
 
 def _key(scene: Any, kind: Kind) -> tuple[int, Kind]:
-    return NO_SCENE if kind == Kind.ENVIRONMENT else scene.session_uid, kind
+    return scene.session_uid, kind
 
 
 def _is_edited(scene: Any, kind: Kind) -> bool:
@@ -219,8 +222,6 @@ def _is_edited(scene: Any, kind: Kind) -> bool:
 
 def _stored_state(scene: Any, kind: Kind) -> RequestState:
     """A request that was not seen yet, as it is stored."""
-    if kind == Kind.ENVIRONMENT:
-        return RequestState(kind, environment_folder(), status_folder(environment_folder()))
     state = RequestState(kind)
     if kind in STORED:
         subject, result_shown = _read_stored(scene, kind)
@@ -259,10 +260,14 @@ def _read_scene(scene: Any, kind: Kind) -> RequestState:
 def _read_status(scene: Any, state: RequestState, show_result: bool | None = None) -> states.StatusRead:
     folder = _locate(scene, state)
     assert folder is not None
-    if state.kind != Kind.TRAINING:
+    if state.kind not in STORED:
         return states.StatusRead(folder, inspect_status(folder))
-    settings, run = getattr(scene, ids.SETTINGS), folder.parent
-    files = RunFiles(_stamp(folder / PREVIEW), _stamp(run / METRICS), _stamp(run / TRACKING))
+    settings, run = getattr(scene, ids.SETTINGS), replace(state, folder=folder).run
+    files = RunFiles(
+        _stamp(folder.parent / CAPTURE_FOLDER / SPLIT_FILES[0]) if state.kind == Kind.AVATAR else None,
+        _stamp(folder / PICTURE),
+        *map(_stamp, (folder / PREVIEW, run / AVATAR, run / METRICS, run / TRACKING)),
+    )
     shown = settings.show_result if show_result is None else show_result
     return states.StatusRead(folder, inspect_status(folder), files, settings.live_preview, shown)
 
@@ -304,7 +309,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
         case states.Show():
             return _show(scene, state)
         case states.ReadCurve(run):
-            _curves[run] = _read_curve(run)
+            _curves[run] = _read_curve(run) or _read_picture(state.folder)
         case states.StopWorker(folder):
             request_cancel(folder)
         case states.KillWorker(folder):
@@ -338,7 +343,8 @@ def _remove(kind: Kind, folder: Path) -> None:
             refuse_running_worker(folder)
         shutil.rmtree(folder, ignore_errors=True)
     _processes.pop(folder, None)
-    _curves.pop(folder.parent, None)
+    for drawn in (folder.parent, folder.parent / RUN_FOLDER):
+        _curves.pop(drawn, None)
 
 
 def _read_curve(run: Path) -> Curve | None:
@@ -346,6 +352,17 @@ def _read_curve(run: Path) -> Curve | None:
         return curve_image(read_metrics(run))
     except (StgaError, KeyError, TypeError, ValueError):
         return None  # training reports a damaged file
+
+
+def _read_picture(folder: Path | None) -> Curve | None:
+    """What the tracking of the request in this folder shows."""
+    try:
+        rgb = read_npz(folder / PICTURE)["rgb"] if folder is not None else None
+    except (StgaError, KeyError):
+        return None
+    if rgb is None or rgb.ndim != 3 or rgb.dtype != np.uint8:
+        return None
+    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])[::-1].astype(np.float32) / 255, "", ""
 
 
 def _push_undo() -> None:
@@ -395,7 +412,7 @@ def _after_load(_: Any) -> None:
     loader.close()
     _close_watched()
     _end_unawaited()
-    for key in [key for key in _states if key[1] not in (Kind.VIDEO, Kind.ENVIRONMENT)]:
+    for key in [key for key in _states if key[1] != Kind.VIDEO]:
         del _states[key]  # of scenes of the file before; its videos are still rendered
     for scene in bpy.data.scenes:
         if scene.library is None:

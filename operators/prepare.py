@@ -22,8 +22,8 @@ _processes: list["subprocess.Popen[bytes]"] = []
 
 
 def begin_preparing(context: Any) -> None:
-    """Compile in the background what the first training would wait for; nothing without a window, without a training
-    environment, or where it is compiled or is being compiled."""
+    """Compile in the background what the first training would wait for; nothing without a window, without a
+    Python that trains, or where it is compiled or is being compiled."""
     if bpy.app.background or CACHE_VARIABLE not in os.environ or has_kernels(cache_folder() / KERNELS):
         return
     if any(process.poll() is None for process in _processes):

@@ -11,11 +11,11 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.folder import check_request, request_folder, worker_arguments, write_request
-from ..stga_addon.requests.monitor_state import DISMISSIBLE, STORED, SUBJECTS, TRANSIENT, Kind
+from ..stga_addon.requests.monitor_state import DISMISSIBLE, STORED, SUBJECTS, TRAINS, TRANSIENT, Kind
 from ..stga_addon.requests.values import Request
-from ..stga_addon.worker.environment import missing_packages
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, failure_report, inspect_worker
+from ..stga_addon.worker.training_python import missing_packages
 from . import ids, monitor
 from .common import polled, reporting
 from .results import KINDS
@@ -53,7 +53,7 @@ def start(scene: Any, request: Request, python: str | None, folder: Path | None 
     shown = monitor.finish(scene, kind)
     if last.state.failed or shown.error:
         raise StgaError(shown.error or last.status.error)
-    if last.state == WorkerState.CANCELLED and kind != Kind.TRAINING:  # which keeps the avatar so far
+    if last.state == WorkerState.CANCELLED and kind not in TRAINS:  # which keep the avatar so far
         raise StgaError("The worker was cancelled")
     return True
 

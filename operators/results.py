@@ -14,6 +14,7 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.folder import read_request, read_result
 from ..stga_addon.requests.monitor_state import Kind, RequestState, Shown, SliceBuilt
+from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
@@ -27,6 +28,7 @@ from ..stga_addon.scene.display.splat_object import (
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR
+from ..stga_addon.training.run.tracking_file import TRACKING
 from . import ids
 from .common import is_head
 from .select import count_selected
@@ -68,9 +70,17 @@ def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
 # Training
 
 
+def _run(state: RequestState) -> Path:
+    """The run that is trained, as the scene names it."""
+    assert state.subject is not None
+    return state.subject / RUN_FOLDER if state.kind == Kind.AVATAR else state.subject
+
+
 def _run_object(scene: Any, state: RequestState) -> Any:
     """The object that shows the run, or None."""
-    return next((thing for thing in scene.objects if thing.get(tags.RUN) == str(state.subject)), None)
+    if state.subject is None:
+        return None
+    return next((thing for thing in scene.objects if thing.get(tags.RUN) == str(_run(state))), None)
 
 
 def _show_avatar(scene: Any, state: RequestState) -> Answer:
@@ -84,7 +94,7 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
         if isinstance(answer, SliceBuilt):
             ended.pop_all()
         elif state.subject is not None:
-            show_world(state.subject / AVATAR, _head(scene, state))
+            show_world(_run(state) / AVATAR, _head(scene, state))
     return answer
 
 
@@ -100,9 +110,9 @@ def _present(scene: Any, state: RequestState, avatar: Avatar, attributes: SplatA
         return SliceBuilt()
     if shown is not None:
         bpy.data.objects.remove(shown)
-    assert state.subject is not None
-    shown = show(scene, avatar, head, f"{head.name} {state.subject.name}", attributes=attributes)
-    shown[tags.RUN] = str(state.subject)
+    run = _run(state)
+    shown = show(scene, avatar, head, f"{head.name} {run.name}", attributes=attributes)
+    shown[tags.RUN] = str(run)
     return Shown(undoable=True)
 
 
@@ -145,8 +155,36 @@ def _load(path: Path) -> tuple[Avatar, SplatAttributes]:
 def _import_tracked(scene: Any, state: RequestState) -> Answer:
     """Import the tracked capture."""
     assert state.folder is not None
-    model = getattr(read_request(state.folder), "model", "") if is_flame(state.place) else ""
-    return _operate(scene, bpy.ops.stga.import_capture, directory=str(state.place), flame=str(model))
+    return _import(scene, state.place, getattr(read_request(state.folder), "model", None))
+
+
+def _import(scene: Any, capture: Path, model: Path | None) -> Shown:
+    """model: what it was tracked with; None: what lies in the capture."""
+    flame = str(model) if model is not None and is_flame(capture) else ""
+    return _operate(scene, bpy.ops.stga.import_capture, directory=str(capture), flame=flame)
+
+
+# Avatars from footage
+
+
+def _show_made(scene: Any, state: RequestState) -> Answer:
+    """Import the capture once it is tracked; then show the previews and the avatar, at last on the head that training
+    refined."""
+    assert state.folder is not None
+    assert state.loading is not None
+    head, settings = _head(scene, state), getattr(scene, ids.SETTINGS)
+    if state.loading.name == CAPTURE_FOLDER:
+        settings.run_folder = str(_run(state))
+        if is_head(head) and Path(head[tags.CAPTURE]) == state.loading:
+            return Shown()
+        request = read_request(state.folder)
+        assert isinstance(request, MakeAvatar)
+        return _import(scene, state.loading, request.track.model)
+    answer = _show_avatar(scene, state)
+    if isinstance(answer, Shown) and state.loading.name == AVATAR and state.files.tracking is not None:
+        first = head[tags.TIMESTEPS][0]
+        _operate(scene, bpy.ops.stga.apply_motion, filepath=str(state.run / TRACKING), own_offsets=True, start=first)
+    return answer
 
 
 # Analysis and selection
@@ -215,6 +253,13 @@ KINDS = {
         _import_tracked,
         _head,
     ),
+    Kind.AVATAR: RequestKind(
+        "Making an avatar",
+        "Stop, and keep what there is so far; Avatar from Video with the same video continues",
+        ("avatar_folder", "avatar_shown"),
+        _show_made,
+        _run_object,
+    ),
     Kind.ANALYSIS: RequestKind("The analysis", "Stop the analysis; earlier results stay", show=_fill_effects),
     Kind.SELECTION: RequestKind(
         "The selection", "Stop selecting; the groups stay as they are", show=_select_for_take, changed=_head
@@ -228,9 +273,6 @@ KINDS = {
     Kind.LIGHT: RequestKind("The estimate of light", "Stop; the avatar stays as it is", show=_store_light),
     Kind.VIDEO: RequestKind(
         "The video", "Stop making the video; nothing is written, or the PNGs that are finished stay"
-    ),
-    Kind.ENVIRONMENT: RequestKind(
-        "Set-up of the training environment", "Stop making the training environment, and remove the incomplete one"
     ),
 }
 """The only table of what depends on the kind of a request in Blender."""

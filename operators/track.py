@@ -58,7 +58,7 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
     )
     python: bpy.props.StringProperty(
         name="Python",
-        description="Python interpreter that tracks; empty: the training environment of the preferences",
+        description="Python interpreter that tracks; empty: that of the preferences, or Blender's own",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )

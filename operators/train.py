@@ -12,10 +12,10 @@ from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.effect_decisions import parse_choices
 from ..stga_addon.training.run.folder import read_run
 from ..stga_addon.training.settings import PRESETS, make_settings
-from ..stga_addon.worker.environment import stored_adapters
 from . import ids
-from .common import capture_source, environment_folder, file_path, head_of, needs_head, path_property, reporting
+from .common import capture_source, file_path, head_of, needs_head, path_property, reporting
 from .request import needs_idle, python_of, start
+from .training_python import test
 
 
 def preset_property(**more: Any) -> Any:
@@ -30,8 +30,8 @@ def preset_property(**more: Any) -> Any:
 
 
 def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
-    """The GPUs that the last test of the training environment found, in its order."""
-    return stored_adapters(environment_folder())
+    """The GPUs that the last test of the Python found, in its order."""
+    return list(test.found.adapters) if test.found else []
 
 
 class DeviceOptions:
@@ -48,7 +48,7 @@ class DeviceOptions:
     )
     adapter: bpy.props.StringProperty(
         name="GPU",
-        description="Name of the GPU; empty: the first. The list is that of the last test of the training environment",
+        description="Name of the GPU; empty: the first. The list is that of the last test of the Python",
         search=list_adapters,
         search_options={"SUGGESTION"},
     )
@@ -78,7 +78,7 @@ class TrainingOperator:
     )
     python: bpy.props.StringProperty(
         name="Python",
-        description="Python interpreter that trains; empty: the training environment of the preferences",
+        description="Python interpreter that trains; empty: that of the preferences, or Blender's own",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )

@@ -4,12 +4,10 @@ import sys
 
 try:
     from .cli.main import main
-    from .worker.environment_use import mark_environment_used
 except ModuleNotFoundError as error:
     print(f"stga: {sys.executable} lacks the package '{error.name}'", file=sys.stderr)
     raise SystemExit(2) from None
 except KeyboardInterrupt:
     raise SystemExit(130) from None
 
-mark_environment_used()
 raise SystemExit(main())

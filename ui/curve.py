@@ -1,4 +1,4 @@
-"""Picture of a run's accuracy curve in the panel."""
+"""Picture of a run's accuracy curve, or of a tracking, in the panel."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,6 @@ import bpy.utils.previews
 import numpy as np
 
 from ..operators import monitor
-from ..stga_addon.report.curve_image import SIZE
 
 SCALE = 8.0
 """Side of the picture in the panel, in heights of a button."""
@@ -19,7 +18,7 @@ _shown: dict[Path, monitor.Curve] = {}
 
 
 def draw_curve(layout: Any, folder: Path) -> None:
-    """Draw the curve of the run in this folder; nothing before its second evaluation."""
+    """Draw the curve of the run in this folder, or the head over the footage that is tracked; nothing before then."""
     curve = monitor.curve(folder)
     if curve is None:
         return
@@ -35,7 +34,7 @@ def draw_curve(layout: Any, folder: Path) -> None:
 def _fill_preview(name: str, pixels: np.ndarray) -> None:
     _previews.pop(name, None)  # a new one, because Blender keeps the texture of the old one
     preview = _previews.new(name)
-    preview.image_size = SIZE, SIZE
+    preview.image_size = pixels.shape[1], pixels.shape[0]
     preview.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
 
 

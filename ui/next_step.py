@@ -19,7 +19,7 @@ from ..stga_addon.worker.status import WorkerState
 from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .train_panel import draw_environment_setup, draw_train_button
+from .train_panel import draw_missing_python, draw_train_button
 
 
 class NextStepPanel(SidebarPanel, bpy.types.Panel):
@@ -29,6 +29,14 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
         training, tracking = (monitor.state_of(context.scene, kind) for kind in (Kind.TRAINING, Kind.TRACKING))
+        making = monitor.state_of(context.scene, Kind.AVATAR)
+        if draw_running(layout, context, Kind.AVATAR):
+            draw_text(layout, context, "Head, then splats appear. Go on working, save, or quit Blender", "INFO")
+            return
+        if making.subject is not None:
+            draw_end(layout, context, making)
+            if making.snapshot.state != WorkerState.FINISHED:
+                layout.operator(ids.AVATAR_FROM_VIDEO, text="Continue…", icon="FILE_MOVIE")
         if tracking.is_running:
             done = f"Tracking, {100 * tracking.snapshot.status.progress:.0f} %"
             draw_text(
@@ -38,8 +46,10 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_text(
                 layout,
                 context,
-                "Import a capture: the tracked head, its cameras and their images. Or track your own footage below",
+                "Choose a video of a face. Or import a capture: a tracked head, its cameras and their images",
             )
+            draw_missing_python(layout, context)
+            layout.operator(ids.AVATAR_FROM_VIDEO, text="Avatar from Video…", icon="FILE_MOVIE")
             layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
             if OpenDemo.poll(context):
                 layout.operator(ids.OPEN_DEMO, icon="USER")
@@ -54,12 +64,8 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, context, "Train an avatar, or choose a trained one under 4 Show")
             draw_train_button(layout, settings)
         else:
-            draw_text(
-                layout,
-                context,
-                "Training needs a Python environment; to show a trained avatar, go to 4 Show",
-            )
-            draw_environment_setup(layout)
+            draw_text(layout, context, "Training needs a Python; to show a trained avatar, go to 4 Show")
+            draw_missing_python(layout, context)
 
 
 def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:

@@ -1,17 +1,14 @@
-"""Preferences of the add-on: the FLAME model, the training environment and the device that renders."""
+"""Preferences of the add-on: the FLAME model, the Python that tracks and trains, and the device that renders."""
 
 from typing import Any
 
 import bpy
 
-from ..operators import ids, monitor
+from ..operators import ids
 from ..operators.common import path_property, register_classes, unregister_classes
-from ..operators.training_python import has_training_python
-from ..stga_addon.requests.environment_job import CAN_MAKE
-from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.worker.environment import PYTHON_VARIABLE
-from ..stga_addon.worker.status import WorkerState
-from .request import draw_failure, draw_running
+from ..operators.training_python import has_training_python, test
+from ..stga_addon.worker.training_python import PYTHON_VARIABLE
+from .text import draw_text
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -25,8 +22,8 @@ class Preferences(bpy.types.AddonPreferences):
 
     training_python: bpy.props.StringProperty(
         name="Python",
-        description="An interpreter that has torch, numba and what else training needs; empty: the one chosen with "
-        f"`stga environment use`, or the environment made here. The variable {PYTHON_VARIABLE} takes precedence",
+        description="An interpreter that has torch, numba and what else tracking and training need; empty: Blender's "
+        f"own, which has it all with the complete edition. The variable {PYTHON_VARIABLE} takes precedence",
         subtype="FILE_PATH",
     )
 
@@ -43,27 +40,23 @@ class Preferences(bpy.types.AddonPreferences):
     def draw(self, context: Any) -> None:
         self.layout.prop(self, "flame_model")
         self.layout.prop(self, "render_device")
-        _draw_environment(self.layout.box(), context, self)
+        _draw_python(self.layout.box(), context, self)
 
 
-def _draw_environment(box: Any, context: Any, stored: Any) -> None:
-    box.label(text="Training Environment")
+def _draw_python(box: Any, context: Any, stored: Any) -> None:
     row = box.split(factor=0.8, align=True)
     row.prop(stored, "training_python")
-    row.operator(ids.TEST_ENVIRONMENT)
-    if draw_running(box, context, Kind.ENVIRONMENT):
-        return
-    environment = monitor.state_of(context.scene, Kind.ENVIRONMENT)
-    state = environment.snapshot.state
-    if state.failed:
-        box.label(text="Failed", icon="ERROR")
-        draw_failure(box, context, environment)
-    elif state == WorkerState.FINISHED:
-        box.label(text=environment.snapshot.status.message, icon="CHECKMARK")
+    row.operator(ids.TEST_PYTHON)
+    if test.is_running:
+        box.label(text=f"Testing {test.python}", icon="TIME")
+    elif test.error:
+        draw_text(box, context, test.error, "ERROR")
+    elif test.found is not None:
+        draw_text(box, context, f"{test.python}: {test.found.line}", "CHECKMARK")
     elif not has_training_python(context):
-        box.label(text="No training environment yet", icon="INFO")
-    if CAN_MAKE:
-        box.operator(ids.MAKE_ENVIRONMENT, text="Make Training Environment…", icon="IMPORT")
+        draw_text(
+            box, context, "Blender's Python lacks packages: choose another, or install the complete edition", "INFO"
+        )
 
 
 def register() -> None:

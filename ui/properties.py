@@ -93,6 +93,8 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     track: bpy.props.PointerProperty(type=TrackSettings)
     tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last tracking
     tracking_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it was imported
+    avatar_folder: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last video's avatar
+    avatar_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it has reached the scene
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: bpy.props.IntProperty(options={"HIDDEN"})
     motion_source: bpy.props.PointerProperty(

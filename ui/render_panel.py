@@ -27,6 +27,5 @@ class RenderPanel(bpy.types.Panel):
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages() and not has_gpu_context():
-            has_environment = has_training_python(context)
-            renderer = "Rendered by the training environment" if has_environment else "No Python here can render"
+            renderer = "Rendered by another Python" if has_training_python(context) else "No Python here can render"
             layout.label(text=f"{renderer}: Blender's Python lacks {', '.join(missing_packages())}", icon="INFO")

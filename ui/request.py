@@ -4,7 +4,7 @@ import textwrap
 from typing import Any
 
 from ..operators import ids, monitor
-from ..stga_addon.requests.monitor_state import Kind, RequestState
+from ..stga_addon.requests.monitor_state import STORED, Kind, RequestState
 from ..stga_addon.training.run.progress import describe_figures
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
@@ -22,6 +22,12 @@ ENDS = {
         WorkerState.CANCELLED: "Cancelled; Track continues",
         WorkerState.FAILED: "Tracking failed",
         WorkerState.NONE: "Capture not found",
+    },
+    Kind.AVATAR: {
+        WorkerState.FINISHED: "Avatar made",
+        WorkerState.CANCELLED: "Cancelled; Avatar from Video continues",
+        WorkerState.FAILED: "Making the avatar failed",
+        WorkerState.NONE: "Its folder was not found",
     },
     Kind.VIDEO: {
         WorkerState.FINISHED: "Video rendered",
@@ -47,8 +53,8 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
     column = layout.column(align=True)
     for line in (*describe_figures(now.status.figures), now.status.detail):
         draw_text(column, context, line)
-    if kind == Kind.TRAINING:
-        draw_curve(layout, state.place)
+    if kind in STORED:
+        draw_curve(layout, state.run)
     layout.operator(ids.CANCEL, text="Cancel", icon="CANCEL").request = kind
     return True
 

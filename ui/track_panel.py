@@ -16,7 +16,7 @@ from .options import set_options
 from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
-from .train_panel import draw_missing_environment
+from .train_panel import draw_missing_python
 
 
 class TrackPanel(SidebarPanel, bpy.types.Panel):
@@ -36,7 +36,7 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
             layout.prop(settings.track, name)
         track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
         set_options(track, settings.track, TrackOptions)
-        draw_missing_environment(layout, context)
+        draw_missing_python(layout, context)
 
 
 class TrackOptionsPanel(SidebarPanel, bpy.types.Panel):

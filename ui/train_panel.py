@@ -48,7 +48,7 @@ def _draw_choices(layout: Any, context: Any) -> None:
     row = layout.row(align=True)
     draw_train_button(row, settings)
     draw_train_button(row, settings, resume=True)
-    draw_missing_environment(layout, context)
+    draw_missing_python(layout, context)
 
 
 def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
@@ -61,16 +61,11 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     train.effects = " ".join(chosen_effects(settings))
 
 
-def draw_missing_environment(layout: Any, context: Any) -> None:
-    """Say where there is no training environment yet, and how to make one."""
+def draw_missing_python(layout: Any, context: Any) -> None:
+    """Where no Python here can track and train, say where one is chosen."""
     if not has_training_python(context):
-        layout.label(text="No training environment yet", icon="INFO")
-        draw_environment_setup(layout)
-
-
-def draw_environment_setup(layout: Any) -> None:
-    """Draw the button that opens the preferences, where a training environment is made."""
-    layout.operator("preferences.addon_show", text="Set Up in Preferences", icon="PREFERENCES").module = package()
+        show = layout.operator("preferences.addon_show", text="Choose a Python in Preferences", icon="PREFERENCES")
+        show.module = package()
 
 
 class TrainOptionsPanel(SidebarPanel, bpy.types.Panel):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from ..requests.folder import worker_arguments
-from ..worker.environment import PYTHON_VARIABLE
 from ..worker.status import WorkerSnapshot
+from ..worker.training_python import PYTHON_VARIABLE
 from .job import Job
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from ..requests.folder import request_folder
-from ..requests.values import Extend, Refine, RenderBlend, Request, Resume, Train
+from ..requests.values import Extend, MakeAvatar, Refine, RenderBlend, Request, Resume, Train
 from ..schema import IS_PATH, setting
 from ..training.run.folder import AVATAR
 
 KINDS: dict[str, type[Any]] = {}
-"""Name of a request in a plan -> its dataclass: every request but Resume, which is how an interrupted one continues."""
+"""Name of a request in a plan -> its dataclass: every request but Resume, which is how an interrupted one
+continues, and MakeAvatar, which is two jobs."""
 TRAININGS = (Train, Refine, Extend)
 OUTPUT_FIELDS = ("out", "output")
 """Names of the field that says where a request writes; of a training it is `run`."""
@@ -24,7 +25,7 @@ def kind_name(kind: type[Any]) -> str:
     return "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__).lstrip("-")
 
 
-KINDS.update({kind_name(kind): kind for kind in get_args(Request) if kind is not Resume})
+KINDS.update({kind_name(kind): kind for kind in get_args(Request) if kind not in (Resume, MakeAvatar)})
 
 
 @dataclass(frozen=True)

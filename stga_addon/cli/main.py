@@ -33,7 +33,6 @@ COMMANDS = (
     ".drive",
     ".info",
     ".presets",
-    ".environment",
     "..development.benchmark.command",
     "..development.demo.command",
 )

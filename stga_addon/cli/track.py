@@ -72,7 +72,7 @@ def tracking_request(options: Namespace, out: Path) -> Track:
     """What `add_footage`'s options ask for, into the folder `out`."""
     return Track(
         options.footage, options.model, out, options.cameras, options.landmarks, options.focal,
-        options.start, options.stop, options.step, dict(options.offset), options.meshes,
+        options.start, options.stop, options.step, dict(options.offset) or None, options.meshes,
         options.world, options.sync, options.mattes,
     )  # fmt: skip
 

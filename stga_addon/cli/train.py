@@ -64,7 +64,7 @@ def training_request(options: Namespace) -> Train | Resume:
     """Raises StgaError for options that do not go together, or that differ from those that a run began with."""
     selection = None if options.head is None else options.head.selection()
     if options.resume:
-        _refuse_changes(options, read_run(options.out))
+        refuse_changes(options, read_run(options.out))
         return Resume(
             options.out, options.capture, options.flame, options.principal_point, options.device, selection
         )  # fmt: skip
@@ -116,7 +116,7 @@ def _refuse_overwritten(options: Namespace) -> None:
             raise StgaError(f"{option}: cannot be combined with {by}, which has settings of its own")
 
 
-def _refuse_changes(options: Namespace, run: Run) -> None:
+def refuse_changes(options: Namespace, run: Run) -> None:
     """Raise StgaError for an option that differs from what the run to be resumed began with."""
     settings = run.settings
     began_with = {

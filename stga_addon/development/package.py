@@ -18,7 +18,7 @@ from ..errors import StgaError, exit_code
 from ..files import replacing
 from .compiled_kernels import compile_kernels
 from .demo.capture import CaptureOptions, make_capture
-from .editions import DEMO_FOLDER, PLATFORM, SMALL, Edition, complete, edition_manifest
+from .editions import DEMO_FOLDER, SMALL, Edition, complete, edition_manifest
 from .wheels import TARGETS, Target, collect_wheels, this_platform
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,7 +48,7 @@ def build_zip(
     """
     manifest = read_manifest(root)
     wheels = edition_wheels(root / "wheels", edition)
-    files = {file.relative_to(root).as_posix(): file for file in extension_files(root, manifest, edition)}
+    files = {file.relative_to(root).as_posix(): file for file in extension_files(root, manifest)}
     files |= {f"wheels/{wheel.name}": wheel for wheel in wheels}
     if demo is not None:
         files |= {f"{DEMO_FOLDER}/{file.relative_to(demo).as_posix()}": file for file in _walk(demo, demo, [])}
@@ -89,10 +89,10 @@ def read_manifest(root: Path) -> dict[str, Any]:
         raise StgaError(f"{root / MANIFEST}: cannot be read ({error.strerror}); expected a checkout") from error
 
 
-def extension_files(root: Path, manifest: dict[str, Any], edition: Edition = SMALL) -> list[Path]:
-    """The files of the zip from the checkout, sorted: what `paths_exclude_pattern` and the edition leave."""
+def extension_files(root: Path, manifest: dict[str, Any]) -> list[Path]:
+    """The files of the zip from the checkout, sorted: what `paths_exclude_pattern` leaves."""
     patterns = manifest["build"]["paths_exclude_pattern"]
-    return sorted(_walk(root, root, [*patterns, *edition.left_out, f"/{MANIFEST}", "/wheels/"]))
+    return sorted(_walk(root, root, [*patterns, f"/{MANIFEST}", "/wheels/"]))
 
 
 def fetch_wheels(folder: Path) -> None:
@@ -162,7 +162,7 @@ def target_of(blender: Sequence[str]) -> Target:
 def build_editions(options: argparse.Namespace) -> Iterator[Path]:
     """Build the edition that was asked for, the complete one for each of its targets. Raises StgaError."""
     if options.edition != "complete":
-        yield build_zip(options.out, edition={"small": SMALL, "platform": PLATFORM}[options.edition])
+        yield build_zip(options.out)
         return
     here = this_platform()
     targets = [target_of(shlex.split(options.blender))] if options.blender else list(TARGETS)
@@ -182,7 +182,7 @@ def build_editions(options: argparse.Namespace) -> Iterator[Path]:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m stga_addon.development.package", description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder that receives the zip")
-    parser.add_argument("--edition", choices=("small", "platform", "complete"), default="small")
+    parser.add_argument("--edition", choices=("small", "complete"), default="small")
     parser.add_argument("--blender", default="", help="complete: for the Python of this Blender, and no other")
     parser.add_argument("--all", action="store_true", help="complete: for every platform, not only this one")
     parser.add_argument(

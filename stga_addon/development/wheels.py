@@ -19,9 +19,11 @@ from packaging.tags import Tag, cpython_tags
 from packaging.utils import canonicalize_name, parse_wheel_filename
 
 from ..errors import StgaError
-from ..requests.environment_make import TORCH_CPU_INDEX
 from ..worker.requirements import GPU_REQUIREMENT, REQUIREMENTS
 
+TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+"""PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which PyPI has for Linux,
+takes gigabytes. Everything else comes from PyPI, or the mirror that pip is configured for."""
 PLATFORM_TAGS = {
     "linux-x64": (
         *(f"manylinux_2_{minor}_x86_64" for minor in range(28, 4, -1)),

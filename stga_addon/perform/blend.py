@@ -15,8 +15,8 @@ from ..errors import StgaError
 from ..progress import Cancelled, Progress, Report, Say
 from ..requests.results import Written
 from ..requests.values import FRAME_DIGITS, RenderBlend
-from ..worker.environment import BLENDER_VARIABLE, PYTHON_VARIABLE
 from ..worker.launch import end_with_this_process
+from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
 
 PARTIAL = ".rendering-"
 """Start of the name of the folder that Blender writes into; a picture leaves it when it is whole."""
@@ -30,7 +30,7 @@ STOP_TIMEOUT_S = 10.0
 def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
     """Render the frames that have no picture yet.
 
-    The add-on has to be enabled in that Blender; it renders with the training environment of this process, unless
+    The add-on has to be enabled in that Blender; it renders with the Python of this process, unless
     STGA_PYTHON names another. Raises StgaError where Blender is missing or fails, Cancelled between two pictures.
     """
     if not request.blend.is_file():

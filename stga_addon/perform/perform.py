@@ -10,11 +10,12 @@ from time import monotonic
 from typing import Any
 
 from ..errors import StgaError
+from ..files import write_npz
 from ..progress import Cancelled, Progress, Report, Say, ignore
 from ..requests import values
-from ..requests.folder import PREVIEW, has_request, read_request, write_result
+from ..requests.folder import PICTURE, PREVIEW, has_request, read_request, write_result
 from ..requests.results import Result, Written
-from ..requests.values import Extend, Refine, Request, Resume, Track, Train
+from ..requests.values import Extend, MakeAvatar, Refine, Request, Resume, Track, Train
 from ..schema import validate
 from ..tracking.folder import is_written
 from ..training.run.folder import has_run
@@ -34,6 +35,7 @@ WORK: dict[type[Any], tuple[str, str]] = {
     values.Select: (".selection", "select"),
     values.SelectForTake: (".training", "select_for_take"),
     values.Track: (".tracking", "perform_tracking"),
+    values.MakeAvatar: (".avatar", "make_avatar"),
     values.SolveAgain: (".tracking", "solve_again"),
     values.Render: (".render", "render"),
     values.RenderBlend: (".blend", "render_blend"),
@@ -77,7 +79,7 @@ def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, res
         writer.update(0.0, "Starting")
         try:
             request = read_request(folder)
-            if isinstance(request, Train | Resume | Refine | Extend):
+            if isinstance(request, Train | Resume | Refine | Extend | MakeAvatar):
                 from ..raster.cpu.precompile import begin_compiling
 
                 begin_compiling()
@@ -135,4 +137,7 @@ class _StatusReport:
         if progress.preview is not None and monotonic() - self._previewed_s > PREVIEW_INTERVAL_S:
             progress.preview(self._writer.folder / PREVIEW)
             self._previewed_s = monotonic()
+        if progress.picture is not None:
+            with suppress(StgaError):  # a full disk, which the work reports itself
+                write_npz(self._writer.folder / PICTURE, {"rgb": progress.picture})
         return self._also(progress) or stop

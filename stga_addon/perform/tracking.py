@@ -1,7 +1,10 @@
 """Tracking as requests ask for it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from ..progress import Cancelled, Progress, Report, Say
 from ..requests.results import Written
@@ -39,14 +42,24 @@ FOCAL_SOURCES = {
 def perform_tracking(request: Track, report: Report, say: Say) -> Written:
     """Track the head into a capture. Raises StgaError; cancelled, it leaves the landmarks of whole cameras, with which
     the same request continues."""
-    steps = _steps(report)
+    now = Progress()
+
+    def keep(progress: Progress) -> bool:
+        nonlocal now
+        now = progress
+        return report(progress)
+
+    def show(picture: np.ndarray) -> None:
+        report(replace(now, picture=picture))
+
+    steps = _steps(keep)
     steps("Opening the footage", 0, 1)
     frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}), request.sync)
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
     found = track(
         footage, request.model, request.out, request.landmarks, request.meshes, request.world,
-        request.mattes == "auto", steps,
+        request.mattes == "auto", steps, show,
     )  # fmt: skip
     error = f"Reprojection error {found.median_px:.1f} px (median)"
     report(Progress(1.0, "Tracked", error))

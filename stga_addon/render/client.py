@@ -79,9 +79,7 @@ class RenderClient:
             reply = receive(cast(BinaryIO, server.stdout))
         except (OSError, EOFError, ValueError) as error:
             self.close()
-            raise StgaError(
-                f"{python}: the render server exited unexpectedly; check the training environment, which needs numba"
-            ) from error
+            raise StgaError(f"{python}: the render server exited unexpectedly; that Python needs numba") from error
         self._sent, self.failure = layers, str(reply.get("failure", ""))
         if "error" in reply:
             raise StgaError(f"{python}: the render server could not render the image ({reply['error']})")
@@ -100,7 +98,7 @@ class RenderClient:
             this = f"{sys.executable}, {sys.version.split()[0]}"
             raise StgaError(
                 f"Rendering splats needs {' and '.join(missing_packages())} in Blender's own Python ({this}), "
-                "or a training environment, which the add-on's preferences or `stga environment` make or choose"
+                "or another Python with them, which is chosen in the add-on's preferences"
             ) from error
 
 

@@ -3,7 +3,6 @@
 import sys
 from typing import BinaryIO
 
-from ..worker.environment_use import mark_environment_used
 from ..worker.stdout import claim_stdout
 
 
@@ -41,5 +40,4 @@ def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
 
 if __name__ == "__main__":
     replies = claim_stdout()
-    mark_environment_used()
     serve(sys.stdin.buffer, replies, sys.argv[1])

@@ -4,6 +4,7 @@ request.json   the request
 request.npz    its arrays
 result.json    what was found, where the request asks for something other than files; result.npz: its arrays
 preview.npz    of a training: the avatar of a few seconds ago
+picture.npz    of a tracking: the head over the footage, `rgb` (H, W, 3) uint8
 besides the files of the worker's status (`worker.status`)
 """
 
@@ -19,14 +20,15 @@ from ..tracking.folder import is_written
 from ..training.run.folder import has_run, read_run
 from ..worker.launch import prepare_status_folder
 from ..worker.status import remove_status_folder
+from .avatar_folder import check_inputs
 from .results import Result
-from .values import Extend, Refine, RenderRecording, Request, Resume, SolveAgain, Track, Train
+from .values import Extend, MakeAvatar, Refine, RenderRecording, Request, Resume, SolveAgain, Track, Train
 
 FORMAT, VERSION = "stga-request", 1
 REQUEST, REQUEST_ARRAYS = "request.json", "request.npz"
 RESULT, RESULT_ARRAYS = "result.json", "result.npz"
-PREVIEW = "preview.npz"
-FILES = (REQUEST, REQUEST_ARRAYS, RESULT, RESULT_ARRAYS, PREVIEW)
+PREVIEW, PICTURE = "preview.npz", "picture.npz"
+FILES = (REQUEST, REQUEST_ARRAYS, RESULT, RESULT_ARRAYS, PREVIEW, PICTURE)
 
 
 def request_folder(subject: Path) -> Path:
@@ -43,6 +45,8 @@ def check_request(request: Request) -> None:
             read_run(request.run)
         case Track() if is_written(request.out):
             raise StgaError(f"{request.out}: already holds a capture; choose another folder")
+        case MakeAvatar():
+            check_inputs(request.track)
         case SolveAgain() if not is_written(request.capture):
             raise StgaError(f"{request.capture}: holds no tracked capture to solve again")
         case RenderRecording():

@@ -8,9 +8,12 @@ from ..training.run.folder import AVATAR
 from ..worker.status import WorkerSnapshot, WorkerState
 from .folder import PREVIEW
 from .values import (
+    CAPTURE_FOLDER,
+    RUN_FOLDER,
     Analyze,
     ConvertMotion,
     Extend,
+    MakeAvatar,
     Refine,
     Relight,
     RenderRecording,
@@ -28,16 +31,16 @@ SLICE_INTERVAL_S = 0.02
 
 
 class Kind(StrEnum):
-    """What is asked for; a scene has at most one request of each kind, the environment belongs to no scene."""
+    """What is asked for; a scene has at most one request of each kind."""
 
     TRAINING = "training"
     TRACKING = "tracking"
+    AVATAR = "avatar"
     ANALYSIS = "analysis"
     SELECTION = "selection"
     PERFORMANCE = "performance"
     LIGHT = "light"
     VIDEO = "video"
-    ENVIRONMENT = "environment"
 
 
 SUBJECTS: dict[type[Request], tuple[Kind, str]] = {
@@ -47,6 +50,7 @@ SUBJECTS: dict[type[Request], tuple[Kind, str]] = {
     Extend: (Kind.TRAINING, "run"),
     Track: (Kind.TRACKING, "out"),
     SolveAgain: (Kind.TRACKING, "capture"),
+    MakeAvatar: (Kind.AVATAR, "out"),
     Analyze: (Kind.ANALYSIS, "capture"),
     SelectForTake: (Kind.SELECTION, "capture"),
     ConvertMotion: (Kind.PERFORMANCE, "output"),
@@ -54,20 +58,22 @@ SUBJECTS: dict[type[Request], tuple[Kind, str]] = {
     Relight: (Kind.LIGHT, "run"),
 }
 """Request -> its kind, and the field that names what it is about."""
-STORED = {Kind.TRAINING, Kind.TRACKING}
-"""Requests that the .blend file remembers; their folder is in that of the run or capture, others' are temporary."""
+STORED = {Kind.TRAINING, Kind.TRACKING, Kind.AVATAR}
+"""Requests that the .blend file remembers; their folder is in that of what they make, others' are temporary."""
+TRAINS = {Kind.TRAINING, Kind.AVATAR}
+"""Requests with a run, whose previews and avatar are shown on the head."""
 TRANSIENT = {Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE, Kind.LIGHT}
 """Requests that leave nothing but their result in the scene: killed when they are cancelled, gone when they ended."""
 DISMISSIBLE = {*STORED, Kind.VIDEO}
 SHOWN_STATES: dict[Kind, tuple[WorkerState, ...]] = {
     Kind.TRAINING: (WorkerState.FINISHED, WorkerState.CANCELLED),
     Kind.TRACKING: (WorkerState.FINISHED,),
+    Kind.AVATAR: (WorkerState.FINISHED, WorkerState.CANCELLED),
     Kind.ANALYSIS: (WorkerState.FINISHED,),
     Kind.SELECTION: (WorkerState.FINISHED,),
     Kind.PERFORMANCE: (WorkerState.FINISHED,),
     Kind.LIGHT: (WorkerState.FINISHED,),
     Kind.VIDEO: (),
-    Kind.ENVIRONMENT: (),
 }
 """Final states of a worker whose result changes the scene."""
 
@@ -77,9 +83,12 @@ Stamp = tuple[int, int]
 
 @dataclass(frozen=True)
 class RunFiles:
-    """Stamps of a run's files; None: there is no such file."""
+    """Stamps of a run's files, and of the capture that is tracked for it; None: there is no such file."""
 
+    capture: Stamp | None = None
+    picture: Stamp | None = None
     preview: Stamp | None = None
+    avatar: Stamp | None = None
     metrics: Stamp | None = None
     tracking: Stamp | None = None
 
@@ -88,12 +97,12 @@ class RunFiles:
 class RequestState:
     """What is known of a scene's request of one kind.
 
-    subject         run, capture, video or environment that the request is about, as the scene names it; None: none
+    subject         run, capture or video that the request is about, as the scene names it; None: none
     folder          of the request, as found now: a run may have moved along with the .blend file
     snapshot        the worker's status as last read
     files           of a run, as last seen
     result_shown    the result has reached the scene, or never will
-    shown_preview   stamp of the preview that was loaded last
+    shown_capture, shown_preview   stamps of the capture and the preview that were loaded last
     loading         what is being read, or put into the scene: an avatar file, or the folder of the request
     building        it is being built in slices
     error           one sentence: a result that could not be shown, or why monitoring stopped
@@ -106,6 +115,7 @@ class RequestState:
     snapshot: WorkerSnapshot = field(default_factory=WorkerSnapshot)
     files: RunFiles = field(default_factory=RunFiles)
     result_shown: bool = False
+    shown_capture: Stamp | None = None
     shown_preview: Stamp | None = None
     loading: Path | None = None
     building: bool = False
@@ -114,9 +124,14 @@ class RequestState:
 
     @property
     def place(self) -> Path:
-        """Where the run or capture is now."""
+        """Where what the request makes is now."""
         assert self.folder is not None
         return self.folder.parent
+
+    @property
+    def run(self) -> Path:
+        """Where the run of one that trains is now."""
+        return self.place / RUN_FOLDER if self.kind == Kind.AVATAR else self.place
 
     @property
     def interval_s(self) -> float | None:
@@ -131,7 +146,9 @@ class RequestState:
     @property
     def has_result(self) -> bool:
         """Whether the worker has ended with a result that is still to be shown."""
-        return self.snapshot.state in SHOWN_STATES[self.kind] and not self.result_shown
+        # An avatar's tracking may have been cancelled.
+        is_there = self.kind != Kind.AVATAR or self.files.avatar is not None
+        return self.snapshot.state in SHOWN_STATES[self.kind] and is_there and not self.result_shown
 
     @property
     def is_running(self) -> bool:
@@ -242,7 +259,7 @@ class Show(_OnPath):
 
 
 class ReadCurve(_OnPath):
-    """Read the evaluations in the run for the panel's curve."""
+    """Read the evaluations in the run for the panel's curve, or before the first ones the picture of the tracking."""
 
 
 class StopWorker(_OnPath):
@@ -307,7 +324,7 @@ def _started(before: RequestState, subject: Path, folder: Path) -> Outcome:
     state = RequestState(before.kind, subject, folder)
     is_stale = before.kind == Kind.VIDEO and before.folder not in (None, folder)
     stale = (RemoveFiles(before.folder),) if is_stale and before.folder else ()
-    curve = (ReadCurve(state.place),) if state.kind == Kind.TRAINING else ()
+    curve = (ReadCurve(state.run),) if state.kind in TRAINS else ()
     return state, (*stale, *_stored(state), *curve, Redraw())
 
 
@@ -323,14 +340,14 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     before, worker = state, event.snapshot.state
     error = "" if state.stopped else state.error
     state = replace(state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error, stopped=False)
-    is_new = (state.folder, state.files.metrics) != (before.folder, before.files.metrics)
-    if state.kind == Kind.TRAINING and is_new:
-        effects.append(ReadCurve(state.place))
+    drawn, drawn_before = ((each.folder, each.files.metrics, each.files.picture) for each in (state, before))
+    if drawn != drawn_before and state.kind in (*TRAINS, Kind.TRACKING):
+        effects.append(ReadCurve(state.run))
     if (state.folder, state.files, state.snapshot) != (before.folder, before.files, before.snapshot):
         effects.append(Redraw())
     if state.loading is not None:
         return state, tuple(effects)
-    if state.kind == Kind.TRAINING:
+    if state.kind in TRAINS:
         return _load_avatar(state, event, effects)
     if state.has_result:
         state = replace(state, loading=state.folder)
@@ -341,12 +358,14 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
 
 
 def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) -> Outcome:
-    """Load the trained avatar, or a preview of it, once each."""
-    preview = state.files.preview
+    """Load the tracked capture, the trained avatar, or a preview of it, once each."""
+    capture, preview = state.files.capture, state.files.preview
+    if capture not in (None, state.shown_capture) and (state.snapshot.state.is_alive or state.has_result):
+        return replace(state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture), tuple(effects)
     if state.has_result:
-        effects.append(StoreAvatar(state.place / AVATAR))
+        effects.append(StoreAvatar(state.run / AVATAR))
         if event.show_result:
-            state = replace(state, loading=state.place / AVATAR)
+            state = replace(state, loading=state.run / AVATAR)
         else:
             state = replace(state, result_shown=True)
             effects.extend(_stored(state))
@@ -358,9 +377,10 @@ def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) 
 
 
 def _loading_ended(state: RequestState, undoable: bool = False, error: str = "") -> Outcome:
-    was_result = state.loading is not None and state.loading.name != PREVIEW
+    loading = state.loading
+    was_result = loading is not None and (state.kind not in TRAINS or loading.name == AVATAR)
     # Undo brings back what was shown before the training.
-    undoable = undoable or (state.kind == Kind.TRAINING and was_result and not error)
+    undoable = undoable or (state.kind in TRAINS and was_result and not error)
     undo = (PushUndo(),) if undoable else ()
     if state.kind in TRANSIENT:
         forgotten, removed = _forgotten(state, error=error)

@@ -24,6 +24,8 @@ WORLDS = "auto", "head", "keep"
 SYNC = "none", "auto", "sound", "motion"
 MATTES = "auto", "none"
 """What `Track.mattes` may be but a folder."""
+CAPTURE_FOLDER, RUN_FOLDER = "capture", "run"
+"""Folders in that of `MakeAvatar`."""
 BLEND_SUFFIX = ".blend"
 SPLATS_ENGINE = "STGA_SPLATS"
 """Blender's name of the add-on's render engine."""
@@ -175,6 +177,27 @@ class Track:
     world: str = setting("auto", choices=WORLDS)
     sync: str = setting("none", choices=SYNC)
     mattes: str = setting("auto", is_path=lambda text: text not in MATTES)
+
+
+@dataclass(frozen=True)
+class MakeAvatar:
+    """Track a head through footage, and train its avatar; what an earlier request did in the same folder stays.
+
+    track, train    write to CAPTURE_FOLDER and RUN_FOLDER of one folder, `out`; the FLAME model is that of `track`
+    """
+
+    track: Track
+    train: Train
+
+    @property
+    def out(self) -> Path:
+        return self.track.out.parent
+
+    def check(self) -> None:
+        """Raise StgaError where the two do not belong together."""
+        wanted = self.out / CAPTURE_FOLDER, self.out / CAPTURE_FOLDER, self.out / RUN_FOLDER
+        if (self.track.out, self.train.capture, self.train.run) != wanted:
+            raise StgaError(f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}")
 
 
 @dataclass(frozen=True)
@@ -480,6 +503,6 @@ class Relight:
 
 
 Request = (
-    Train | Resume | Refine | Extend | Select | SelectForTake | Track | SolveAgain | Render | RenderBlend
-    | RenderRecording | Export | ConvertMotion | Analyze | TimePresets | Evaluate | Benchmark | Relight
+    Train | Resume | Refine | Extend | Select | SelectForTake | Track | MakeAvatar | SolveAgain | Render
+    | RenderBlend | RenderRecording | Export | ConvertMotion | Analyze | TimePresets | Evaluate | Benchmark | Relight
 )  # fmt: skip

@@ -133,7 +133,7 @@ def _error_color(error: float | None, median: float) -> np.ndarray:
 
 def _tile(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, caption: str) -> Image.Image:
     """The head in the image, beside it the same with the mesh; below, the caption."""
-    left, top, right, bottom = _head_box(camera, vertices)
+    left, top, right, bottom = head_box(camera, vertices)
     scale = min(PICTURE[0] / (right - left), PICTURE[1] / (bottom - top))
     cropped = replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
     small = cropped.scaled(scale)
@@ -141,7 +141,7 @@ def _tile(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.nda
     picture = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC, box=box)
     tile = Image.new("RGB", _tile_size(), BACKGROUND)
     tile.paste(picture, (0, 0))
-    tile.paste(Image.fromarray(_with_mesh(np.asarray(picture), vertices, faces, small)), (PICTURE[0], 0))
+    tile.paste(Image.fromarray(with_mesh(np.asarray(picture), vertices, faces, small)), (PICTURE[0], 0))
     _write(tile, (0, PICTURE[1] + 2), caption)
     return tile
 
@@ -154,7 +154,7 @@ def _without_outside(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     return np.asarray(image + opacity * (np.array(MATTE_COLOR) - image) + 0.5).astype(np.uint8)
 
 
-def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
+def head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
     """Left, top, right and bottom of the head in the image; the whole image where it lies outside."""
     pixels, depth = camera.project(vertices)
     whole = 0, 0, camera.width, camera.height
@@ -167,7 +167,7 @@ def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]
     return (left, top, right, bottom) if right > left and bottom > top else whole
 
 
-def _with_mesh(picture: np.ndarray, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+def with_mesh(picture: np.ndarray, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
     """The mesh over the picture, colored by the direction of its surface."""
     triangle, weights = rasterize(vertices, faces, camera)
     seen = triangle >= 0

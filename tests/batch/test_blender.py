@@ -117,7 +117,7 @@ def test_frames_through_the_local_engine(shot: Path) -> None:
 
 
 def test_frames_through_ray(shot: Path) -> None:
-    """Catches a Ray worker that finds neither Blender nor the training environment."""
+    """Catches a Ray worker that finds neither Blender nor the training Python."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     command = [sys.executable, "-c", COMMAND, str(plan_of(shot, "ray"))]
     variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}

@@ -11,7 +11,7 @@ from capture.factory import write_flame_capture
 from stga_addon.capture.flame_capture import OWN_MODELS
 from stga_addon.development.package import build_zip, fetch_wheels
 from stga_addon.errors import StgaError
-from stga_addon.worker.environment import missing_packages
+from stga_addon.worker.training_python import missing_packages
 
 ROOT = Path(__file__).resolve().parents[2]
 

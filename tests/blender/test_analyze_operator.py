@@ -83,7 +83,7 @@ def answer(**values):
 
 
 def write_interpreter(path: Path, body: str) -> str:
-    """A program that stands in for the Python of the training environment, given the folder of a request."""
+    """A program that stands in for the Python of the training Python, given the folder of a request."""
     path.write_text(f"#!{sys.executable}\n{WORKER}{body}\n")
     path.chmod(0o755)
     return str(path)

@@ -124,11 +124,11 @@ def test_render_of_the_open_head(stga, here, tmp_path):
     assert pictures != tracked
 
 
-def test_missing_training_environment(stga, extension, folder, monkeypatch, capsys):
+def test_missing_training_python(stga, extension, folder, monkeypatch, capsys):
     """Catches a traceback, or success, where nothing can train."""
-    monkeypatch.setattr(extension.stga_addon.worker.environment, "missing_packages", lambda: ["torch"])
+    monkeypatch.setattr(extension.stga_addon.worker.training_python, "missing_packages", lambda: ["torch"])
     assert stga("train", folder, "--out", folder / "run") == 2
-    assert "`blender --background --command stga environment use PATH`" in capsys.readouterr().err
+    assert "Install the complete edition of the add-on, or choose a Python" in capsys.readouterr().err
     bpy.ops.stga.import_capture(directory=str(folder))
     assert stga("select") == 0  # needs none
 
@@ -139,7 +139,7 @@ def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monke
     chosen = tmp_path / "python"
     chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
     chosen.chmod(0o755)
-    monkeypatch.setenv(extension.stga_addon.worker.environment.PYTHON_VARIABLE, str(chosen))
+    monkeypatch.setenv(extension.stga_addon.worker.training_python.PYTHON_VARIABLE, str(chosen))
     arguments = [command, "FOOTAGE", *([] if command == "train" else ["--model", "HEAD"]), "--out", "OUT"]
     more = ["--iterations", "2"] if command != "track" else []
     assert stga(*arguments, *more) == 7
@@ -164,8 +164,8 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
     assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options) == {"FINISHED"}
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
     assert here("train", "--out", tmp_path / "headless", *arguments) == 0
-    assert stga("train", "--out", tmp_path / "environment", *arguments) == 0
-    runs = ("panel", "headless", "environment")
+    assert stga("train", "--out", tmp_path / "delegated", *arguments) == 0
+    runs = ("panel", "headless", "delegated")
     for run in runs:
         with np.load(tmp_path / run / "selection.npz") as stored:
             for timestep, faces in painted.items():
@@ -176,34 +176,17 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_environment_of_a_server_without_a_window(stga, extension, folder, tmp_path, monkeypatch, capsys):
-    """Catches a training environment that can be chosen in the preferences' dialog alone, or is not used afterwards."""
-    operators, worker = extension.operators.training_python, extension.stga_addon.worker.environment
-    command = import_module(f"{extension.__name__}.stga_addon.cli.environment")
-    monkeypatch.setenv(command.FOLDER_VARIABLE, "")  # restored after the test
-    monkeypatch.delenv(worker.PYTHON_VARIABLE, raising=False)
-    place = tmp_path / "environment"
-    for module in (operators, extension.operators.command_line):
-        monkeypatch.setattr(module, "environment_folder", lambda create=False: place)
-    monkeypatch.setattr(extension.stga_addon.requests.environment_job, "check_python", lambda python, folder: "good")
-    assert stga("environment", "use", sys.executable) == 0
-    assert capsys.readouterr().out == f"{sys.executable}: good\n"
-    assert operators.training_python(bpy.context) == sys.executable
-    assert operators.has_training_python(bpy.context)
+def test_a_farms_python_comes_first(extension, monkeypatch):
+    """Catches a farm's variable that Blender ignores, or that overrules the Python an operator was given."""
+    operators, worker = extension.operators.training_python, extension.stga_addon.worker.training_python
     monkeypatch.setenv(worker.PYTHON_VARIABLE, "/farm/python")
     assert operators.training_python(bpy.context) == "/farm/python"
     assert operators.training_python(bpy.context, "/given/python") == "/given/python"
-    monkeypatch.delenv(worker.PYTHON_VARIABLE)
-    assert stga("environment", "remove") == 0
-    assert worker.stored_choice(place) == ""
-    if not bpy.app.online_access:
-        assert stga("environment", "make") == 2
-        assert "start it with --online-mode, or give a folder of --wheels" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_an_avatar_from_footage(stga, take, tmp_path, capfd):
-    """Catches a .blend file that is missing because the training environment has no Blender, or one without links."""
+    """Catches a .blend file that is missing because the Python that trains has no Blender, or one without links."""
     given = [take / "footage", "--model", take / "head.npz", "--landmarks", take / "points"]
     more = ["--iterations", "4", "--effect", "tracking=on"]
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0

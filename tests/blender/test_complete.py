@@ -1,4 +1,4 @@
-"""The complete edition in a Blender whose Python has nothing but numpy, without a network: Train works at once."""
+"""The complete edition in a Blender whose Python has nothing but numpy, without a network: it tracks and trains."""
 
 import json
 import os
@@ -13,6 +13,9 @@ import pytest
 pytest.importorskip("bpy")
 
 
+from tracking.head_video import write_head_video
+
+from stga_addon.avatar.file import read_avatar
 from stga_addon.development.editions import complete
 from stga_addon.development.package import build_zip, wheel_folder
 from stga_addon.development.wheels import Target, check_wheels, collect_wheels, this_platform
@@ -34,7 +37,7 @@ SCRIPT = """
 import json, sys, time
 from pathlib import Path
 import bpy
-archive, home = sys.argv[1], Path(sys.argv[2])
+archive, home, video = sys.argv[1], Path(sys.argv[2]), sys.argv[4]
 result = {"before": [name for name in ("torch", "numba", "scipy") if __import__("importlib.util").util.find_spec(name)]}
 bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=False)
 bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -43,7 +46,6 @@ begin = time.perf_counter()
 bpy.ops.preferences.addon_enable(module=module)
 result["enabling_s"] = time.perf_counter() - begin
 result["heavy"] = sorted({"torch", "numba"} & set(sys.modules))
-result["installer"] = hasattr(bpy.types, "STGA_OT_make_environment")
 bpy.ops.stga.open_demo()
 settings = bpy.context.scene.stga
 result["run"], result["minutes"] = settings.run_folder, settings.minutes
@@ -52,8 +54,15 @@ bpy.ops.stga.show_avatar(filepath=settings.avatar)
 bpy.ops.stga.open_demo()
 result["next run"] = settings.run_folder
 result["log"] = (Path(result["run"]) / "job/worker.log").read_text()
-environment = sys.modules[module + ".stga_addon.requests.environment_job"]
-result["check"] = environment.check_python(sys.executable)
+bpy.ops.stga.test_python()
+result["check"] = sys.modules[module + ".operators.training_python"].test.found.line
+bpy.ops.stga.avatar_from_video(filepath=video, directory=str(home / "avatar"), minutes=0.05)
+result["made"] = [settings.head["stga_capture"], settings.splats["stga_run"], len(settings.splats.data.vertices)]
+run = sys.modules[module + ".operators.command_line"]._run
+result["codes"] = [
+    run(["track", video, "--stop", "3", "--out", str(home / "tracked")]),
+    run(["avatar", video, "--out", str(home / "avatar"), "--budget", "3s"]),
+]
 bpy.ops.preferences.addon_disable(module=module)
 index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
 bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
@@ -93,23 +102,30 @@ def bare_python(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> None:
+def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> None:
     """Catches a missing wheel, a worker that needs another Python or a network, and files that uninstalling leaves."""
-    python = bare_python(tmp_path / "bare")
+    python, video = bare_python(tmp_path / "bare"), tmp_path / "head.mp4"
+    write_head_video(video, 6)
     offline = OFFLINE if subprocess.run([*OFFLINE, "true"], check=False).returncode == 0 else []
     profile = {"BLENDER_USER_RESOURCES": str(tmp_path / "profile"), "HOME": str(tmp_path)}
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "NUMBA_"))}
-    command = [*offline, str(python), "-c", SCRIPT, str(archive), str(tmp_path), str(ITERATIONS)]
+    command = [*offline, str(python), "-c", SCRIPT, str(archive), str(tmp_path), str(ITERATIONS), str(video)]
     done = subprocess.run(command, cwd=tmp_path, env=kept | profile, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))
     result = json.loads(line.removeprefix("RESULT "))
     print({name: result[name] for name in ("enabling_s", "check")})
-    assert (result["before"], result["heavy"], result["installer"]) == ([], [], False)
+    assert (result["before"], result["heavy"]) == ([], [])
     assert result["run"] == str(tmp_path / "STGA Demo/run")
     assert result["next run"] == str(tmp_path / "STGA Demo/run 2")
     assert result["minutes"] == 1.0
     assert result["left"] == []
+    *folders, splats = result["made"]
+    assert folders == [str(tmp_path / "avatar/capture"), str(tmp_path / "avatar/run")]
+    assert splats == len(read_avatar(tmp_path / "avatar/run/avatar.npz").splats)
+    assert result["codes"] == [0, 0]
+    assert (tmp_path / "tracked/bundled_head.npz").is_file()
+    assert (tmp_path / "avatar/avatar.blend").is_file()
     settings = make_settings("global", iterations=ITERATIONS)
     perform(Train(tmp_path / "here", demo, settings), ignore, print)
     found, expected = (read_metrics(run)[-1]["psnr"] for run in (Path(result["run"]), tmp_path / "here"))

@@ -37,7 +37,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch, video: DrawnVideo, shades: list[float
 
 
 @pytest.mark.slow
-def test_video_without_a_training_environment(monkeypatch, tmp_path) -> None:
+def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
     """Catches a view transform, an order, a size or a rate of the encoded video that is not that of the images."""
     scenes = len(bpy.data.scenes)
     (tmp_path / "drawn").mkdir()
@@ -54,7 +54,7 @@ def test_video_without_a_training_environment(monkeypatch, tmp_path) -> None:
     assert len(bpy.data.scenes) == scenes
 
 
-def test_images_without_a_training_environment(monkeypatch, tmp_path) -> None:
+def test_images_without_a_training_python(monkeypatch, tmp_path) -> None:
     """Catches images that are not written, and a GPU that fails without a sentence."""
     for name in ("drawn", "out"):
         (tmp_path / name).mkdir()

@@ -12,6 +12,7 @@ from .test_import_operators import ball_avatar, write_motion  # noqa: E402
 pytestmark = pytest.mark.usefixtures("extension")
 
 HANDLERS = {
+    "STGA_FH_video": (".mp4;.mov;.mkv;.avi;.m4v;.webm;.mts;.mxf", "stga.avatar_from_video"),
     "STGA_FH_capture": (".json", "stga.import_capture"),
     "STGA_FH_performance": (".csv;.json;.txt", "stga.apply_motion"),
     "STGA_FH_npz": (".npz", "stga.open_npz"),

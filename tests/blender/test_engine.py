@@ -58,7 +58,7 @@ def _engine(empty_scene):
 
 
 def no_python() -> str:
-    raise StgaError("no training environment")
+    raise StgaError("no training Python")
 
 
 def camera_at(lens: float = 60.0, **data: object):

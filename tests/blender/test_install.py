@@ -77,7 +77,6 @@ def test_zip_holds_what_the_extension_runs(zip_file):
         "operators/train.py",
         "ui/panel.py",
         "stga_addon/worker/launch.py",
-        "stga_addon/cli/environment.py",
     } <= names
     assert {name for name in names if name.startswith("wheels/")} == {f"wheels/{name}" for name in WHEELS}
 

@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("extension")
 OPERATORS = (
     "track_footage", "view_footage", "mark_key", "solve_again", "export_head_model", "open_demo", "import_capture",
     "import_motion", "import_meshes", "select", "toggle_region", "count_selected", "heat_map", "analyze_capture",
-    "train", "refine", "extend", "cancel", "dismiss", "copy_report", "make_environment", "test_environment",
+    "avatar_from_video", "train", "refine", "extend", "cancel", "dismiss", "copy_report", "test_python",
     "show_avatar", "apply_motion", "standard_view", "preview_images", "render_video", "import_ply",
     "export_avatar", "export_cameras", "open_npz",
 )  # fmt: skip

@@ -136,18 +136,3 @@ def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch,
     assert monitor.tick() is None
     assert "ZeroDivisionError" not in capsys.readouterr().err
     assert "Monitoring stopped after an unexpected error (ZeroDivisionError" in " ".join(draw(extension))
-
-
-def test_unreadable_worker_does_not_end_the_timer_silently(extension, tmp_path, monkeypatch, capsys):
-    """Catches an error about the training environment's worker that ends the monitoring of every training, unseen."""
-    monitor = extension.operators.monitor
-    status = extension.stga_addon.worker.status
-    running = status.WorkerSnapshot(status.WorkerState.WORKING)
-    state = monitor.RequestState(Kind.ENVIRONMENT, tmp_path, tmp_path / "status", running)
-    monkeypatch.setitem(monitor._states, (monitor.NO_SCENE, Kind.ENVIRONMENT), state)
-    monkeypatch.setattr(monitor, "inspect_status", lambda folder: 1 / 0)
-    assert monitor.tick() is None
-    assert "ZeroDivisionError" in capsys.readouterr().err
-    assert "ZeroDivisionError" in monitor._states[monitor.NO_SCENE, Kind.ENVIRONMENT].error
-    assert monitor.tick() is None
-    assert "ZeroDivisionError" not in capsys.readouterr().err

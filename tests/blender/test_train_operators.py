@@ -126,23 +126,20 @@ def test_named_gpu_reaches_the_request(device, adapter, wanted, head, tmp_path, 
     assert asked[-1].device == wanted
 
 
-def test_gpus_are_those_of_the_last_test(tmp_path, monkeypatch, extension):
-    """Catches a list of another environment's GPUs, and a traceback in the panel where it is missing or damaged."""
-    train = extension.operators.train
-    monkeypatch.setattr(train, "environment_folder", lambda: tmp_path)
+def test_gpus_are_those_of_the_last_test(monkeypatch, extension):
+    """Catches a list of another Python's GPUs, and a traceback in the panel before the first test."""
+    train, own = extension.operators.train, extension.operators.training_python
+    monkeypatch.setattr(own.test, "found", None)
     assert train.list_adapters(None, None, "") == []
-    (tmp_path / "adapters.json").write_text('["Card (Vulkan)", "Card (Vulkan) #2"]')
+    monkeypatch.setattr(own.test, "found", own.Checked("", ("Card (Vulkan)", "Card (Vulkan) #2")))
     assert train.list_adapters(None, None, "") == ["Card (Vulkan)", "Card (Vulkan) #2"]
-    for damaged in ("{", '{"a": 1}', "[1, null]"):
-        (tmp_path / "adapters.json").write_text(damaged)
-        assert train.list_adapters(None, None, "") == []
 
 
-def test_missing_training_environment(extension, head, tmp_path, monkeypatch):
+def test_missing_training_python(extension, head, tmp_path, monkeypatch):
     """Catches a traceback about imports where a sentence should say which Python lacks which packages."""
-    monkeypatch.setattr(extension.stga_addon.worker.environment, "find_spec", lambda name: None)
+    monkeypatch.setattr(extension.stga_addon.worker.training_python, "find_spec", lambda name: None)
     monkeypatch.setattr(extension.operators.request, "missing_packages", lambda: ["torch"])
-    expected = r"^Error: No training environment: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
+    expected = r"^Error: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
     with pytest.raises(RuntimeError, match=expected):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), minutes=0.1)
     assert not (tmp_path / "run").exists()
@@ -348,19 +345,11 @@ def test_file_made_without_the_panel(extension, tmp_path):
 
 
 @pytest.mark.slow
-def test_environment_operators_without_a_window(extension, tmp_path, monkeypatch):
-    """Catches an environment that a script cannot make or test, and a network used although Blender is offline."""
-    for module in (extension.operators.environment, extension.operators.make_environment):
-        monkeypatch.setattr(module, "environment_folder", lambda create=False: tmp_path / "environment")
-    python = str(tmp_path / "python")
+def test_python_is_tested_without_a_window(extension, tmp_path):
+    """Catches a test of a Python that a script cannot make, or that finds nothing wrong with another program."""
     with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
-        bpy.ops.stga.test_environment(python=python)
-    if not bpy.app.online_access:
-        with pytest.raises(RuntimeError, match="Allow Online Access"):
-            bpy.ops.stga.make_environment()
-    with pytest.raises(RuntimeError, match="is not a folder; expected one of wheel files"):
-        bpy.ops.stga.make_environment(wheels=str(tmp_path / "none"))
-    (tmp_path / "wheels").mkdir()
-    with pytest.raises(RuntimeError, match=r"Installing from the folder of wheels failed: .*No matching distribution"):
-        bpy.ops.stga.make_environment(wheels=str(tmp_path / "wheels"), python=sys.executable)
-    assert not bpy.ops.stga.cancel.poll()
+        bpy.ops.stga.test_python(python=str(tmp_path / "python"))
+    with pytest.raises(RuntimeError, match="is not a Python that runs this add-on"):
+        bpy.ops.stga.test_python(python="false")
+    assert bpy.ops.stga.test_python(python=sys.executable) == {"FINISHED"}
+    assert extension.operators.training_python.test.found.line.startswith(f"Python {sys.version.split()[0]}, torch ")

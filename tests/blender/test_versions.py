@@ -25,7 +25,7 @@ from stga_addon.development.package import build_zip
 from stga_addon.export.ply import read_ply
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.sequence import read_motion
-from stga_addon.worker.environment import missing_packages
+from stga_addon.worker.training_python import missing_packages
 
 # bpy that the tests themselves run in, and others: (version, the variable with the path of a Python that has it)
 TRAINING_PYTHON = "" if missing_packages() else sys.executable

@@ -117,7 +117,7 @@ def test_a_folder_of_something_else_is_left_alone(take, tmp_path, capsys):
 
 
 def test_a_python_without_blender_says_so(take, tmp_path, monkeypatch, capsys):
-    """Catches a command that fails at its very end, where the training environment has no bpy."""
+    """Catches a command that fails at its very end, where the training Python has no bpy."""
     monkeypatch.setattr(avatar, "find_spec", lambda name: None)
     assert avatar._write_blend(tmp_path) is None
     assert "this Python has no bpy" in capsys.readouterr().out

@@ -338,7 +338,7 @@ def commands_of(parser: argparse.ArgumentParser) -> set[str]:
 
 def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that the parser lost, and an extension without `development` whose parser needs it."""
-    shipped = {"train", "refine", "presets", "render", "eval", "select", "export", "info", "perform", "environment"}
+    shipped = {"train", "refine", "presets", "render", "eval", "select", "export", "info", "perform"}
     shipped |= {"avatar", "batch", "drive", "extend", "relight", "track"}
     assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
     monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)

@@ -9,12 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from stga_addon.development.editions import INSTALLER_FILES, PLATFORM, SMALL, complete, edition_manifest
+from stga_addon.development.editions import SMALL, Edition, complete, edition_manifest
 from stga_addon.development.package import (
     ROOT,
     build_zip,
-    extension_files,
-    fetch_wheels,
     main,
     read_manifest,
     wheel_folder,
@@ -146,27 +144,14 @@ def test_manifest_of_an_edition() -> None:
     assert small == {name: value for name, value in manifest.items() if name != "build"}
 
 
-def test_no_way_to_install_in_the_platform_edition(tmp_path: Path) -> None:
-    """Catches code in the platform edition that installs packages, downloads something, or runs what it downloaded."""
-    try:
-        fetch_wheels(ROOT / "wheels")
-    except StgaError as error:
-        pytest.skip(f"wheels not present and not downloadable: {error}")
+@pytest.mark.parametrize("edition", [SMALL, complete(LINUX)], ids=["small", "complete"])
+def test_no_way_to_install_packages(edition: Edition, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches code in a zip that installs packages, downloads something, or runs what it downloaded."""
+    monkeypatch.setattr("stga_addon.development.package.edition_wheels", lambda folder, edition: [])
     forbidden = re.compile(r"\bpip\b|ensurepip|\"venv\"|urllib|http\.client|import requests\b")
-    with zipfile.ZipFile(build_zip(tmp_path, edition=PLATFORM)) as archive:
+    assert forbidden.search((ROOT / "stga_addon/development/wheels.py").read_text()), "the search finds what is there"
+    with zipfile.ZipFile(build_zip(tmp_path, edition=edition)) as archive:
         texts = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
     assert {name: found for name, text in texts.items() if (found := forbidden.search(text))} == {}
     assert "ownload" not in str(manifest["permissions"])
-    with zipfile.ZipFile(build_zip(tmp_path, edition=SMALL)) as archive:
-        small = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
-    assert set(small) > set(texts)
-    assert any(forbidden.search(text) for text in small.values()), "the search finds what the small edition has"
-
-
-def test_left_out_files_exist() -> None:
-    """Catches a file that moved, whose old name keeps nothing out of an edition."""
-    for name in PLATFORM.left_out:
-        assert (ROOT / name.strip("/")).is_file()
-    left = {file.relative_to(ROOT).as_posix() for file in extension_files(ROOT, read_manifest(ROOT), complete(LINUX))}
-    assert not left & {name.strip("/") for name in INSTALLER_FILES}

@@ -242,17 +242,12 @@ def batch(rng: random.Random, case: Path) -> list[str]:
     return [some_path(rng, case, "mesh", "flame"), *arguments, *option(rng, 0.8, "--out", new)]
 
 
-def environment(rng: random.Random, case: Path) -> list[str]:
-    action = rng.choice([["test"], ["remove"], ["use", some_path(rng, case)], ["use", "x"], ["x"]])
-    return ["--folder", some_path(rng, case, "new"), *action]
-
-
 COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = {
     "info": (3, info), "select": (3, select), "export": (3, export), "drive": (1, drive), "render": (3, render),
     "eval": (2, evaluate), "train": (1, train), "refine": (0.5, refine), "extend": (0.5, extend),
     "relight": (0.5, relight), "track": (1, track), "avatar": (0.5, avatar),
     "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{name}" for name in REQUESTS))]),
     "batch": (1, batch), "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
-    "benchmark": (0.5, benchmark), "demo": (0.2, demo), "environment": (0.2, environment),
+    "benchmark": (0.5, benchmark), "demo": (0.2, demo),
     "x": (0.1, lambda rng, case: []),
 }  # fmt: skip

@@ -43,7 +43,7 @@ views: dict[str, np.ndarray] = {}
 
 
 def no_python() -> str:
-    raise StgaError("no training environment")
+    raise StgaError("no training Python")
 
 
 def viewport() -> tuple[Any, Any, Any]:

@@ -25,8 +25,7 @@ seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 monitor = sys.modules[f"{extension}.operators.monitor"]
-environment_folder = sys.modules[f"{extension}.operators.common"].environment_folder
-status_folder = sys.modules[f"{extension}.stga_addon.worker.environment"].status_folder
+test = sys.modules[f"{extension}.operators.training_python"].test
 lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
 
 
@@ -65,9 +64,9 @@ def is_training() -> bool:
 
 
 def has_worker() -> bool:
-    """Whether a run, the test of the environment or a video has a worker that is alive."""
+    """Whether a run or a video has a worker that is alive."""
     video = request("video").folder
-    folders = [*Path(BLEND).parent.glob("*/job"), status_folder(environment_folder())]
+    folders = [*Path(BLEND).parent.glob("*/job")]
     folders += [] if video is None else [video]
     return any(monitor.inspect_status(folder).state.is_alive for folder in folders)
 
@@ -84,10 +83,9 @@ def first() -> Iterator[Callable[[], bool]]:
     """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the worker at work."""
     bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
-    bpy.ops.stga.test_environment()
-    yield lambda: not request("environment").is_running
-    tested = request("environment").snapshot.status
-    seen["environment"] = tested.message or tested.error
+    bpy.ops.stga.test_python()
+    yield lambda: not test.is_running
+    seen["tested"] = test.found.line if test.found else test.error
     with in_window():
         bpy.ops.stga.import_capture(directory=CAPTURE)
     yield looks_at_head

@@ -56,7 +56,7 @@ def test_training_in_a_window(home: Path) -> None:
     """Catches what only a window has: timers, their end, undo, reopening, and workers that outlive Blender."""
     capture = Path(os.environ.get("STGA_GUI_CAPTURE") or write_mesh_capture(home / "capture"))
     seen = play(home, "first", capture)
-    assert seen["environment"].startswith(f"Python {sys.version.split()[0]}, torch ")
+    assert seen["tested"].startswith(f"Python {sys.version.split()[0]}, torch ")
     assert {"iteration", "per_second", "left_s", "splats", "memory_mb"} <= set(seen["figures"])
     assert seen["refreshed"]
     assert seen["cancelled"]["avatar"]

@@ -150,13 +150,13 @@ def test_what_is_no_message_is_refused():
 
 
 def test_no_interpreter_that_can_render_is_one_sentence(monkeypatch):
-    """Catches a traceback where Blender's Python has no numba and there is no training environment."""
+    """Catches a traceback where Blender's Python has no numba and there is no training Python."""
 
     def nobody() -> str:
-        raise StgaError("no training environment")
+        raise StgaError("no training Python")
 
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
-    with pytest.raises(StgaError, match=r"Rendering splats needs numba and platformdirs .*training environment"):
+    with pytest.raises(StgaError, match=r"Rendering splats needs numba and platformdirs .*or another Python"):
         RenderClient(nobody).compose([], CAMERA)
     with pytest.raises(StgaError, match="/no/such/python: cannot be started"):
         RenderClient(lambda: "/no/such/python").compose([], CAMERA)

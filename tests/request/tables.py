@@ -13,6 +13,7 @@ from stga_addon.requests.values import (
     Evaluate,
     Export,
     Extend,
+    MakeAvatar,
     Played,
     Refine,
     Relight,
@@ -55,6 +56,10 @@ REQUESTS: tuple[Request, ...] = (
         offset={"left": -3},
         meshes=True,
         mattes="none",
+    ),
+    MakeAvatar(
+        Track(Path("v.mp4"), None, Path("o/capture"), focal=900.0),
+        Train(Path("o/run"), Path("o/capture"), make_settings(iterations=3), device="cpu"),
     ),
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),

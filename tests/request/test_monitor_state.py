@@ -77,7 +77,7 @@ def test_a_running_request_of_any_kind(kind):
     state, effects = after(START, state=RequestState(kind, Path("old"), JOB, error="old", stopped=True))
     assert state == RequestState(kind, RUN, JOB)
     assert Redraw() in effects
-    assert (Store(RUN, False) in effects) == (kind in (Kind.TRAINING, Kind.TRACKING))
+    assert (Store(RUN, False) in effects) == (kind in (Kind.TRAINING, Kind.TRACKING, Kind.AVATAR))
     for worker in (WorkerState.STARTING, WorkerState.WORKING, WorkerState.CANCELLING):
         state, effects = after(status(worker), state=state)
         assert (state.is_running, state.interval_s, state.can_be_dismissed) == (True, CHECK_INTERVAL_S, False)
@@ -90,7 +90,7 @@ def test_a_running_request_of_any_kind(kind):
 def test_any_end_of_any_kind_stops_the_timer(kind, end):
     """Catches a timer that runs for ever, a result shown twice, and a failure or a cancelled request that is shown."""
     state, _ = after(START, status(WorkerState.WORKING), status(end, error="why"), state=RequestState(kind))
-    shown = {Kind.TRAINING: ENDS[:2], Kind.VIDEO: (), Kind.ENVIRONMENT: ()}.get(kind, ENDS[:1])
+    shown = {Kind.TRAINING: ENDS[:2], Kind.VIDEO: (), Kind.AVATAR: ()}.get(kind, ENDS[:1])
     assert (state.loading is not None) == (end in shown)
     if state.loading is not None:
         assert state.interval_s == CHECK_INTERVAL_S
@@ -173,7 +173,7 @@ def test_the_next_video_replaces_the_last_one():
 def test_every_request_of_blender_has_a_kind():
     """Catches a field that a request does not have."""
     for request, (_, name) in SUBJECTS.items():
-        assert name in request.__dataclass_fields__
+        assert name in request.__dataclass_fields__ or isinstance(vars(request).get(name), property)
 
 
 # Trainings
@@ -325,3 +325,48 @@ def test_training_that_ends_while_a_preview_is_shown():
     state, _ = after(Shown(), state=state)
     assert state.result_shown
     assert state.interval_s is None
+
+
+# An avatar from footage
+
+
+def made(state: WorkerState, **files: int) -> StatusRead:
+    """A status of making an avatar; files: name -> stamp."""
+    stamps = {name: (stamp, 1) for name, stamp in files.items()}
+    return StatusRead(JOB, WorkerSnapshot(state), RunFiles(**stamps))
+
+
+def test_head_previews_and_avatar_appear_once_each():
+    """Catches a head that is imported anew at every look or never, a preview that has no head to be shown on, and an
+    avatar of another folder."""
+    making = RequestState(Kind.AVATAR)
+    state, _ = after(START, made(WorkerState.WORKING), state=making)
+    assert state.loading is None
+    state, effects = after(made(WorkerState.WORKING, capture=1, preview=1), state=state)
+    assert (state.loading, loads(effects)) == (RUN / "capture", [])
+    state, effects = after(Shown(), made(WorkerState.WORKING, capture=1, preview=1), state=state)
+    assert loads(effects) == [PREVIEW]
+    state, effects = after(Shown(), made(WorkerState.WORKING, capture=1, preview=1), state=state)
+    assert (state.loading, loads(effects)) == (None, [])
+    state, effects = after(made(WorkerState.FINISHED, capture=1, preview=1, avatar=1), state=state)
+    assert loads(effects) == [RUN / "run" / "avatar.npz"]
+    assert StoreAvatar(RUN / "run" / "avatar.npz") in effects
+    state, effects = after(Shown(), state=state)
+    assert (PushUndo() in effects, Store(RUN, True) in effects, state.interval_s) == (True, True, None)
+    assert after(made(WorkerState.FINISHED, capture=1, preview=1, avatar=1), state=state)[0].loading is None
+
+
+@pytest.mark.parametrize("end", [WorkerState.CANCELLED, WorkerState.FAILED])
+def test_what_was_never_made_is_not_shown(end):
+    """Catches an error about a missing avatar after the tracking was cancelled, and a head imported from an old one."""
+    state, effects = after(START, made(end, capture=1), state=RequestState(Kind.AVATAR))
+    assert (state.loading, loads(effects), state.interval_s) == (None, [], None)
+
+
+def test_the_tracking_is_drawn_before_there_is_a_curve():
+    """Catches a picture of the tracking that the panel never reads again."""
+    state, _ = after(START, made(WorkerState.WORKING), state=RequestState(Kind.AVATAR))
+    for stamp in (1, 2):
+        state, effects = after(made(WorkerState.WORKING, picture=stamp), state=state)
+        assert ReadCurve(RUN / "run") in effects
+    assert after(made(WorkerState.WORKING, picture=2), state=state)[1] == []

@@ -59,7 +59,7 @@ WHOLE = {f"{frame:06d}.png": f"half {frame}" for frame in range(8, 13)}
 
 
 def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> None:
-    """Catches frames that are rendered twice, left out, or by another engine or training environment."""
+    """Catches frames that are rendered twice, left out, or by another engine or training Python."""
     shot.output.mkdir()
     (shot.output / "000010.png").write_text("half 10")
     shares: list[float] = []

@@ -1,4 +1,4 @@
-"""One list of requirements: the training environment and pyproject.toml."""
+"""One list of requirements: the training Python and pyproject.toml."""
 
 import re
 import tomllib
@@ -10,7 +10,7 @@ PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml")
 
 
 def test_environment_and_project_require_the_same():
-    """Catches a training environment with other versions than an installation by pip."""
+    """Catches a training Python with other versions than an installation by pip."""
     extras = PROJECT["optional-dependencies"]
     assert sorted(REQUIREMENTS.values()) == sorted([*PROJECT["dependencies"], *extras["train"]])
     assert GPU_REQUIREMENT in extras["gpu"]

@@ -12,10 +12,10 @@ from importlib.util import find_spec
 from typing import Any
 
 from ...errors import StgaError
-from ...worker.environment import PYTHON_VARIABLE
 from ...worker.helpers import processors
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, inspect_worker, read_status
+from ...worker.training_python import PYTHON_VARIABLE
 from ..engine import Ended, job_command
 from ..job import Job
 

@@ -1,4 +1,4 @@
-"""Reports as JSON which packages and device an interpreter has: `python -m stga_addon.requests.environment_check`."""
+"""Reports as JSON which packages and device an interpreter has: `python -m stga_addon.requests.python_report`."""
 
 import importlib
 import json

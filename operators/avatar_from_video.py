@@ -1,0 +1,99 @@
+"""Makes an avatar from a video: tracks and trains in a process beside Blender, and shows both as they become."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+
+from ..stga_addon.errors import StgaError
+from ..stga_addon.requests.avatar_folder import check_inputs
+from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track
+from ..stga_addon.requests.values import Train as TrainRequest
+from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
+from ..stga_addon.training.settings import make_settings
+from . import ids
+from .common import FileImport, file_filter, file_path, path_property, reporting
+from .request import needs_idle, start
+from .training_python import training_python
+
+MAX_FOLDERS = 1000
+
+
+class AvatarFromVideo(bpy.types.Operator, FileImport):
+    """Make an avatar from a video of a face: track the head, train, and show the avatar on it. What was begun with the
+    same video is continued"""
+
+    bl_idname = ids.AVATAR_FROM_VIDEO
+    bl_label = "Avatar from Video"
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
+
+    filepath: path_property("Video", "Video of a face", options={"SKIP_SAVE"})
+    directory: path_property(
+        "Folder",
+        "Folder for capture and avatar; empty: one beside the .blend file, or beside the video",
+        "DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
+    focal: bpy.props.FloatProperty(
+        name="Focal Length", description="Of the camera, in pixels; 0: unknown", min=0.0, options={"SKIP_SAVE"}
+    )
+    python: bpy.props.StringProperty(
+        name="Python",
+        description="Python interpreter that tracks and trains; empty: that of the preferences, or Blender's own",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE", "HIDDEN"},
+    )
+    filter_glob: file_filter(*VIDEO_SUFFIXES)
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return needs_idle(cls, context, Kind.AVATAR)
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        if not self.filepath:
+            return super().invoke(context, event)
+        video = file_path(self.filepath, "video").resolve()  # dropped
+        self.directory = str(proposed_folder(self._tracking(video, Path())).parent)
+        return context.window_manager.invoke_props_dialog(self, width=480, title=self.bl_label, confirm_text="Make")
+
+    def draw(self, context: Any) -> None:
+        self.layout.use_property_split = True
+        for name in ("directory", "minutes", "focal"):
+            self.layout.prop(self, name)
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        video = file_path(self.filepath, "video").resolve()
+        if not video.is_file():
+            raise StgaError(f"{video}: is not a file; expected a video")
+        python = training_python(context, self.python)
+        if self.directory:
+            capture = file_path(self.directory, "folder").resolve() / CAPTURE_FOLDER
+        else:
+            capture = proposed_folder(self._tracking(video, Path()))
+        settings = make_settings("global", seconds=60 * self.minutes, effects={})
+        train = TrainRequest(capture.parent / RUN_FOLDER, capture, settings)
+        request = MakeAvatar(self._tracking(video, capture), train)
+        if start(context.scene, request, python):
+            self.report({"INFO"}, f"Made {request.out}")
+        return {"FINISHED"}
+
+    def _tracking(self, video: Path, capture: Path) -> Track:
+        return Track(video, None, capture, focal=self.focal or None)
+
+
+def proposed_folder(track: Track) -> Path:
+    """The folder of the capture in the first folder beside the .blend file, else beside the video, that is free or in
+    which this video's avatar was begun."""
+    beside = Path(bpy.data.filepath).parent if bpy.data.filepath else track.footage.parent
+    names = [f"{track.footage.stem} avatar", *(f"{track.footage.stem} avatar {n}" for n in range(2, MAX_FOLDERS))]
+    for capture in (beside / name / CAPTURE_FOLDER for name in names):
+        try:
+            check_inputs(replace(track, out=capture))
+        except StgaError:
+            continue
+        return capture
+    raise StgaError(f"{beside}: holds {MAX_FOLDERS} avatars of {track.footage.name}; choose a folder")

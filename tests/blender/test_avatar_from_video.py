@@ -1,0 +1,101 @@
+"""Avatar from Video: its request, the folder that it proposes, and its way from a video to splats on a head."""
+
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+pytest.importorskip("av")
+pytest.importorskip("cv2")
+
+from tracking.head_video import write_head_video  # noqa: E402
+
+from stga_addon.scene import tags  # noqa: E402
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "anna.mp4"
+    path.write_bytes(b"video")
+    return path
+
+
+@pytest.fixture
+def asked(extension, monkeypatch):
+    """The requests that the operator starts, which are not carried out."""
+    requests: list[object] = []
+    monkeypatch.setattr(
+        extension.operators.avatar_from_video, "start", lambda scene, request, python: requests.append(request)
+    )
+    return requests
+
+
+def begin(requests):
+    """What the worker writes first."""
+    folder = import_module(type(requests[-1]).__module__.replace("values", "avatar_folder"))
+    folder.write_inputs(requests[-1].track)
+
+
+def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path):
+    """Catches a second way to an avatar, with other settings than `stga avatar VIDEO`."""
+    out = tmp_path / "out"
+    assert bpy.ops.stga.avatar_from_video(filepath=str(video), directory=str(out), minutes=2.0) == {"FINISHED"}
+    main, avatar = (import_module(f"{extension.__name__}.stga_addon.cli.{name}") for name in ("main", "avatar"))
+    options = main.make_parser().parse_args(["avatar", str(video), "--out", str(out)])
+    assert asked == [avatar.avatar_request(options)]
+
+
+def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
+    """Catches an avatar of one video continued with another or begun anew each time, and a folder far from the file
+    that shows it."""
+
+    def make(path: Path) -> Path:
+        assert bpy.ops.stga.avatar_from_video(filepath=str(path)) == {"FINISHED"}
+        return asked[-1].out
+
+    assert make(video) == tmp_path / "anna avatar"
+    (tmp_path / "anna avatar/run").mkdir(parents=True)  # of somebody else
+    assert make(video) == tmp_path / "anna avatar 2"
+    begin(asked)
+    assert make(video) == tmp_path / "anna avatar 2"
+    other = tmp_path / "shots/anna.mp4"
+    other.parent.mkdir()
+    other.touch()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
+    assert make(other) == tmp_path / "anna avatar 3"
+
+
+def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
+    """Catches a worker that is started for nothing, and the request of another video in a folder."""
+    with pytest.raises(RuntimeError, match=r"gone\.mp4: is not a file; expected a video"):
+        bpy.ops.stga.avatar_from_video(filepath=str(tmp_path / "gone.mp4"))
+    (tmp_path / "out/capture").mkdir(parents=True)
+    (tmp_path / "out/inputs.json").write_text('{"footage": "/shots/ben.mp4", "model": null}')
+    with pytest.raises(RuntimeError, match=r"footage: .*out began with .*ben\.mp4"):
+        bpy.ops.stga.avatar_from_video(filepath=str(video), directory=str(tmp_path / "out"), python=sys.executable)
+
+
+@pytest.mark.slow
+def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
+    """Catches a head or splats that do not arrive, a run that the Train panel does not continue, splats on a head that
+    is not the refined one, and a tracking that shows nothing while it runs."""
+    pytest.importorskip("torch")
+    video = tmp_path / "head.mp4"
+    write_head_video(video, 6)
+    assert bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable) == {"FINISHED"}
+    settings, out = bpy.context.scene.stga, tmp_path / "head avatar"
+    assert settings.head[tags.CAPTURE] == str(out / "capture")
+    assert settings.splats[tags.RUN] == settings.run_folder == str(out / "run")
+    assert (settings.avatar, settings.avatar_shown) == (str(out / "run/avatar.npz"), True)
+    assert settings.head.hide_get()
+    with np.load(out / "job/picture.npz") as stored:
+        assert stored["rgb"].std() > 10
+    pixels, *_ = extension.operators.monitor.curve(out / "run")
+    assert pixels.shape == (256, 256, 4)
+    # Again: nothing is left to do but to show it
+    assert bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable) == {"FINISHED"}
+    heads = [thing for thing in bpy.data.objects if thing.get(tags.KIND) == tags.HEAD]
+    assert heads == [settings.head]

@@ -1,0 +1,22 @@
+"""A video of a generated head whose face the networks find."""
+
+from pathlib import Path
+
+import numpy as np
+
+from stga_addon.development.demo.head import synthetic_flame
+from stga_addon.render.video import video_writer
+from stga_addon.tracking.correspondence import picture_cameras
+from stga_addon.tracking.mesh_image import shaded_image
+
+
+def write_head_video(path: Path, frames: int, size: int = 256) -> None:
+    """The head turns from side to side before a camera that stands still."""
+    model = synthetic_flame(0)
+    front = picture_cameras(model.v_template)[0]
+    center = model.v_template.mean(axis=0)
+    with video_writer(path, 25) as write:
+        for turn in np.radians(np.linspace(-20, 20, frames)):
+            about = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+            turned = (model.v_template - center) @ about.T + center
+            write(shaded_image(turned, model.faces, front.scaled(size / front.width)))
