@@ -126,7 +126,7 @@ def track(
         raise StgaError(f"{out}: already holds a capture; give another --out")
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
-    head = read_head_model(head_file)
+    head, is_new = read_head_model(head_file), not out.exists()
     footage, source = _stored(footage, out), _source(footage, head_file, landmarks)
     if landmarks is not None:
         found = read_landmarks(footage, landmarks)
@@ -145,9 +145,14 @@ def track(
         write_places(places_file, places, reliable)
         if show is not None:
             show_first_frame(head, footage, detector, places, reliable, show)
-        found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
-    if not any(camera.confidence.any() for camera in found.values()):
-        raise StgaError(f"{footage.root}: shows no face in any of {len(list(footage.views()))} frames")
+        try:
+            found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
+            _check_faces(footage, found)
+        except StgaError:
+            if is_new:  # what it holds is of no use for other footage
+                shutil.rmtree(out)
+            raise
+    _check_faces(footage, found)
     check_count(found, places)
     neutral = places.on(head.model.v_template, head.model.faces)
     if np.ptp(neutral[reliable], axis=0).max() < MIN_FACE_M:
@@ -375,6 +380,13 @@ def _masks(footage: Footage, timestep: int, most: int | None = None) -> list[tup
 def _recording_at(footage: Footage, timestep: int, most: int | None) -> Sequence[FootageCamera]:
     seen = [camera for camera in footage.cameras if timestep in camera.timesteps]
     return seen if most is None else evenly_spread(seen, most)
+
+
+def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
+    """Raise StgaError where no camera ever sees a face."""
+    if not any(camera.confidence.any() for camera in found.values()):
+        views = list(footage.views())
+        raise StgaError(f"{views[0][1].source(views[0][0])}: shows no face, nor does any other of {len(views)} frames")
 
 
 def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]) -> None:

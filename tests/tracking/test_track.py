@@ -29,6 +29,7 @@ from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.track import track
 
 from .recording import LANDMARKS, SIZE, record, rig, write_footage
+from .scenes import write_video
 from .test_fit import frame_at, places_on
 from .test_sequences import write_folders
 
@@ -344,7 +345,7 @@ def test_footage_without_a_face(recorded, capsys):
         arrays = dict(np.load(folder / f"points/cam{number}.npz"))
         write_npz(folder / f"points/cam{number}.npz", arrays | {"confidence": np.zeros((5, LANDMARKS))})
     assert command(folder) == 2
-    assert "shows no face in any of 25 frames" in capsys.readouterr().err
+    assert "shows no face, nor does any other of 25 frames" in capsys.readouterr().err
 
 
 class Counting:
@@ -442,6 +443,8 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
     places = places_on(head, LANDMARKS)
     monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: Counting([]))
     monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
+    for name in ("out", "out_0", "out_1"):
+        (tmp_path / name).mkdir()  # else nothing is left of footage without a face
     for offset, message in ((1, "shows no face"), (1, "shows no face"), (2, "holds landmarks of other footage")):
         footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset}))
         with pytest.raises(StgaError, match=message):
@@ -454,6 +457,18 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
         os.utime(changed, ns=(0, 1))
         with pytest.raises(StgaError, match="holds landmarks of other footage"):
             track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
+
+
+def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
+    """Catches images and landmarks that stay where the footage is of no use, and a message that does not name it."""
+    write_video(tmp_path / "landscape.mp4", range(0, 200, 50))
+    head = HeadModel(flame_model(None), "flame")
+    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: Counting([]))
+    places = places_on(head, LANDMARKS), np.ones(LANDMARKS, bool)
+    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: places)
+    with pytest.raises(StgaError, match=r"landscape.mp4.*: shows no face, nor does any other of 4 frames"):
+        track(open_footage(tmp_path / "landscape.mp4"), None, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_two_faces_are_reported_with_camera_and_frame(recorded):
