@@ -3,7 +3,7 @@
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, frame_backward
-from ...avatar.offsets.offset import moved_frames, offset_of
+from ...avatar.offsets.offset import offset_of
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
@@ -88,7 +88,7 @@ class CpuBackend:
         """The timestep's frames, moved by the driven offsets; averaged: by their moving averages."""
         offsets = self.state.driven_offsets.items()
         coefficients = {name: state.average if averaged else state.value for name, state in offsets}
-        return moved_frames(self._frames.of(timestep), coefficients, self._frames.signals(timestep))
+        return self._frames.moved(timestep, coefficients)
 
     def _forward(
         self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray, sh_degree: int,

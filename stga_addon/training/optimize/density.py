@@ -44,7 +44,8 @@ def control_density(
         steps=pairs.steps,
         unseen_share=pairs.unseen_share,
     )
-    keep = ~(_prunable(state) & within)
+    faint = _sigmoid(state.parameters.opacity) < MIN_OPACITY
+    keep = ~prunable(state, faint & within)
     keep[split] = False
     state = join(keep_rows(state, keep), children)
     zero = np.zeros(len(state), np.float32)
@@ -94,16 +95,16 @@ def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
     return Splats(*(np.concatenate(pair) for pair in zip(*halves, strict=True)))
 
 
-def _prunable(state: TrainState) -> np.ndarray:
-    """(N,) bool: splats of low opacity, except the most opaque bound splat of each triangle."""
-    opacity, face, unbound = state.parameters.opacity, state.face, state.unbound
-    prunable = _sigmoid(opacity) < MIN_OPACITY
-    bound = np.flatnonzero(~unbound)
-    order = bound[np.lexsort((-opacity[bound], face[bound]))]
+def prunable(state: TrainState, unwanted: np.ndarray) -> np.ndarray:
+    """(N,) bool: the unwanted splats (N,) bool but for a bound one of each triangle that would have none left: the most
+    opaque one."""
+    face, bound = state.face, np.flatnonzero(~state.unbound)
+    order = bound[np.lexsort((-state.parameters.opacity[bound], unwanted[bound], face[bound]))]
     first = np.ones(len(order), bool)
     first[1:] = face[order][1:] != face[order][:-1]
+    prunable = unwanted.copy()
     prunable[order[first]] = False
-    return np.asarray(prunable)
+    return prunable
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:

@@ -1,12 +1,13 @@
 """Cache of meshes and face frames by timestep, and the limits on size and position in their units (STGA, training)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
+from ...avatar.offsets.offset import moved_frames
 from ...avatar.offsets.table import OFFSETS
 from ...avatar.strain import color_range, strain_basis
 from ...capture.model import Capture
@@ -74,6 +75,10 @@ class FrameStore:
             return entry.signals[name]
 
         return signal
+
+    def moved(self, timestep: int, coefficients: Mapping[str, np.ndarray]) -> FaceFrames:
+        """The timestep's frames, moved by the driven offsets of these coefficients."""
+        return moved_frames(self.of(timestep), coefficients, self.signals(timestep))
 
     def mesh(self, timestep: int) -> np.ndarray:
         """(V, 3) that the frames of the timestep are computed from."""

@@ -1,19 +1,25 @@
 """Training strategies: which triangles an iteration trains, and what happens after a step."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from ..settings import CONTINUATIONS, TrainingSettings
 from .density import MAX_SPLIT_SHARE, control_density, reset_strays
+from .frames import FrameStore
+from .outlines import Outline, prune_outside
 from .state import TrainState
 
 EXTEND_LOCAL_SHARE = 0.5
 """Share of an extension's budget that trains what the new takes need, before all splats are trained."""
 MAX_REGION_SPLIT_SHARE = 0.1
 """Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""
+
+OUTLINE_INTERVAL = 200
+"""Iterations between turns of `OutlineControl`."""
 
 
 class Strategy(Protocol):
@@ -151,6 +157,27 @@ class DensityControl:
         return control_density(
             state, budget, np.random.default_rng([self.settings.seed, iteration]), share, self.region
         )
+
+
+@dataclass(frozen=True)
+class OutlineControl:
+    """Prunes splats outside of the outlines of the masks, where alpha is learned from them.
+
+    region  (F,) bool: only splats on these triangles are pruned; None for all
+    """
+
+    settings: TrainingSettings
+    frames: FrameStore
+    outlines: Callable[[], Sequence[Outline]]
+    region: np.ndarray | None = None
+
+    def is_due(self, iteration: int, progress: float) -> bool:
+        return self.settings.random_background and _at_interval(iteration, OUTLINE_INTERVAL)
+
+    def apply(self, state: TrainState, iteration: int) -> TrainState:
+        coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
+        frames = partial(self.frames.moved, coefficients=coefficients)
+        return prune_outside(state, frames, self.outlines(), self.region)
 
 
 def _at_interval(iteration: int, interval: int) -> bool:

@@ -1,6 +1,7 @@
 """One training step: a view in, updated splats out."""
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from .cpu_backend import CpuBackend
 from .flame_refinement import RefinementState, refinable_tracking, refinement_rate
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
+from .outlines import Outline, read_outlines
 from .state import TrainState, new_state, with_offsets
-from .strategies import DensityControl, PostStep, StrayReset, make_strategy
+from .strategies import DensityControl, OutlineControl, PostStep, StrayReset, make_strategy
 
 
 class Trainer:
@@ -130,10 +132,15 @@ class Trainer:
         """The view with the splats' exponential moving average: a new (3, H, W) float32 image over the background."""
         return self._backend.render(view, self._background, sh_degree(self.settings, progress))
 
+    @cached_property
+    def _outlines(self) -> list[Outline]:
+        return read_outlines(self.capture, self.settings.seed)
+
     def _post_step(self, progress: float) -> None:
         steps: tuple[PostStep, ...] = (
             StrayReset(self.settings, self.frames.units, self.strategy.region),
             DensityControl(self.settings, self.initial_count, self.strategy.region),
+            OutlineControl(self.settings, self.frames, lambda: self._outlines, self.strategy.region),
         )
         due = [step for step in steps if step.is_due(self.iteration, progress)]
         if due:
