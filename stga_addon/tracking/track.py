@@ -53,7 +53,7 @@ from .landmarks import (
     write_places,
 )
 from .mattes import with_mattes
-from .pictures import Show, show_first_frame, show_fit
+from .pictures import Show, picture_of_first_frame, picture_of_fit
 from .posed_points import PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
@@ -103,7 +103,7 @@ def track(
     world: str = "auto",
     mattes: bool = True,
     report: Report = lambda stage, done, total: None,
-    show: Show | None = None,
+    show: Show = lambda draw: None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
@@ -113,7 +113,7 @@ def track(
     What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks: called again after an interruption, those
     cameras and frames are not worked on again. world: "head": meters as the head's size says, y up, the head near the
     origin; "keep": that of the cameras, which is scaled about its origin where it is not in meters; "auto": as the
-    calibration says, else "head". show: given pictures of how the head fits, the first one within seconds.
+    calibration says, else "head". show: told of each picture of how the head fits.
     Raises StgaError.
     """
     if is_written(out):
@@ -132,8 +132,7 @@ def track(
         _begin(out, _source(footage, head_file))
         places_file = out / LANDMARKS_FOLDER / PLACES_FILE
         write_places(places_file, places, reliable)
-        if show is not None:
-            show_first_frame(head, footage, detector, places, reliable, show)
+        show(partial(picture_of_first_frame, head, footage, detector, places, reliable))
         found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
     if not any(camera.confidence.any() for camera in found.values()):
         raise StgaError(f"{footage.root}: shows no face in any of {len(list(footage.views()))} frames")
@@ -150,13 +149,11 @@ def track(
     metric = keep and is_metric(head, places, reliable, take)
     fit = fit_head(head, places, reliable, take, report, metric)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
-    if show is not None:
-        show_fit(fit, footage, show)
+    show(partial(picture_of_fit, fit, footage))
     recorded = RecordedTake(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
     with Helpers() as helpers:
         fit, misfits = by_images(head, fit, recorded, helpers, report)
-    if show is not None:
-        show_fit(fit, footage, show)
+    show(partial(picture_of_fit, fit, footage))
     fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)
