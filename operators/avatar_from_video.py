@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.avatar_folder import check_inputs
+from ..stga_addon.requests.avatar_folder import check_inputs, read_inputs
 from ..stga_addon.requests.monitor_state import Kind
 from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track
 from ..stga_addon.requests.values import Train as TrainRequest
@@ -19,6 +19,8 @@ from .request import needs_idle, start
 from .training_python import training_python
 
 MAX_FOLDERS = 1000
+DIGITS = 3
+"""Of numbers that Blender keeps in single precision, which continue only as they began."""
 
 
 class AvatarFromVideo(bpy.types.Operator, FileImport):
@@ -30,9 +32,9 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filepath: path_property("Video", "Video of a face", options={"SKIP_SAVE"})
-    directory: path_property(
+    folder: path_property(  # not `directory`, which Blender's file browser sets to that of the file
         "Folder",
-        "Folder for capture and avatar; empty: one beside the .blend file, or beside the video",
+        "Folder for capture and avatar; empty: one beside the .blend file, else beside the video",
         "DIR_PATH",
         options={"SKIP_SAVE"},
     )
@@ -54,27 +56,30 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         if not self.filepath:
-            return super().invoke(context, event)
+            return self.execute(context) if self.folder else super().invoke(context, event)
         video = file_path(self.filepath, "video").resolve()  # dropped
-        self.directory = str(proposed_folder(self._tracking(video, Path())).parent)
+        self.folder = str(proposed_folder(self._tracking(video, Path())).parent)
         return context.window_manager.invoke_props_dialog(self, width=480, title=self.bl_label, confirm_text="Make")
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
-        for name in ("directory", "minutes", "focal"):
+        for name in ("folder", "minutes", "focal"):
             self.layout.prop(self, name)
 
     @reporting
     def execute(self, context: Any) -> set[str]:
+        if self.folder and not self.filepath:  # continues
+            began_with = read_inputs(file_path(self.folder, "folder"))
+            self.filepath, self.focal = str(began_with.get("footage", "")), began_with.get("focal") or 0.0
         video = file_path(self.filepath, "video").resolve()
         if not video.is_file():
             raise StgaError(f"{video}: is not a file; expected a video")
         python = training_python(context, self.python)
-        if self.directory:
-            capture = file_path(self.directory, "folder").resolve() / CAPTURE_FOLDER
+        if self.folder:
+            capture = file_path(self.folder, "folder").resolve() / CAPTURE_FOLDER
         else:
             capture = proposed_folder(self._tracking(video, Path()))
-        settings = make_settings("global", seconds=60 * self.minutes, effects={})
+        settings = make_settings("global", seconds=round(60 * self.minutes, DIGITS), effects={})
         train = TrainRequest(capture.parent / RUN_FOLDER, capture, settings)
         request = MakeAvatar(self._tracking(video, capture), train)
         if start(context.scene, request, python):
@@ -82,7 +87,7 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
         return {"FINISHED"}
 
     def _tracking(self, video: Path, capture: Path) -> Track:
-        return Track(video, None, capture, focal=self.focal or None)
+        return Track(video, None, capture, focal=round(self.focal, DIGITS) or None)
 
 
 def proposed_folder(track: Track) -> Path:

@@ -36,7 +36,7 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
         if making.subject is not None:
             draw_end(layout, context, making)
             if making.snapshot.state != WorkerState.FINISHED:
-                layout.operator(ids.AVATAR_FROM_VIDEO, text="Continue…", icon="FILE_MOVIE")
+                layout.operator(ids.AVATAR_FROM_VIDEO, text="Continue", icon="FRAME_NEXT").folder = str(making.subject)
         if tracking.is_running:
             done = f"Tracking, {100 * tracking.snapshot.status.progress:.0f} %"
             draw_text(

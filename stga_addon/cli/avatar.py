@@ -73,7 +73,7 @@ def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callabl
     flame = Path(inputs["model"]) if inputs["model"] and is_flame(out / CAPTURE_FOLDER) else None
     capture, avatar = open_capture(out / CAPTURE_FOLDER, flame), read_avatar(out / RUN_FOLDER / AVATAR)
     empty_file()
-    head = set_up_head(refine(capture), flame)
+    head = set_up_head(refine(capture))
     show_on_head(avatar, head, f"//{RUN_FOLDER}/{AVATAR}", playback_fps(capture, numbered=True))
     show_world(out / RUN_FOLDER / AVATAR, head)
     finish(head)

@@ -137,7 +137,8 @@ class _StatusReport:
         if progress.preview is not None and monotonic() - self._previewed_s > PREVIEW_INTERVAL_S:
             progress.preview(self._writer.folder / PREVIEW)
             self._previewed_s = monotonic()
-        if progress.picture is not None:
+        picture = progress.picture() if progress.picture is not None else None
+        if picture is not None:
             with suppress(StgaError):  # a full disk, which the work reports itself
-                write_npz(self._writer.folder / PICTURE, {"rgb": progress.picture})
+                write_npz(self._writer.folder / PICTURE, {"rgb": picture})
         return self._also(progress) or stop

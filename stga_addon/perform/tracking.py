@@ -49,8 +49,8 @@ def perform_tracking(request: Track, report: Report, say: Say) -> Written:
         now = progress
         return report(progress)
 
-    def show(picture: np.ndarray) -> None:
-        report(replace(now, picture=picture))
+    def show(draw: Callable[[], np.ndarray | None]) -> None:
+        report(replace(now, picture=draw))
 
     steps = _steps(keep)
     steps("Opening the footage", 0, 1)

@@ -19,10 +19,11 @@ from .viewports import frame_alone
 WORLD_NAME = "World splats"
 
 
-def set_up_head(capture: Capture, flame: Path | None) -> Any:
+def set_up_head(capture: Capture) -> Any:
     """Bring the capture's head and cameras into the open file's empty scene; returns the head. Raises StgaError."""
     head = import_head(capture)
-    head[tags.FLAME_MODEL] = str(flame.resolve()) if flame is not None else ""  # so that Train works in the saved file
+    model = capture.flame_file
+    head[tags.FLAME_MODEL] = "" if model is None else str(model.resolve())  # so that Train works in the saved file
     cameras = import_cameras(capture, capture_root(capture.root))
     configure_scene(current_scene(), capture, central(cameras))
     return head

@@ -25,27 +25,29 @@ FIRST_CAMERAS = 3
 COLUMNS = 2
 """Most frames of a picture, in each direction."""
 
-Show = Callable[[np.ndarray], None]
-"""Called with a picture (SIZE, SIZE, 3) uint8."""
+Show = Callable[[Callable[[], np.ndarray | None]], None]
+"""Called with what draws a picture (SIZE, SIZE, 3) uint8 for those who watch; None: there is nothing to see."""
 
 
-def show_first_frame(
-    head: HeadModel, footage: Footage, detector: FaceNetworks, places: SurfacePoints, reliable: np.ndarray, show: Show
-) -> None:
-    """Show the head on the first frame, within seconds; nothing where no face, or several, are found there."""
+def picture_of_first_frame(
+    head: HeadModel, footage: Footage, detector: FaceNetworks, places: SurfacePoints, reliable: np.ndarray
+) -> np.ndarray | None:
+    """The head on the first frame, found within seconds; None where no face, or several, are seen there."""
     timestep = footage.timesteps[0]
     seeing = evenly_spread([camera for camera in footage.cameras if timestep in camera.timesteps], FIRST_CAMERAS)
     found = [(camera, detector.detect(camera.image(timestep))) for camera in seeing]
     alone = [(camera.camera, faces[0]) for camera, faces in found if len(faces) == 1]
     points = np.array([face for _, face in alone]).reshape(-1, len(places), 2)
     seen = TimestepLandmarks(tuple(camera for camera, _ in alone), points, np.ones(points.shape[:2]))
-    if determines_pose(seen, reliable, places.on(head.model.v_template, head.model.faces)):
-        with suppress(StgaError):  # the whole take may still be tracked, and says what is wrong
-            show_fit(fit_head(head, places, reliable, {timestep: seen}), footage, show)
+    if not determines_pose(seen, reliable, places.on(head.model.v_template, head.model.faces)):
+        return None
+    with suppress(StgaError):  # the whole take may still be tracked, and says what is wrong
+        return picture_of_fit(fit_head(head, places, reliable, {timestep: seen}), footage)
+    return None
 
 
-def show_fit(fit: HeadFit, footage: Footage, show: Show) -> None:
-    """Show the head on a few of the frames that it was fitted to."""
+def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
+    """The head on a few of the frames that it was fitted to."""
     timesteps = evenly_spread(sorted(fit.parameters), COLUMNS**2)
     columns = COLUMNS if len(timesteps) == COLUMNS**2 else 1
     side = SIZE // columns
@@ -60,7 +62,7 @@ def show_fit(fit: HeadFit, footage: Footage, show: Show) -> None:
             fit.head.model.faces,
             side,
         )
-    show(picture)
+    return picture
 
 
 def _square(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:

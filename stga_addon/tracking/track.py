@@ -55,7 +55,7 @@ from .landmarks import (
     write_places,
 )
 from .mattes import with_mattes
-from .pictures import Show, show_first_frame, show_fit
+from .pictures import Show, picture_of_first_frame, picture_of_fit
 from .posed_points import PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
@@ -108,7 +108,7 @@ def track(
     world: str = "auto",
     mattes: bool = True,
     report: Report = lambda stage, done, total: None,
-    show: Show | None = None,
+    show: Show = lambda draw: None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
@@ -143,8 +143,7 @@ def track(
         _begin(out, source)
         places_file = out / LANDMARKS_FOLDER / PLACES_FILE
         write_places(places_file, places, reliable)
-        if show is not None:
-            show_first_frame(head, footage, detector, places, reliable, show)
+        show(partial(picture_of_first_frame, head, footage, detector, places, reliable))
         try:
             found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
             _check_faces(footage, found)
@@ -169,13 +168,11 @@ def track(
     metric = keep and is_metric(head, places, reliable, take)
     fit = fit_head(head, places, reliable, take, report, metric)
     _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
-    if show is not None:
-        show_fit(fit, footage, show)
+    show(partial(picture_of_fit, fit, footage))
     recorded = RecordedTake(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
     with Helpers() as helpers:
         fit, misfits = by_images(head, fit, recorded, helpers, report)
-    if show is not None:
-        show_fit(fit, footage, show)
+    show(partial(picture_of_fit, fit, footage))
     fit = in_cameras_world(fit) if keep else fit
     errors = reprojection_errors(fit, places, reliable, take, footage, found)
     parameters = interpolated(fit.parameters, footage.timesteps)

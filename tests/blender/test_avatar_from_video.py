@@ -42,9 +42,13 @@ def begin(requests):
 def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path):
     """Catches a second way to an avatar, with other settings than `stga avatar VIDEO`."""
     out = tmp_path / "out"
-    assert bpy.ops.stga.avatar_from_video(filepath=str(video), directory=str(out), minutes=2.0) == {"FINISHED"}
+    assert bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(out), minutes=0.05, focal=2308.3) == {
+        "FINISHED"
+    }
     main, avatar = (import_module(f"{extension.__name__}.stga_addon.cli.{name}") for name in ("main", "avatar"))
-    options = main.make_parser().parse_args(["avatar", str(video), "--out", str(out)])
+    options = main.make_parser().parse_args(
+        ["avatar", str(video), "--out", str(out), "--budget", "3s", "--focal", "2308.3"]
+    )
     assert asked == [avatar.avatar_request(options)]
 
 
@@ -68,6 +72,14 @@ def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
     assert make(other) == tmp_path / "anna avatar 3"
 
 
+def test_what_was_begun_is_continued_by_its_folder(asked, video, tmp_path):
+    """Catches a Continue in the panel that asks for the video again, or continues as with other options."""
+    assert bpy.ops.stga.avatar_from_video(filepath=str(video), focal=900.0) == {"FINISHED"}
+    begin(asked)
+    assert bpy.ops.stga.avatar_from_video("INVOKE_DEFAULT", folder=str(tmp_path / "anna avatar")) == {"FINISHED"}
+    assert asked[1] == asked[0]
+
+
 def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
     """Catches a worker that is started for nothing, and the request of another video in a folder."""
     with pytest.raises(RuntimeError, match=r"gone\.mp4: is not a file; expected a video"):
@@ -75,7 +87,7 @@ def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
     (tmp_path / "out/capture").mkdir(parents=True)
     (tmp_path / "out/inputs.json").write_text('{"footage": "/shots/ben.mp4", "model": null}')
     with pytest.raises(RuntimeError, match=r"footage: .*out began with .*ben\.mp4"):
-        bpy.ops.stga.avatar_from_video(filepath=str(video), directory=str(tmp_path / "out"), python=sys.executable)
+        bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(tmp_path / "out"), python=sys.executable)
 
 
 @pytest.mark.slow

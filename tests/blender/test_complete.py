@@ -56,7 +56,7 @@ result["next run"] = settings.run_folder
 result["log"] = (Path(result["run"]) / "job/worker.log").read_text()
 bpy.ops.stga.test_python()
 result["check"] = sys.modules[module + ".operators.training_python"].test.found.line
-bpy.ops.stga.avatar_from_video(filepath=video, directory=str(home / "avatar"), minutes=0.05)
+bpy.ops.stga.avatar_from_video(filepath=video, folder=str(home / "avatar"), minutes=0.05)
 result["made"] = [settings.head["stga_capture"], settings.splats["stga_run"], len(settings.splats.data.vertices)]
 run = sys.modules[module + ".operators.command_line"]._run
 result["codes"] = [
@@ -123,7 +123,7 @@ def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> N
     *folders, splats = result["made"]
     assert folders == [str(tmp_path / "avatar/capture"), str(tmp_path / "avatar/run")]
     assert splats == len(read_avatar(tmp_path / "avatar/run/avatar.npz").splats)
-    assert result["codes"] == [0, 0]
+    assert result["codes"] == [0, 0], done.stderr[-3000:]
     assert (tmp_path / "tracked/bundled_head.npz").is_file()
     assert (tmp_path / "avatar/avatar.blend").is_file()
     settings = make_settings("global", iterations=ITERATIONS)

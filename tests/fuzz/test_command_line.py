@@ -15,6 +15,7 @@ import traceback
 import warnings
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,13 +97,18 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
     settings = read_run(case / "run").settings
     key = np.zeros(synthetic_flame(0).n_expression + 18)
     avatar, played = case / "run/avatar.npz", ask.Played({4: open_capture(capture).neutral})
+    tracking = ask.Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points")
+    capture_of_avatar = case / "made/capture"
     requests: tuple[ask.Request, ...] = (
         ask.Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}),
         ask.Resume(run, capture, device="cpu"),
         ask.Refine(case / "refined", run, weights=np.linspace(0, 1, 320, dtype=np.float32), **once),
         ask.Extend(case / "extended", run, (case / "take",), **once),
         ask.SelectForTake(run, case / "take"),
-        ask.Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points"),
+        tracking,
+        ask.MakeAvatar(
+            replace(tracking, out=capture_of_avatar), ask.Train(case / "made/run", capture_of_avatar, settings)
+        ),
         ask.SolveAgain(footage / "out", footage / "head.npz", {1: key}),
         ask.RenderRecording(case / "none.bin", case / "asked.mp4", 1, 25.0),
         ask.Analyze(capture),

@@ -20,12 +20,12 @@ def test_first_frame_shows_the_head_where_it_is(tmp_path, monkeypatch):
     write_head_video(tmp_path / "head.mp4", 2)
     head, networks = read_head_model(None), FaceNetworks()
     places, reliable = calibrate(head.model, networks, "head")
-    shown: list[np.ndarray] = []
+    shown = []
     draw = pictures.with_mesh
     for with_mesh in (draw, lambda picture, *_: picture):
         monkeypatch.setattr(pictures, "with_mesh", with_mesh)
         footage = open_footage(tmp_path / "head.mp4")
-        pictures.show_first_frame(head, footage, networks, places, reliable, shown.append)
+        shown.append(pictures.picture_of_first_frame(head, footage, networks, places, reliable))
     over, plain = (picture.astype(int) for picture in shown)
     assert over.shape == (pictures.SIZE, pictures.SIZE, 3)
     drawn, skin = np.abs(over - plain).max(2) > 8, plain[..., 0] - plain[..., 2] > 20

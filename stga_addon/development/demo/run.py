@@ -55,7 +55,7 @@ def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | Non
     with tqdm(desc="Rendering the capture", unit="image") as bar:
         model = make_capture(folder, SEED, options, progress=lambda done, total: _advance(bar, done, total))
     capture = open_capture(folder, model)
-    head, selection = _import_and_select(capture, model)
+    head, selection = _import_and_select(capture)
     avatar = _train(capture, model, out, budget, selection, device)
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
@@ -88,14 +88,14 @@ def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
     bar.update(done - bar.n)
 
 
-def _import_and_select(capture: Capture, model: Path) -> tuple[object, dict[int, np.ndarray]]:
+def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:
     """Make a Blender scene with head, cameras and a vertex group per frame; returns head and selection read back."""
     from ...scene.avatar_scene import set_up_head
     from ...scene.blend_file import new_file
     from ...scene.vertex_groups import read_selection, write_selection
 
     new_file()
-    head = set_up_head(capture, model)
+    head = set_up_head(capture)
     write_selection(head, select_capture(capture, SelectionOptions()))
     return head, read_selection(head)
 
