@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from ...avatar.embedding import FaceFrames, to_world
+from ...avatar.embedding import FaceFrames, points_to_world
 from ...capture.camera import Camera
 from ...capture.images import area_mean, read_mask
 from ...capture.model import Capture
-from ...flame.quaternions import to_matrices
 from .density import prunable
 from .hull_points import pixels_of
 from .state import TrainState, keep_rows
@@ -22,9 +21,7 @@ MAX_OUTLINE_HEIGHT_PX = 400
 TOLERANCE_SHARE = 0.01
 """Error of masks and tracking, as a share of the image height."""
 MAX_OUTSIDE_SHARE = 0.5
-"""Share of the outlines in whose image a point lies, of which it may lie outside."""
-REACH = 2.0
-"""Distance of a splat's ends from its center, in standard deviations."""
+"""Share of the outlines in whose image a point lies, that it may lie outside of."""
 
 
 @dataclass(frozen=True)
@@ -56,22 +53,18 @@ def prune_outside(
     outlines: Sequence[Outline],
     region: np.ndarray | None = None,
 ) -> TrainState:
-    """Prune the splats whose center, or an end of an axis, lies outside of most of the outlines in whose image it lies.
+    """Prune the splats whose center lies outside of most of the outlines in whose image it lies.
 
     frames: timestep -> the frames of the triangles; region (F,) bool: the triangles whose splats may change, None for
     all. Every triangle with bound splats keeps one.
     """
-    splats, n = state.splats(), len(state)
-    seen, outside = np.zeros((2, 7, n), np.int32)  # the center, and the ends of the axes
+    seen, outside = np.zeros((2, len(state)), np.int32)
     for outline in outlines:
-        world = to_world(splats, frames(outline.timestep))
-        axes = REACH * to_matrices(world.rotation) * np.exp(world.log_scale)[:, None]
-        offsets = [0, *(side * axes[..., axis] for axis in range(3) for side in (-1, 1))]
-        for point, offset in enumerate(offsets):
-            x, y, shown = pixels_of(world.xyz + offset, outline.camera)
-            seen[point] += shown
-            outside[point] += shown & outline.clear[y, x]
-    stray = (outside > MAX_OUTSIDE_SHARE * seen).any(axis=0)
+        points = points_to_world(state.parameters.xyz, frames(outline.timestep), state.face)
+        x, y, shown = pixels_of(points, outline.camera)
+        seen += shown
+        outside += shown & outline.clear[y, x]
+    stray = outside > MAX_OUTSIDE_SHARE * seen
     if region is not None:
         stray &= region[state.face]
     return keep_rows(state, ~prunable(state, stray))
