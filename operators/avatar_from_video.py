@@ -8,7 +8,7 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.avatar_folder import check_inputs, read_inputs
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.requests.monitor_state import TRAINS
 from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track
 from ..stga_addon.requests.values import Train as TrainRequest
 from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
@@ -52,7 +52,7 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_idle(cls, context, Kind.AVATAR)
+        return needs_idle(cls, context, *TRAINS)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         if not self.filepath:

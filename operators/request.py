@@ -102,10 +102,10 @@ def python_of(operator: Any, context: Any) -> str | None:
     return training_python(context, operator.python)
 
 
-def needs_idle(operator: Any, context: Any, kind: Kind) -> bool:
-    """Poll: whether no request of the kind is running."""
-    is_idle = not monitor.state_of(context.scene, kind).is_running
-    return polled(operator, is_idle, f"{KINDS[kind].label} is running; wait, or cancel it")
+def needs_idle(operator: Any, context: Any, *kinds: Kind) -> bool:
+    """Poll: whether no request of these kinds is running."""
+    running = next((kind for kind in kinds if monitor.state_of(context.scene, kind).is_running), None)
+    return running is None or polled(operator, False, f"{KINDS[running].label} is running; wait, or cancel it")
 
 
 def _kind_property(kinds: Any) -> Any:

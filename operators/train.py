@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.requests.monitor_state import TRAINS
 from ..stga_addon.requests.values import Extend, Refine, Resume
 from ..stga_addon.requests.values import Train as TrainRequest
 from ..stga_addon.scene.vertex_groups import training_selection
@@ -91,7 +91,7 @@ class TrainingOperator:
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return needs_head(cls, context) and needs_idle(cls, context, Kind.TRAINING)
+        return needs_head(cls, context) and needs_idle(cls, context, *TRAINS)
 
 
 class Train(TrainingOperator, TrainOptions, bpy.types.Operator):

@@ -126,7 +126,7 @@ def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> N
     assert result["codes"] == [0, 0], done.stderr[-3000:]
     assert (tmp_path / "tracked/bundled_head.npz").is_file()
     assert (tmp_path / "avatar/avatar.blend").is_file()
-    settings = make_settings("global", iterations=ITERATIONS)
+    settings = make_settings("global", iterations=ITERATIONS, effects={})  # as the operator
     perform(Train(tmp_path / "here", demo, settings), ignore, print)
     found, expected = (read_metrics(run)[-1]["psnr"] for run in (Path(result["run"]), tmp_path / "here"))
     assert abs(found - expected) < MAX_DIFFERENCE_DB
