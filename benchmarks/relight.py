@@ -21,7 +21,7 @@ from PIL import Image
 
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.images import read_image, read_mask
-from stga_addon.capture.mesh_raster import rasterize
+from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
 from stga_addon.light.estimate import Known, estimate_light

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import bpy
 import numpy as np
 
-from ..stga_addon.capture.region import SELECTED_WEIGHT
+from ..stga_addon.capture.meshes import SELECTED_WEIGHT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.requests.values import Extend as ExtendRequest
 from ..stga_addon.requests.values import Refine as RefineRequest

@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.driving.head_map import head_map
-from ..stga_addon.driving.live.receiver import LOOPBACK, Receiver, leaves_this_machine
-from ..stga_addon.driving.live.sources import SOURCES
-from ..stga_addon.driving.live.take import Recording
+from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES, Receiver, leaves_this_machine
+from ..stga_addon.driving.live.stream import Recording
 from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S
 from ..stga_addon.driving.transfer import trained_range
 from ..stga_addon.errors import StgaError

@@ -10,7 +10,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.avatar.file import read_avatar
-from ..stga_addon.driving.page_controls import page_controls
+from ..stga_addon.driving.head_map import page_controls
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar, range_bytes
 from ..stga_addon.format import format_bytes

@@ -11,8 +11,7 @@ from typing import Any, ClassVar
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.capture.camera import Camera
-from ..stga_addon.capture.camera_path import TURNTABLE_S, to_and_fro
+from ..stga_addon.capture.camera import TURNTABLE_S, Camera, to_and_fro
 from ..stga_addon.errors import StgaError
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.recording import Recorder, check_output

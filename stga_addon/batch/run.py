@@ -9,10 +9,8 @@ from filelock import SoftFileLease
 
 from ..errors import StgaError
 from ..worker.status import WorkerState, WorkerStatus, read_status, request_cancel
-from .engine import Engine
-from .folder import is_done, is_running, prepare, read_record, write_record
-from .identity import job_digests
-from .job import Job
+from .folder import is_done, is_running, job_digests, prepare, read_record, write_record
+from .job import Engine, Job
 from .plan import Plan
 
 MAX_RETRIES = 5

@@ -1,6 +1,10 @@
-"""Normals and connected parts of meshes."""
+"""Geometry of triangle meshes: normals, connected parts, rigid alignment, and which triangle a camera's pixels show."""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from .camera import Camera
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -22,3 +26,190 @@ def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
         part = part[part]
         if np.array_equal(part, before):
             return np.asarray(part)
+
+
+MAX_ITERATIONS = 100
+MIN_RESIDUAL = 1e-7
+"""Share of the mesh's size below which residuals are rounding."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x ↦ scale · rotation x + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera in the world that `apply` leads to."""
+        pose = np.eye(4)
+        pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
+        pose[:3, 3] = self.scale * camera.world_to_camera[:3, 3] - pose[:3, :3] @ self.translation
+        return replace(camera, world_to_camera=pose)
+
+
+def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    """The mesh (V, 3) moved rigidly onto the neutral mesh (V, 3), without scale (STGA, selective training).
+
+    A robust Procrustes fit: vertices that the expression moves, such as those of an open jaw, get hardly any weight,
+    provided that less than half of all vertices move against the skull. A plain least-squares fit would tilt the head.
+    The neutral mesh must have an extent (`meshes.check_extent`).
+    """
+    size = np.linalg.norm(np.ptp(neutral, axis=0))
+    weights = np.ones(len(mesh))
+    fitted = np.asarray(mesh, np.float64)
+    for _ in range(MAX_ITERATIONS):
+        rotation, translation = weighted_procrustes(mesh, neutral, weights)
+        before, fitted = fitted, mesh @ rotation.T + translation
+        residual = np.linalg.norm(fitted - neutral, axis=1)
+        # Geman-McClure weights, scaled by the median residual: they fall with its fourth power.
+        scale = max(float(np.median(residual)), MIN_RESIDUAL * size)
+        weights = 1 / (1 + (residual / scale) ** 2) ** 2
+        if np.abs(fitted - before).max() < MIN_RESIDUAL * size:
+            break
+    return np.asarray(fitted)
+
+
+def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and translation (3,) with least Σ w·|R·source + t − target|² (Kabsch); points (N, 3)."""
+    share = (weights / weights.sum())[:, None]
+    source_center, target_center = (share * source).sum(0), (share * target).sum(0)
+    u, _, vt = np.linalg.svd((target - target_center).T @ (share * (source - source_center)))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rotation, target_center - rotation @ source_center
+
+
+def similarity(source: np.ndarray, target: np.ndarray, metric: bool = False) -> Similarity:
+    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not coincide (Umeyama).
+
+    metric: of those with a scale of 1.
+    """
+    rotation, _ = weighted_procrustes(source, target, np.ones(len(source)))
+    a, b = source - source.mean(0), target - target.mean(0)
+    scale = 1.0 if metric else float((b * (a @ rotation.T)).sum() / (a**2).sum())
+    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+
+
+CHUNK_PIXELS = 1 << 21
+"""Candidate pixels that are tested at a time, to bound the memory."""
+MIN_DEPTH_M = 0.01
+"""Triangles nearer to the camera's plane, or behind it, are not drawn."""
+
+
+def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """What a camera sees of a mesh: triangle (H, W) int32, -1 for none, and barycentric coordinates (H, W, 3).
+
+    Both sides of a triangle are visible. Triangles that reach behind the camera are left out; barycentric coordinates
+    are those in the image, without perspective.
+    """
+    flat, depth = camera.project(vertices)
+    inverse_depth = 1 / np.where(depth > 0, depth, np.nan)[faces]
+    rows = np.flatnonzero(np.isfinite(inverse_depth).all(1) & np.isfinite(flat[faces]).all((1, 2)))
+    corners = flat[faces[rows]]
+    slopes = _barycentric_slopes(corners)
+    closeness_slopes = (slopes * inverse_depth[rows][:, :, None]).sum(1)
+    nearest = np.zeros(camera.width * camera.height)
+    owner = np.full(len(nearest), -1)
+    for group in _chunks(corners, camera):
+        face, x, y = _covered(group, corners, camera)
+        closeness = _at(closeness_slopes[face], x, y)
+        pixel = y * camera.width + x
+        np.maximum.at(nearest, pixel, closeness)
+        wins = (closeness > 0) & (closeness == nearest[pixel])  # of several triangles at one depth, the last
+        owner[pixel[wins]] = face[wins]
+    shown = np.flatnonzero(owner >= 0)
+    triangle, weights = np.full(len(nearest), -1, np.int32), np.zeros((len(nearest), 3))
+    triangle[shown] = rows[owner[shown]]
+    y, x = np.divmod(shown, camera.width)
+    weights[shown] = np.maximum(_at(slopes[owner[shown]], x[:, None], y[:, None]), 0)
+    shape = camera.height, camera.width
+    return triangle.reshape(shape), weights.reshape(*shape, 3)
+
+
+def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) bool: the pixels that a mesh covers; faster than `rasterize`."""
+    from PIL import Image, ImageDraw  # Blender lacks it, and needs `rasterize` alone
+
+    pixels, depth = camera.project(vertices)
+    pixels -= 0.5  # Pillow's pixel centers lie at whole numbers
+    picture = Image.new("1", (camera.width, camera.height))
+    draw = ImageDraw.Draw(picture)
+    for corners in pixels[faces[(depth > MIN_DEPTH_M)[faces].all(1)]].reshape(-1, 6).tolist():
+        draw.polygon(corners, fill=1)
+    return np.asarray(picture)
+
+
+def _chunks(corners: np.ndarray, camera: Camera) -> list[np.ndarray]:
+    """Triangles (T, 3, 2) that may show a pixel, in groups whose bounding boxes hold about CHUNK_PIXELS."""
+    low, high = corners.min(1), corners.max(1)
+    size = np.minimum(high, [camera.width, camera.height]) - np.maximum(low, 0)
+    drawn = np.flatnonzero((size >= 0).all(1))
+    groups = np.cumsum(np.ceil(size[drawn] + 1).prod(1)) // CHUNK_PIXELS
+    return np.split(drawn, np.flatnonzero(np.diff(groups)) + 1)
+
+
+def _covered(group: np.ndarray, corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangle, x and y of each pixel center that lies in a triangle of the group, or on its edge.
+
+    Pixel by pixel along the lines of the image that cross a triangle, between its edges.
+    """
+    face, y = _counted(group, *_whole(corners[group, :, 1].min(1), corners[group, :, 1].max(1), camera.height))
+    left, right = _crossings(corners, face, y + 0.5)
+    line, x = _counted(np.arange(len(face)), *_whole(left, right, camera.width))
+    return face[line], x, y[line]
+
+
+def _whole(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first pixel with its center from `low` to `high`, inside an image of this size, and how many there are."""
+    first = np.ceil(np.clip(low, 0, size + 1) - 0.5).astype(np.int64)
+    last = np.floor(np.clip(high, -1, size) - 0.5).astype(np.int64)
+    return first, np.maximum(np.minimum(last, size - 1) - first + 1, 0)
+
+
+def _counted(values: np.ndarray, first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each value `count` times, and numbers that count from its `first`."""
+    begin = np.cumsum(count) - count
+    return np.repeat(values, count), np.arange(count.sum()) + np.repeat(first - begin, count)
+
+
+def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x (R,) of the leftmost and the rightmost point of a triangle on a line of the image; face, y (R,).
+
+    An edge's ends are taken in the order of y, so that two triangles with a common edge agree where it lies to the
+    last bit and leave no pixel between them.
+    """
+    left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        first, second = corners[:, a], corners[:, b]
+        turned = second[:, 1] < first[:, 1]
+        x0, y0 = np.where(turned, second.T, first.T)
+        x1, y1 = np.where(turned, first.T, second.T)
+        slope = np.divide(x1 - x0, y1 - y0, out=np.zeros_like(x0), where=y1 > y0)
+        top = y0[face]
+        x = x0[face] + slope[face] * (y - top)
+        crosses = (top <= y) & (y <= y1[face])
+        np.minimum(left, x, out=left, where=crosses)
+        np.maximum(right, x, out=right, where=crosses)
+    return left, right
+
+
+def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
+    """(T, 3, 3): the barycentric coordinate of corner k at pixel (x, y) is [k, 0]·x + [k, 1]·y + [k, 2].
+
+    Zero for triangles that are seen edge-on.
+    """
+    x, y = corners[..., 0] - 0.5, corners[..., 1] - 0.5
+    along_x, along_y = np.roll(y, -1, 1) - np.roll(y, 1, 1), np.roll(x, 1, 1) - np.roll(x, -1, 1)
+    constant = -(along_x * np.roll(x, -1, 1) + along_y * np.roll(y, -1, 1))
+    area = _at(np.stack([along_x[:, 0], along_y[:, 0], constant[:, 0]], -1), x[:, 0], y[:, 0])
+    with np.errstate(divide="ignore"):
+        inverse = np.where(area != 0, 1 / area, 0.0)
+    return np.asarray(np.stack([along_x, along_y, constant], -1) * inverse[:, None, None])
+
+
+def _at(slopes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.asarray(slopes[..., 0] * x + slopes[..., 1] * y + slopes[..., 2])

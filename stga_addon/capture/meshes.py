@@ -1,7 +1,8 @@
-"""Reading of tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles."""
+"""Tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles; regions of triangles."""
 
 import io
 import re
+import struct
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -10,10 +11,35 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import read_bytes, read_json
+from ..files import parse_json, read_bytes, read_json, read_npz
 from ..flame.model import faces_within
 from .camera import MAX_COORDINATE_M
-from .glb_chunks import glb_chunks
+from .model import Capture
+
+MAGIC, VERSION, JSON_KIND = b"glTF", 2, b"JSON"
+HEADER_BYTES, CHUNK_HEADER_BYTES = 20, 8
+"""The file's header and that of its first chunk; and that of any later chunk."""
+
+
+def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The document and the binary chunk of a .glb file; the chunk is empty where there is none.
+
+    Raises ValueError where it is not binary glTF 2.0. Source: Khronos, glTF 2.0, section 4.4.
+    """
+    if len(data) < HEADER_BYTES:
+        raise ValueError("ends within its header")
+    magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
+    if (magic, version, kind) != (MAGIC, VERSION, JSON_KIND):
+        raise ValueError("expected binary glTF 2.0, with a JSON chunk at its beginning")
+    if length > len(data) - HEADER_BYTES:
+        raise ValueError("its JSON chunk reaches beyond the file")
+    document = parse_json(data[HEADER_BYTES : HEADER_BYTES + length])
+    if not isinstance(document, dict):
+        raise ValueError("its JSON chunk holds no object")
+    rest = data[HEADER_BYTES + length :]
+    size = struct.unpack_from("<I", rest)[0] if len(rest) >= CHUNK_HEADER_BYTES else 0
+    return document, rest[CHUNK_HEADER_BYTES : CHUNK_HEADER_BYTES + size]
+
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 8 << 20
@@ -211,3 +237,50 @@ def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
     first = np.repeat(np.cumsum(count) - count, fan)
     second = first + 1 + np.arange(fan.sum()) - np.repeat(np.cumsum(fan) - fan, fan)
     return np.asarray(index[np.stack([first, second, second + 1], axis=1)])
+
+
+WEIGHTS = "weights"
+FILES = (".npz", ".json")
+"""Suffixes of region files."""
+SELECTED_WEIGHT = 0.5
+"""Least weight of a triangle that belongs to the region."""
+
+
+def is_region_file(name: str) -> bool:
+    """Whether a region is named by its file."""
+    return Path(name).suffix.lower() in FILES
+
+
+def find_region(capture: Capture, name: str) -> np.ndarray:
+    """(F,) bool: a region of the capture, a vertex mask of FLAME, or the triangles of a region file.
+
+    Raises StgaError where there is none, or it holds no triangle.
+    """
+    region = _find(capture, name)
+    if not region.any():
+        raise StgaError(f"region '{name}': holds no triangle")
+    return region
+
+
+def _find(capture: Capture, name: str) -> np.ndarray:
+    masks = {} if capture.flame is None else capture.flame.model.masks
+    if name in capture.regions:
+        return np.asarray(capture.regions[name])
+    if name in masks:
+        return faces_within(capture.faces, masks[name])
+    path = Path(name)
+    if path.suffix.lower() == ".npz":
+        return _read_weights(path, len(capture.faces))
+    if path.suffix.lower() == ".json":
+        regions = read_regions(path, capture.faces, len(capture.neutral))
+        return np.asarray(np.any([np.zeros(len(capture.faces), bool), *regions.values()], axis=0))
+    known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
+    raise StgaError(f"region '{name}': is neither a region of the capture ({known}) nor an .npz or .json file")
+
+
+def _read_weights(path: Path, faces: int) -> np.ndarray:
+    weights = read_npz(path).get(WEIGHTS)
+    if weights is None or weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != (faces,):
+        found = "no such array" if weights is None else f"{weights.dtype} {weights.shape}"
+        raise StgaError(f"{path}: expected '{WEIGHTS}', one number from 0 to 1 per triangle ({faces},), found {found}")
+    return np.asarray(weights >= SELECTED_WEIGHT)

@@ -114,8 +114,8 @@ def with_threads(plan: Plan, threads: int) -> Plan:
 def print_plan(plan: Plan) -> None:
     """Print the jobs, and how long they are expected to take."""
     from ..batch.forecast import forecast_seconds
+    from ..batch.report import plan_lines
     from ..batch.run import Batch
-    from ..batch.table import plan_lines
     from ..worker.helpers import processors
 
     batch = Batch(plan)
@@ -126,8 +126,8 @@ def print_plan(plan: Plan) -> None:
 def _print_commands(plan: Plan) -> None:
     """Prepare the folders of the jobs that are not finished, and print a shell command for each in an order in which
     they can be done. Raises StgaError where a worker is running in a folder."""
-    from ..batch.engine import job_command
     from ..batch.folder import hold_folder, prepare
+    from ..batch.job import job_command
     from ..batch.run import Batch
 
     with hold_folder(plan.out):
@@ -147,9 +147,8 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     from ..batch.engines.table import make_engine
     from ..batch.folder import hold_folder
     from ..batch.forecast import forecast_seconds
-    from ..batch.report import write_report
+    from ..batch.report import LiveTable, summary_line, write_report
     from ..batch.run import Batch, run_batch
-    from ..batch.table import LiveTable, summary_line
 
     with hold_folder(plan.out) as lease:
         batch = Batch(plan)

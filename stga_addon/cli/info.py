@@ -31,7 +31,7 @@ def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
 
 
 def run(options: Namespace) -> None:
-    from ..capture.summary import summarize_capture
+    from ..capture.model import summarize_capture
     from ..training.effects.plan import describe_effects
 
     if (options.capture / RUN).exists() or options.capture.suffix == ".npz":

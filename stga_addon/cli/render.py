@@ -2,7 +2,7 @@
 
 from argparse import ArgumentParser, Namespace
 
-from ..capture.camera_path import TURNTABLE_S
+from ..capture.camera import TURNTABLE_S
 from ..errors import StgaError
 from ..export.playback import DEFAULT_FPS
 from ..export.ply import is_ply

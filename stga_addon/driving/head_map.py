@@ -6,16 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..capture.rigid import similarity
+from ..capture.mesh_geometry import similarity
+from ..errors import StgaError
+from ..export.playback import ShapeControls
 from ..flame.forward import RIGID_SIZE, FlameFrame
 from ..flame.model import JOINTS, FlameModel
 from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.posed_points import PosedPoints, SurfacePoints
-from .correspondence import face_points
 from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 from .performance import Performance
-from .shapes import JAW_OPEN, MOUTH_CLOSE, effective_weights, face_shapes
+from .shapes import JAW_OPEN, MOUTH_CLOSE, effective_weights, face_points, face_shapes
 
 JAW_SHAPES = ("jawOpen", "jawLeft", "jawRight")
 """Those that turn the jaw; jawForward, which a rotation cannot do, is left to the expressions."""
@@ -247,3 +248,17 @@ def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
     eyeballs = (person.weights[:, [JOINTS.index("left_eye"), JOINTS.index("right_eye")]] > 0.5).any()
     looks = np.array([name.startswith("eyeLook") for name in ARKIT_SHAPES])
     return np.where(looks & eyeballs, 1.0, reach)
+
+
+def page_controls(sequence: FlameSequence | None) -> ShapeControls | None:
+    """The controls of a FLAME head; None for a head without FLAME, or whose face ARKit's shapes do not fit."""
+    if sequence is None:
+        return None
+    try:
+        found = head_map(sequence, "the avatar")
+    except StgaError:  # eyes that are not where a head has them
+        return None
+    products = np.zeros((COUNT, found.expressions.shape[1]))
+    products[PRODUCTS] = found.expressions[COUNT:]
+    linear = np.concatenate([found.expressions[:COUNT], found.jaw, found.eyes], axis=1)
+    return ShapeControls(ARKIT_SHAPES, linear, products, ARKIT_SHAPES[JAW_OPEN], ARKIT_SHAPES[MOUTH_CLOSE])

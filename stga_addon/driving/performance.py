@@ -109,3 +109,21 @@ def parts_kept(performance: Performance, parts: tuple[str, ...]) -> Performance:
 
 def _interpolated(times: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
+
+
+@dataclass(frozen=True)
+class FacePacket:
+    """One frame of a live source.
+
+    names    ARKit shapes that it holds
+    weights  (52,) in the order of `ARKIT_SHAPES`, 0 for shapes that it lacks; None: the source sees no face
+    head     yaw, pitch, roll in radians as in `Performance.head`; None where it holds none
+    subject  the source's name for itself or its face
+    time     seconds of the source's own clock; None where it sends none
+    """
+
+    names: tuple[str, ...]
+    weights: np.ndarray | None
+    head: tuple[float, float, float] | None = None
+    subject: str = ""
+    time: float | None = None

@@ -1,7 +1,11 @@
-"""What ARKit's shapes do to points of a face: displacements measured on ICT-FaceKit.
+"""What ARKit's shapes do to points of a face, measured on ICT-FaceKit, and where these points lie on a FLAME head.
 
 `arkit_shapes.npz` holds samples of the ICT-FaceKit light model (MIT License, Copyright (c) 2020 USC Institute for
 Creative Technologies), made by `development/arkit_shapes.py`.
+
+ICT-FaceKit's points are moved onto the head: first by an affine map and ICT-FaceKit's own identities, iterating nearest
+points (point to plane, as Chen and Medioni 1992), then by a smooth warp (radial basis functions) with less and less
+smoothing. No detector and no table of landmarks is needed; a head must look along +z with y up.
 """
 
 from dataclasses import dataclass
@@ -10,7 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import StgaError
 from ..files import read_npz
+from ..flame.forward import joint_positions
+from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
+from ..tracking.posed_points import SurfacePoints
 from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 
 SHAPES_FILE = Path(__file__).with_name("arkit_shapes.npz")
@@ -52,3 +60,167 @@ def effective_weights(weights: np.ndarray) -> np.ndarray:
     limited = weights.copy()
     limited[..., MOUTH_CLOSE] = np.minimum(weights[..., MOUTH_CLOSE], np.maximum(weights[..., JAW_OPEN], 0))
     return limited
+
+
+EYE_JOINTS = (JOINTS.index("right_eye"), JOINTS.index("left_eye"))
+MIN_EYE_DISTANCE_M, MAX_EYE_DISTANCE_M = 0.03, 0.15
+EYEBALL_RADIUS_M = 0.012
+"""Of a head without eyeballs: its pupils are taken to lie in front of the eyes' joints."""
+ITERATIONS = 12
+CANDIDATES = 24
+"""Triangles whose centers are nearest to a point, among which the nearest is looked for."""
+MIN_COSINE = 0.5
+"""Between the normals of a point and of the triangle that it may lie on."""
+FAR_M = 1.0
+"""Added to the distance of triangles that face another way."""
+MAX_MATCH_M, MEDIANS = 0.003, 4.0
+"""A nearest point counts up to this distance, or this many times the median of all."""
+TANGENTIAL_WEIGHT, PUPIL_WEIGHT, IDENTITY_DEVIATION_M, AFFINE_WEIGHT = 0.1, 30.0, 0.002, 0.09
+SMOOTHINGS = (0.3, 0.1, 0.03, 0.01)
+"""Ridge of the warp's kernel, in meters."""
+MAX_WARP_MATCH_M = 0.006
+MAX_SURFACE_DISTANCE_M = 0.003
+
+
+def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray]:
+    """The 478 points on the neutral head, and (478,) bool which lie reliably on its skin.
+
+    `name` is what errors call the head. Raises StgaError where its eyes are not where a head has them.
+    """
+    source, surface = face_shapes(), _Surface(model.v_template, model.faces)
+    pupils = _pupils(model, name)
+    skin = source.reliable & (np.arange(len(source.points)) < SKIN_POINTS)
+    points, normals = _aligned(surface, pupils, skin)
+    points = _warped(surface, points, normals, pupils, skin)
+    face, barycentric, _, distance = surface.nearest(points, normals)
+    return SurfacePoints(face, barycentric), skin & (distance < MAX_SURFACE_DISTANCE_M)
+
+
+class _Surface:
+    """Triangles of a mesh, for nearest points."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        self.corners = vertices[faces]
+        self.centers = self.corners.mean(axis=1)
+        normals = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
+        self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+    def nearest(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Triangle (N,), barycentric and position (N, 3), and distance (N,) of the nearest points that face alike."""
+        squared = (self.centers**2).sum(1) - 2 * points @ self.centers.T
+        squared += np.where(normals @ self.normals.T < MIN_COSINE, FAR_M, 0.0)
+        count = min(CANDIDATES, len(self.centers))
+        near = np.argpartition(squared, count - 1, axis=1)[:, :count]
+        barycentric = _closest(self.corners[near], points)
+        positions = np.einsum("nkb,nkbc->nkc", barycentric, self.corners[near])
+        distance = np.linalg.norm(positions - points[:, None], axis=2)
+        turned = np.einsum("nkc,nc->nk", self.normals[near], normals) < MIN_COSINE
+        best = (distance + FAR_M * turned).argmin(axis=1)
+        rows = np.arange(len(points))
+        return near[rows, best], barycentric[rows, best], positions[rows, best], distance[rows, best]
+
+
+def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (N, K, 3) of the points of triangles (N, K, 3, 3) nearest to points (N, 3)."""
+    a, b, c = np.moveaxis(corners, 2, 0)
+    from_a, from_b = points[:, None] - a, points[:, None] - b
+
+    def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return np.asarray((first * second).sum(axis=-1))
+
+    def along(edge: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        return np.asarray(np.clip(dot(offset, edge) / np.maximum(dot(edge, edge), 1e-20), 0, 1))
+
+    ab, ac = b - a, c - a
+    d00, d01, d11 = dot(ab, ab), dot(ab, ac), dot(ac, ac)
+    d20, d21 = dot(from_a, ab), dot(from_a, ac)
+    determinant = np.maximum(d00 * d11 - d01**2, 1e-20)
+    second, third = (d11 * d20 - d01 * d21) / determinant, (d00 * d21 - d01 * d20) / determinant
+    inside = (second >= 0) & (third >= 0) & (second + third <= 1)
+    on_ab, on_ac, on_bc = along(ab, from_a), along(ac, from_a), along(c - b, from_b)
+    zero = np.zeros_like(on_ab)
+    options = np.stack(
+        [
+            np.stack([1 - second - third, second, third], -1),
+            np.stack([1 - on_ab, on_ab, zero], -1),
+            np.stack([1 - on_ac, zero, on_ac], -1),
+            np.stack([zero, 1 - on_bc, on_bc], -1),
+        ]
+    )
+    distance = np.linalg.norm(np.einsum("onkb,nkbc->onkc", options, corners) - points[:, None], axis=-1)
+    distance[0] = np.where(inside, distance[0], np.inf)
+    return np.asarray(np.take_along_axis(options, distance.argmin(axis=0)[None, ..., None], axis=0)[0])
+
+
+def _pupils(model: FlameModel, name: str) -> np.ndarray:
+    """(2, 3) foremost points of right and left eyeball."""
+    joints = joint_positions(model, model.v_template)
+    pupils = []
+    for joint in EYE_JOINTS:
+        eyeball = model.v_template[model.weights[:, joint] > EYEBALL_WEIGHT]
+        if len(eyeball):
+            pupils.append([*eyeball[:, :2].mean(axis=0), eyeball[:, 2].max()])
+        else:
+            pupils.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
+    apart = float(pupils[1][0] - pupils[0][0])
+    if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
+        raise StgaError(
+            f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {1000 * MIN_EYE_DISTANCE_M:.0f} to "
+            f"{1000 * MAX_EYE_DISTANCE_M:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
+        )
+    return np.array(pupils)
+
+
+def _aligned(surface: _Surface, pupils: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (478, 3) after the affine map and the identities."""
+    source = face_shapes()
+    own = source.points[list(PUPILS)]
+    linear = np.eye(3) * np.ptp(pupils[:, 0]) / np.ptp(own[:, 0])
+    points = source.points @ linear + pupils.mean(axis=0) - own.mean(axis=0) @ linear
+    normals = source.normals
+    count = len(source.identity)
+    basis = np.einsum("ac,nb->nacb", np.eye(3), np.pad(source.points, ((0, 0), (0, 1)), constant_values=1.0))
+    basis = np.concatenate([basis.reshape(-1, 3, 12), source.identity.transpose(1, 2, 0) * linear[0, 0]], axis=2)
+    entries = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # of the affine map without its translation
+    anchors = PUPIL_WEIGHT * basis[list(PUPILS)].reshape(6, -1)
+    prior = np.zeros((9 + count, 12 + count))
+    prior[np.arange(9), entries] = AFFINE_WEIGHT
+    prior[9 + np.arange(count), 12 + np.arange(count)] = IDENTITY_DEVIATION_M * np.sqrt(skin.sum() / count)
+    for _ in range(ITERATIONS):
+        face, _, target, distance = surface.nearest(points[skin], normals[skin])
+        kept = distance < max(MEDIANS * float(np.median(distance)), MAX_MATCH_M)
+        moved, normal, target = basis[skin][kept], surface.normals[face[kept]], target[kept]
+        rows = np.concatenate(
+            [np.einsum("na,nak->nk", normal, moved), TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count), anchors, prior]
+        )
+        expected = AFFINE_WEIGHT * np.trace(linear) / 3 * np.eye(3).ravel()
+        wanted = [(normal * target).sum(1), TANGENTIAL_WEIGHT * target.ravel(), PUPIL_WEIGHT * pupils.ravel(), expected]
+        found = np.linalg.lstsq(rows, np.concatenate([*wanted, np.zeros(count)]), rcond=None)[0]
+        linear = found[entries].reshape(3, 3)
+        points = basis @ found
+        normals = source.normals @ np.linalg.inv(linear)
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return points, normals
+
+
+def _warped(
+    surface: _Surface, points: np.ndarray, normals: np.ndarray, pupils: np.ndarray, skin: np.ndarray
+) -> np.ndarray:
+    """The points (478, 3) moved towards the surface by a smooth warp."""
+    warped = points
+    for smoothing in SMOOTHINGS:
+        _, _, target, distance = surface.nearest(warped[skin], normals[skin])
+        kept = distance < MAX_WARP_MATCH_M
+        fixed = np.concatenate([points[skin][kept], points[list(PUPILS)]])
+        moved = np.concatenate([target[kept], pupils]) - fixed
+        plain = np.pad(fixed, ((0, 0), (0, 1)), constant_values=1.0)
+        kernel = smoothing * np.eye(len(fixed)) - _distances(fixed, fixed)
+        system = np.block([[kernel, plain], [plain.T, np.zeros((4, 4))]])
+        weights = np.linalg.solve(system, np.concatenate([moved, np.zeros((4, 3))]))
+        everywhere = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
+        warped = points + np.concatenate([-_distances(points, fixed), everywhere], axis=1) @ weights
+    return np.asarray(warped)
+
+
+def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(first[:, None] - second, axis=2))

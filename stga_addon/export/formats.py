@@ -13,13 +13,12 @@ from ..avatar.splats import Splats
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes
-from .gaussian_avatars import write_gaussian_avatars
 from .gltf import write_gltf
 from .playback import DEFAULT_FPS, Playback, check_rate
-from .ply import ply_bytes, write_ply, write_ply_sequence
+from .ply import ply_bytes, write_gaussian_avatars, write_ply, write_ply_sequence
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
-from .web.write import web_bytes, write_web
+from .web.page import web_bytes, write_web
 
 Meshes = Iterable[tuple[int, np.ndarray]]
 """Pairs of a number and a posed mesh (V, 3) meters."""

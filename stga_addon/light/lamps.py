@@ -1,14 +1,174 @@
-"""What the lights of a scene add to a posed head, with their shadows."""
+"""Lights of a scene at a posed head: shadow maps of what they see, and what they add."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 
 from .array_kernels import toward_light
 from .harmonics import COUNT, basis
-from .kernels import shade_kernels
-from .shadows import ShadowMap
 from .values import Caster, Light, Lighting
+
+MAP_SIZE = 512
+"""Texels a side of a light's shadow map, which just holds the head."""
+LIFT_M = 0.001
+"""Points are lifted off the surface by as much along its normal, so that it does not shade itself."""
+BIAS_M, MAX_BIAS_M = 0.001, 0.006
+"""A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the taps, at most
+MAX_BIAS_M."""
+TAP_STEP = 1.0
+"""Texels between the 3 × 3 places that are looked up: splats soften edges already."""
+Projection = Callable[[np.ndarray], np.ndarray]
+"""Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light cannot see them."""
+
+
+@dataclass(frozen=True)
+class LightView:
+    """How a light sees space: parallel for a sun, else in perspective from its position.
+
+    axes (3, 3): columns across, up and forward. origin (3,). scale: texels per meter, or per unit of slope.
+    """
+
+    axes: np.ndarray
+    origin: np.ndarray
+    scale: float
+    is_parallel: bool
+    size: int
+
+
+@dataclass(frozen=True)
+class HeadBounds:
+    """Middle (3,) of a posed head's box, the diagonal of the box, and the radius around its middle of the head."""
+
+    center: np.ndarray
+    diagonal: float
+    radius: float
+
+
+def head_bounds(vertices: np.ndarray) -> HeadBounds:
+    """Those of vertices (V, 3)."""
+    rows = np.ascontiguousarray(vertices.T)  # numpy is slow where the last axis is short
+    low, high = rows.min(1), rows.max(1)
+    center = (low + high) / 2
+    radius = float(np.sqrt(((rows - center[:, None]) ** 2).sum(0).max()))
+    return HeadBounds(center, float(np.linalg.norm(high - low)), radius)
+
+
+def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
+    """The view of a light around a head.
+
+    A light inside the sphere around the head sees it under a wide angle, and loses what lies behind it.
+    """
+    center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
+    if light.kind == "sun":
+        forward, distance, scale = light.direction, np.inf, size / 2 / radius
+    else:
+        forward = center - light.position
+        distance = float(np.linalg.norm(forward))
+        forward = forward / max(distance, 1e-9)
+        slope = radius / np.sqrt(max(distance**2 - radius**2, (0.3 * radius) ** 2))
+        scale = size / 2 / slope
+    across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
+    return LightView(axes, center if light.kind == "sun" else light.position, scale, light.kind == "sun", size)
+
+
+def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
+    """What `light_view` sees, as a function of points."""
+    view = light_view(head_bounds(vertices), light, size)
+    axes, shift = view.axes.astype(np.float32), (view.origin @ view.axes).astype(np.float32)
+
+    def project(points: np.ndarray) -> np.ndarray:
+        local = np.asarray(points, np.float32) @ axes - shift
+        factor: np.ndarray | np.float32 = np.float32(view.scale)
+        if not view.is_parallel:
+            depth = local[:, 2]
+            factor = factor / np.where(depth > 1e-4, depth, np.float32(np.nan))
+        for k in range(2):
+            local[:, k] = local[:, k] * factor + np.float32(size / 2)
+        return np.asarray(local)
+
+    return project
+
+
+def texel_meters(bounds: HeadBounds, size: int = MAP_SIZE) -> float:
+    """About how wide a texel of a shadow map is on the head."""
+    return bounds.diagonal / size
+
+
+class ShadowMap:
+    """A light's depth map of a posed head (V, 3) meters and of other objects."""
+
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        light: Light,
+        casters: Sequence[Caster] = (),
+        size: int = MAP_SIZE,
+    ) -> None:
+        self._project = light_projection(vertices, light, size)
+        self._light, self._texel_m = light, texel_meters(head_bounds(vertices), size)
+        is_parallel = light.kind == "sun"
+        depth = np.full((size, size), np.inf if is_parallel else 0, np.float32)
+        for mesh in (Caster(vertices, faces), *casters):
+            points = self._project(mesh.vertices)
+            if not is_parallel:  # of a plane in perspective, not depth but 1 / depth is linear in texels
+                points[:, 2] = -1 / points[:, 2]
+            shadow_kernels().add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
+        self.depth = depth if is_parallel else np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
+
+    def lit(
+        self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP, normals: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the surface.
+
+        normals (N, 3): of the surface there, which make `bias` larger on slopes.
+        """
+        found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
+        if normals is not None:
+            biases = self._slope_bias(points, normals, bias, step)
+        places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
+        shadow_kernels().lit_shares(self.depth, places, biases, np.float32(step), found)
+        return found
+
+    def _slope_bias(self, points: np.ndarray, normals: np.ndarray, bias: float, step: float) -> np.ndarray:
+        """(N,) float32 meters."""
+        if self._light.kind == "sun":
+            cosine = normals @ -self._light.direction.astype(np.float32)
+        else:
+            away = self._light.position.astype(np.float32) - points
+            length = np.sqrt(np.einsum("nk,nk->n", away, away))
+            cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
+        cosine = np.clip(cosine, 0.05, 1)
+        slope = np.sqrt(1 - cosine**2) / cosine
+        return np.asarray(np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32)
+
+
+def shade_kernels() -> Any:
+    """The module with `add_lights`."""
+    if find_spec("numba") is None:
+        from . import array_kernels
+
+        return array_kernels
+    from ..raster.cpu import shade
+
+    return shade
+
+
+def shadow_kernels() -> Any:
+    """The module with `add_depths` and `lit_shares`."""
+    if find_spec("numba") is None:
+        from . import array_kernels
+
+        return array_kernels
+    from ..raster.cpu import shadow
+
+    return shadow
+
 
 FEW, SOME, MANY = 1, 2, 3
 """Points a side by which an area light is represented, by its size over its distance."""

@@ -8,9 +8,9 @@ import numpy as np
 from ..avatar.file import Avatar
 from ..capture.camera import Camera
 from ..capture.model import Capture
-from ..driving.page_controls import page_controls
+from ..driving.head_map import page_controls
 from ..export.playback import MAX_VIEWS, Playback
-from ..export.web.write import flame_notice
+from ..export.web.page import flame_notice
 from ..flame.sequence import FlameSequence
 from ..progress import Say
 from ..requests.values import Export

@@ -10,8 +10,7 @@ from PIL import Image
 
 from ..avatar.file import Avatar, read_avatar
 from ..avatar.splats import Splats
-from ..capture.camera import Camera, central_camera
-from ..capture.camera_path import covered_angles, to_and_fro, turntable
+from ..capture.camera import Camera, central_camera, covered_angles, to_and_fro, turntable
 from ..capture.model import View
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..errors import StgaError
@@ -19,7 +18,7 @@ from ..export.playback import DEFAULT_FPS, playback_fps
 from ..export.ply import is_ply, read_ply
 from ..files import replacing
 from ..flame.sequence import sequence_mesh
-from ..light.light_file import read_lighting, turned
+from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
 from ..progress import Report, Say, counted
 from ..render.compose import Composer

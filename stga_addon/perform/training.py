@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..avatar.file import read_avatar, write_avatar
+from ..capture.meshes import SELECTED_WEIGHT, find_region
 from ..capture.model import Capture
 from ..capture.open import open_capture
-from ..capture.region import SELECTED_WEIGHT, find_region
 from ..capture.takes import first_timesteps, join_takes, require_same_head, require_same_scale
 from ..errors import StgaError
 from ..export.ply import write_ply

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.camera_path import TURNTABLE_S
-from ..capture.region import is_region_file
+from ..capture.camera import TURNTABLE_S
+from ..capture.meshes import is_region_file
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..driving.open_motion import MotionOptions
 from ..errors import StgaError

@@ -11,7 +11,7 @@ from typing import Any
 import bmesh
 import numpy as np
 
-from ..capture.region import SELECTED_WEIGHT
+from ..capture.meshes import SELECTED_WEIGHT
 from ..errors import StgaError
 from . import tags
 from .arrays import mesh_triangles, read_values

@@ -9,8 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ..capture.camera import Camera
-from ..capture.mesh_geometry import vertex_normals
-from ..capture.mesh_raster import rasterize
+from ..capture.mesh_geometry import rasterize, vertex_normals
 from ..files import replacing
 from .footage.model import Footage, FootageCamera
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_geometry import vertex_normals
+from ..capture.mesh_geometry import Similarity, similarity, vertex_normals, weighted_procrustes
 from ..capture.model import evenly_spread
-from ..capture.rigid import Similarity, similarity, weighted_procrustes
 from ..flame.forward import POSE_SIZE, RIGID_SIZE
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation

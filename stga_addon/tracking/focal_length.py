@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
-from ..capture.rigid import Similarity
 from ..flame.forward import RIGID_SIZE
 from .fit import TimestepLandmarks, by_visibility, observed_landmarks, rigid_start, triangulated
 from .head_model import HeadModel

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.glb_chunks import glb_chunks
+from ..capture.meshes import glb_chunks
 from ..errors import StgaError, shorten
 from ..files import read_bytes
 from ..flame.quaternions import to_matrices

@@ -3,8 +3,7 @@
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_geometry import vertex_normals
-from ..capture.mesh_raster import rasterize
+from ..capture.mesh_geometry import rasterize, vertex_normals
 
 SKIN_RGB = np.array([0.78, 0.58, 0.48])
 BACKGROUND = 0.45

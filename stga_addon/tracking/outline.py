@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_raster import rasterize
+from ..capture.mesh_geometry import rasterize
 from .photo_consistency import facing
 
 MAX_COSINE = 0.25

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_raster import rasterize
+from ..capture.mesh_geometry import rasterize
 
 PATCH_SAMPLES = 9
 """Samples along each side of a patch."""

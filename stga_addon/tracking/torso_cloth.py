@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.mesh_raster import rasterize
+from ..capture.mesh_geometry import rasterize
 from ..flame.forward import axis_angle_matrices
 from .appearance import NOISE_LEVELS, sampled
 from .dense_terms import MIN_FLOW_SIDE_PX, inside, projection_derivative

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from ..capture.camera import Camera
-from ..capture.mesh_raster import silhouette
+from ..capture.mesh_geometry import silhouette
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT
 from ..flame.quaternions import from_matrices, to_axis_angle

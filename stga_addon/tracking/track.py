@@ -14,7 +14,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.flame_capture import BUNDLED_MODEL
-from ..capture.mesh_raster import silhouette
+from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
 from ..errors import StgaError
 from ..files import read_json, replacing, write_json

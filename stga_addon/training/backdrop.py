@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..capture.mesh_raster import silhouette
+from ..capture.mesh_geometry import silhouette
 from ..capture.model import Capture, View
 
 BACKDROPS = ("plain", "masked", "mesh")

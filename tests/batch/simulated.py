@@ -4,9 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from stga_addon.batch.engine import Ended, Engine
 from stga_addon.batch.folder import hold_folder
-from stga_addon.batch.job import Job
+from stga_addon.batch.job import Ended, Engine, Job
 from stga_addon.batch.plan import Plan, make_plan
 from stga_addon.batch.run import Batch, run_batch
 from stga_addon.perform.perform import perform_in_folder

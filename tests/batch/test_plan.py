@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch.identity import job_digests
+from stga_addon.batch.folder import job_digests
 from stga_addon.batch.job import Resources
 from stga_addon.batch.plan import Plan, make_plan, plan_of_captures, read_plan
 from stga_addon.driving.open_motion import MotionOptions

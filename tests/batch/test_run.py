@@ -13,14 +13,13 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch.engine import Ended
 from stga_addon.batch.engines import local
 from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.folder import LOCK, hold_folder, is_done, prepare, read_record
-from stga_addon.batch.job import Job, Resources
+from stga_addon.batch.job import Ended, Job, Resources
 from stga_addon.batch.plan import make_plan
+from stga_addon.batch.report import plan_lines, table_lines
 from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
-from stga_addon.batch.table import plan_lines, table_lines
 from stga_addon.errors import StgaError
 from stga_addon.requests.values import ConvertMotion, RenderBlend
 from stga_addon.worker import lock

@@ -19,8 +19,8 @@ from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.splats import Splats, no_strain_color
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.light.harmonics import uniform
+from stga_addon.light.lamps import MAP_SIZE, ShadowMap
 from stga_addon.light.relight import Relighter
-from stga_addon.light.shadows import MAP_SIZE, ShadowMap
 from stga_addon.light.values import Caster, Light, Lighting
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage

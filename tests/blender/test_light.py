@@ -18,8 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from light.scenes import lit_avatar  # noqa: E402
 
 from stga_addon.capture.mesh_geometry import vertex_normals  # noqa: E402
-from stga_addon.light.lamps import Lamps  # noqa: E402
-from stga_addon.light.shadows import LIFT_M, ShadowMap  # noqa: E402
+from stga_addon.light.lamps import LIFT_M, Lamps, ShadowMap  # noqa: E402
 from stga_addon.scene.arrays import read_values, triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display.splat_nodes import PERCENTAGE  # noqa: E402

@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from stga_addon.capture.camera import Camera, azimuths, central_camera, look_at, orbited
-from stga_addon.capture.camera_path import UP, covered_angles, to_and_fro, turntable
+from stga_addon.capture.camera import (
+    UP,
+    Camera,
+    azimuths,
+    central_camera,
+    covered_angles,
+    look_at,
+    orbited,
+    to_and_fro,
+    turntable,
+)
 
 CENTER = np.array([0.1, 0.2, -0.3])
 

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from stga_addon.capture.camera import Camera, look_at
-from stga_addon.capture.mesh_raster import rasterize
+from stga_addon.capture.mesh_geometry import rasterize
 
 
 def by_equations(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from stga_addon.capture.mesh_geometry import weighted_procrustes, without_head_motion
 from stga_addon.capture.meshes import CACHE_BYTES, cached_meshes, read_mesh, read_regions, tracked_meshes
-from stga_addon.capture.rigid import weighted_procrustes, without_head_motion
 from stga_addon.errors import StgaError
 
 from . import factory

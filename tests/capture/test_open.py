@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 import stga_addon
 from stga_addon.capture.images import read_image, read_mask
+from stga_addon.capture.model import format_ranges, summarize_capture
 from stga_addon.capture.open import open_capture
-from stga_addon.capture.summary import format_ranges, summarize_capture
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.model import read_flame
@@ -329,7 +329,7 @@ def test_numpy_alone_is_enough(tmp_path: Path) -> None:
         f"sys.path += [{str(only)!r}, {str(Path(stga_addon.__file__).parents[1])!r}]\n"
         "from pathlib import Path\n"
         "from stga_addon.capture.open import open_capture\n"
-        "from stga_addon.capture.summary import summarize_capture\n"
+        "from stga_addon.capture.model import summarize_capture\n"
         f"capture = open_capture(Path({str(root)!r}))\n"
         "summarize_capture(capture), capture.mesh(3), capture.expression_mesh(3, 'head')\n"
         "from stga_addon.errors import StgaError\n"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stga_addon.capture.meshes import find_region
 from stga_addon.capture.model import Capture
-from stga_addon.capture.region import find_region
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
 

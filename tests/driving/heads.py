@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 from flame.mouths import open_flame
 
-from stga_addon.driving.correspondence import face_points
 from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
-from stga_addon.driving.shapes import face_shapes
+from stga_addon.driving.shapes import face_points, face_shapes
 from stga_addon.flame.model import FlameModel
 
 KERNEL_M, REACH_M = 0.006, 0.012

@@ -12,8 +12,7 @@ from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
-from stga_addon.export.gaussian_avatars import in_convention, write_gaussian_avatars
-from stga_addon.export.ply import read_ply, read_vertices
+from stga_addon.export.ply import in_convention, read_ply, read_vertices, write_gaussian_avatars
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, read_motion, sequence_mesh

@@ -34,9 +34,9 @@ from training.test_folder import make_checkpoint, make_run
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image, read_mask
-from stga_addon.capture.mesh_capture import read_face_ids, read_soup
 from stga_addon.capture.meshes import read_mesh, read_regions
 from stga_addon.capture.model import View
+from stga_addon.capture.open import read_face_ids, read_soup
 from stga_addon.capture.transforms import read_transforms
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import PROPERTIES, read_ply, splat_columns, write_ply

@@ -7,10 +7,9 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.light import AvatarLight
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.color import linear_to_srgb
-from stga_addon.light.bounce import Bounce
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import HIGHLIGHT_SHARE
-from stga_addon.light.transfer import transfer_of
+from stga_addon.light.transfer import Bounce, transfer_of
 
 RADIUS = 0.1
 

@@ -6,8 +6,7 @@ import pytest
 pytest.importorskip("numba")
 
 from stga_addon.light import array_kernels
-from stga_addon.light.lamps import light_rows
-from stga_addon.light.shadows import light_projection
+from stga_addon.light.lamps import light_projection, light_rows
 from stga_addon.light.values import Light
 from stga_addon.raster.cpu import shade, shadow
 

@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.light.environment import harmonics_of, pixel_directions, read_hdr, split_environment
+from stga_addon.light.environment import (
+    harmonics_of,
+    pixel_directions,
+    read_hdr,
+    read_lighting,
+    split_environment,
+    turned,
+)
 from stga_addon.light.harmonics import LAMBERT, basis
-from stga_addon.light.light_file import read_lighting, turned
 
 
 def rgbe(pixels: np.ndarray) -> np.ndarray:

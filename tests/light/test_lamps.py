@@ -9,8 +9,7 @@ import pytest
 
 from light.scenes import ball_and_plate, blocked
 from stga_addon.capture.mesh_geometry import vertex_normals
-from stga_addon.light.lamps import Lamps
-from stga_addon.light.shadows import LIFT_M, ShadowMap, head_bounds, light_view
+from stga_addon.light.lamps import LIFT_M, Lamps, ShadowMap, head_bounds, light_view
 from stga_addon.light.values import Caster, Light, Lighting
 
 NO_FACES = np.zeros((0, 3), np.int32)

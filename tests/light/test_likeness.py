@@ -7,8 +7,7 @@ import pytest
 
 from light.scenes import lit_avatar
 from stga_addon.light.harmonics import basis, rotated, uniform
-from stga_addon.light.likeness import kept, kept_shares
-from stga_addon.light.relight import Relighter
+from stga_addon.light.relight import Relighter, kept, kept_shares
 from stga_addon.light.values import Light, Lighting
 
 EYE = np.array([0.2, 0.1, 1.0])

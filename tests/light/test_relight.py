@@ -8,7 +8,7 @@ import pytest
 from light.scenes import lit_avatar
 from stga_addon.capture.color import srgb_to_linear
 from stga_addon.errors import StgaError
-from stga_addon.light import likeness
+from stga_addon.light import relight
 from stga_addon.light.harmonics import rotated, sh_color, uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Light, Lighting
@@ -88,7 +88,7 @@ def test_recorded_and_mix(relighter):
 def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypatch):
     """Catches light that is taken away otherwise than it is given: bounce, occlusion, exposure, white; also where
     nothing of the recorded colors is kept."""
-    monkeypatch.setattr(likeness, "UNLIKE_LIGHT", 1e-12)
+    monkeypatch.setattr(relight, "UNLIKE_LIGHT", 1e-12)
     own = Lighting(relighter.light.radiance)
     lit = relighter.radiance(relighter.avatar.neutral, EYE, own)
     recorded = relighter.radiance(relighter.avatar.neutral, EYE, replace(own, mode="recorded"))

@@ -5,7 +5,7 @@ import numpy as np
 from light.scenes import ball_and_plate, blocked
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import LAMBERT, basis, even_directions
-from stga_addon.light.shadows import LIFT_M
+from stga_addon.light.lamps import LIFT_M
 from stga_addon.light.transfer import transfer_of
 
 

@@ -21,11 +21,9 @@ from training.test_folder import make_checkpoint, make_run
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
-from stga_addon.capture.mesh_capture import read_face_ids, read_soup
 from stga_addon.capture.meshes import read_mesh, read_regions
-from stga_addon.capture.model import View
-from stga_addon.capture.open import open_capture
-from stga_addon.capture.summary import summarize_capture
+from stga_addon.capture.model import View, summarize_capture
+from stga_addon.capture.open import open_capture, read_face_ids, read_soup
 from stga_addon.capture.transforms import read_transforms
 from stga_addon.export.ply import read_ply
 from stga_addon.files import read_json, read_npz

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, shift
 
 from stga_addon.capture.images import read_image, read_mask
-from stga_addon.capture.mesh_raster import silhouette
+from stga_addon.capture.mesh_geometry import silhouette
 from stga_addon.capture.open import open_capture
 from stga_addon.tracking.face_networks import PersonNetwork
 from stga_addon.tracking.matte import find_matte, probability_by_plate

@@ -8,8 +8,7 @@ import trimesh
 from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
-from stga_addon.capture.mesh_raster import rasterize
-from stga_addon.capture.rigid import Similarity
+from stga_addon.capture.mesh_geometry import Similarity, rasterize
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.fit import HeadFit

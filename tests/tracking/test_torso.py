@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
-from stga_addon.capture.mesh_raster import rasterize
+from stga_addon.capture.mesh_geometry import Similarity, rasterize, weighted_procrustes
 from stga_addon.capture.open import open_capture
-from stga_addon.capture.rigid import Similarity, weighted_procrustes
 from stga_addon.development.demo.head import synthetic_head, write_flame
 from stga_addon.development.demo.paint import paint
 from stga_addon.files import read_json, write_npz

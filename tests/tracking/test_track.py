@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.capture.open import open_capture
-from stga_addon.capture.rigid import Similarity
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError

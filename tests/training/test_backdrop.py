@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_view
-from stga_addon.capture.mesh_raster import rasterize, silhouette
+from stga_addon.capture.mesh_geometry import rasterize, silhouette
 from stga_addon.capture.model import Capture
 from stga_addon.training.backdrop import over_color, without_backdrop
 from stga_addon.training.evaluate.evaluation_views import read_evaluation_view

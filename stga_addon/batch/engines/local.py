@@ -11,8 +11,7 @@ from ...requests.folder import worker_arguments
 from ...worker.helpers import processors
 from ...worker.launch import start_worker
 from ...worker.status import inspect_worker
-from ..engine import Ended, training_python
-from ..job import Job
+from ..job import Ended, Job, training_python
 
 MEMORY_SHARE = 0.9
 """Share of the memory that is free at the start that workers may use."""

@@ -18,8 +18,7 @@ from ...errors import StgaError
 from ...files import read_json, replacing, write_json
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, WorkerState, inspect_worker
-from ..engine import Ended, job_command
-from ..job import Job, Resources, kind_name
+from ..job import Ended, Job, Resources, job_command, kind_name
 
 TIMEOUT_S = 60.0
 MAX_ARRAY = 1000

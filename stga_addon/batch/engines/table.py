@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import Any
 
 from ...errors import StgaError
-from ..engine import Engine
+from ..job import Engine
 
 ENGINES = {
     "local": ("LocalEngine", "this machine, as many jobs at once as its processors and memory allow"),

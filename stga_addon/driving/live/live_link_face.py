@@ -5,7 +5,7 @@ import struct
 import numpy as np
 
 from ..names import ARKIT_SHAPES, COLUMN, COUNT, MAX_WEIGHT, OPTIONAL
-from ..packet import FacePacket
+from ..performance import FacePacket
 
 VERSION = 6
 MAX_TEXT_BYTES = 512

@@ -1,10 +1,22 @@
-"""The web page of an avatar: player, styles and data in one HTML file without external requests."""
+"""The web page of an avatar: player, styles and data in one HTML file, or data and player for a server."""
 
 import base64
 import html
 import re
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
+
+import numpy as np
+
+from ...avatar.file import Avatar
+from ...errors import StgaError
+from ...files import replacing_together
+from ...flame.sequence import FlameSequence
+from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
+from ..playback import Playback
+from .data_file import data_file
+from .rig import WebRig, baked_rig, flame_rig
 
 PLAYER = Path(__file__).parent / "player"
 ELEMENT = "stga-avatar.js"
@@ -51,3 +63,80 @@ def page(title: str, notice: str, data: bytes) -> str:
         "data": base64.b64encode(data).decode("ascii"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+
+
+SCRIPT_NAME = "stga-avatar.js"
+BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
+"""About what a splat, and a coefficient of its color, takes in a page: compressed, then written as text."""
+BUNDLED_NOTICE = (
+    "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for Creative Technologies."
+)
+RIG_NOTICE = (
+    "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides "
+    "who may receive them."
+)
+MESH_NOTICE = (
+    "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence (flame.is.tue.mpg.de) decides who "
+    "may receive them."
+)
+
+
+def write_web(
+    path: Path,
+    avatar: Avatar,
+    playback: Playback,
+    meshes: Iterable[np.ndarray] = (),
+    sequence: FlameSequence | None = None,
+) -> list[Path]:
+    """Write a page that plays the avatar, or an .stga data file with the player beside it; returns the files.
+
+    sequence  the FLAME motion, whose rig and sliders go along unless `playback.motion_only`; else the posed `meshes`
+              (V, 3) meters are baked, of which there is one at least
+    Raises StgaError where there is no pose, or a file cannot be written.
+    """
+    rig = _rig(path, None if playback.motion_only else sequence, meshes)
+    try:
+        data = data_file(avatar, rig, playback)
+    except ValueError as error:
+        raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
+    if path.suffix.lower() == ".stga":
+        return _write({path: data, path.with_name(SCRIPT_NAME): element_script().encode("utf-8")})
+    notice = flame_notice(avatar, sequence, playback.motion_only)
+    return _write({path: page(playback.title, notice, data).encode("utf-8")})
+
+
+def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bool) -> str:
+    """What a page of the avatar holds of a head model, and whose licence that has; "" for a head of the user's own.
+
+    Without a sequence, FLAME's mesh is known by its number of vertices.
+    """
+    if sequence is not None and sequence.model.expression_names:
+        return BUNDLED_NOTICE
+    if sequence is not None and not motion_only:
+        return RIG_NOTICE
+    is_flame = len(avatar.neutral) in (TEMPLATE_VERTICES, TEMPLATE_VERTICES + TEETH_VERTICES)
+    return MESH_NOTICE if is_flame or sequence is not None else ""
+
+
+def web_bytes(avatar: Avatar) -> int:
+    """About the size of a page of the avatar."""
+    colors = avatar.splats.sh[0].size + avatar.splats.strain_color[0].size if len(avatar.splats) else 0
+    return round((BYTES_PER_SPLAT + BYTES_PER_COEFFICIENT * colors) * len(avatar.splats))
+
+
+def _rig(path: Path, sequence: FlameSequence | None, meshes: Iterable[np.ndarray]) -> WebRig:
+    if sequence is not None:
+        return flame_rig(sequence)
+    posed = list(meshes)
+    if not posed:
+        raise StgaError(f"{path}: there is no posed mesh to export")
+    return baked_rig(posed)
+
+
+def _write(contents: Mapping[Path, bytes]) -> list[Path]:
+    """Write the files, all or none."""
+    with replacing_together() as new_file:
+        for path, data in contents.items():
+            with new_file(path) as partial:
+                partial.write_bytes(data)
+    return list(contents)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...capture.rigid import weighted_procrustes
+from ...capture.mesh_geometry import weighted_procrustes
 from ...flame.forward import joint_positions
 from ...flame.model import JOINTS
 from ...flame.quaternions import from_matrices, to_axis_angle

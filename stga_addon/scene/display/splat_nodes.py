@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import bpy
 
-from ...capture.region import SELECTED_WEIGHT
+from ...capture.meshes import SELECTED_WEIGHT
 from .. import tags
 from ..compat import NATIVE_SPLATS
 from ..layers import FROZEN_COLOR

@@ -7,10 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from ...light.harmonics import GLOSSY
-from ...light.lamps import light_rows
-from ...light.likeness import Kept
-from ...light.relight import Relighter
-from ...light.shadows import LightView, head_bounds, light_view, texel_meters
+from ...light.lamps import LightView, head_bounds, light_rows, light_view, texel_meters
+from ...light.relight import Kept, Relighter
 from ..layers import Relit, SceneLayer
 
 SURFACE_TEXELS, VERTEX_TEXELS, LIGHT_TEXELS, MAP_TEXELS = 4, 3, 4, 4
@@ -18,7 +16,7 @@ SURFACE_TEXELS, VERTEX_TEXELS, LIGHT_TEXELS, MAP_TEXELS = 4, 3, 4, 4
 RELIT_TEXELS = 14
 """Of a layer: share and factor of color; roughness, specular, first light and number of lights; eye, damping; typical
 albedo; nine harmonics of the world as highlights show them; gain and share of what is kept of recorded colors
-(`light.likeness`)."""
+(`light.relight`)."""
 MAX_MAPS = 16
 
 

@@ -7,7 +7,7 @@ import gpu
 import numpy as np
 from gpu.types import GPUBatch, GPUFrameBuffer, GPUIndexBuf, GPUTexture, GPUVertBuf, GPUVertFormat
 
-from ...light.shadows import MAP_SIZE
+from ...light.lamps import MAP_SIZE
 from ..layers import SceneLayer
 from .relit_packing import RelitScene, ShadowView, relit_scene, surface, with_eye
 from .relit_shaders import MAP_COLUMNS, NOTHING, shadow_map_shader

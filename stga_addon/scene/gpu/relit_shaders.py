@@ -13,9 +13,15 @@ from typing import Any
 import gpu
 from gpu.types import GPUShaderCreateInfo, GPUStageInterfaceInfo
 
-from ...light.likeness import ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT
-from ...light.relight import HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE, REFLECTANCE, WET_HIGHLIGHT_SHARE
-from ...light.shadows import BIAS_M, LIFT_M, MAP_SIZE, MAX_BIAS_M, TAP_STEP
+from ...light.lamps import BIAS_M, LIFT_M, MAP_SIZE, MAX_BIAS_M, TAP_STEP
+from ...light.relight import (
+    ALIKE_AT_SPLAT,
+    HIGHLIGHT_SHARE,
+    MIN_DIFFUSE_SHARE,
+    REFLECTANCE,
+    UNLIKE_AT_SPLAT,
+    WET_HIGHLIGHT_SHARE,
+)
 from .relit_packing import LIGHT_TEXELS, MAP_TEXELS, RELIT_TEXELS, SURFACE_TEXELS, VERTEX_TEXELS
 
 RELIT_TEXTURES = ("surface", "vertices", "lights", "shadows")

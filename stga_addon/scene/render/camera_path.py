@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.camera import Camera, camera_from_gl
-from ...capture.camera_path import covered_angles, turntable
+from ...capture.camera import Camera, camera_from_gl, covered_angles, turntable
 from .. import tags
 from ..arrays import evaluated_vertices, mesh_vertices
 from .camera import image_size, render_camera

@@ -11,7 +11,7 @@ from ...avatar.lattice import lattice_weights
 from ...avatar.splats import SH_C0, Splats, joined
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask
-from ...capture.mesh_raster import MIN_DEPTH_M, silhouette
+from ...capture.mesh_geometry import MIN_DEPTH_M, silhouette
 from ...capture.model import Capture, View
 from ...flame.model import torso_faces
 from ...flame.sequence import below_neck

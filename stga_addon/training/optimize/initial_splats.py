@@ -11,8 +11,7 @@ from ...avatar.embedding import face_frames, to_world
 from ...avatar.lattice import lattice_splats
 from ...avatar.splats import ADDED, SH_C0, Splats, joined
 from ...capture.images import read_view
-from ...capture.mesh_geometry import connected_parts
-from ...capture.mesh_raster import rasterize
+from ...capture.mesh_geometry import connected_parts, rasterize
 from ...capture.model import Capture, View, evenly_spread
 from ..settings import TrainingSettings
 from .hull_points import flat_points, hull_points, in_image

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stga_addon.driving import facial_mocap as mocap
+from stga_addon.driving import read_performance
 from stga_addon.driving.head_map import head_turns
 from stga_addon.driving.live import live_link_face as link
-from stga_addon.driving.live import osc, vmc
+from stga_addon.driving.live import vmc
 from stga_addon.driving.names import ARKIT_SHAPES, COLUMN
 
 from . import wire
@@ -66,10 +66,12 @@ def test_facial_mocap():
     """Catches percent taken as weights, degrees as radians, pitch as yaw, and the second version's separator."""
     weights = {name: round(value, 2) for name, value in wire.mixed(2).items()}
     for separator in "-&":
-        packet = mocap.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
+        packet = read_performance.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
         assert as_dict(packet.weights) == pytest.approx(weights)
         assert packet.head == pytest.approx(np.radians([20, 10, 30]))
-    assert mocap.parse_packet(b"mouthSmile_L&-5|jawOpen&12|").weights[COLUMN["mouthSmileLeft"]] == pytest.approx(-0.05)
+    assert read_performance.parse_packet(b"mouthSmile_L&-5|jawOpen&12|").weights[
+        COLUMN["mouthSmileLeft"]
+    ] == pytest.approx(-0.05)
 
 
 def osc_text(text: str) -> bytes:
@@ -122,7 +124,7 @@ def test_vmc_with_python_osc():
     assert as_dict(packet.weights) == pytest.approx(weights)
     assert packet.time == 12.5
     mixed = written("/x/y", 1, 2.5, "text", b"blob", True, False)
-    assert osc.messages(mixed.dgram) == [("/x/y", (1, 2.5, "text", b"blob", True, False))]
+    assert vmc.messages(mixed.dgram) == [("/x/y", (1, 2.5, "text", b"blob", True, False))]
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -167,7 +169,7 @@ def test_ten_thousand_malformed_packets():
         data = malformed(rng)
         decoded = vmc.decode(data, known)
         known = known if decoded is None else decoded[1]
-        for packet in (link.decode(data), mocap.parse_packet(data), decoded and decoded[0]):
+        for packet in (link.decode(data), read_performance.parse_packet(data), decoded and decoded[0]):
             if packet is not None and packet.weights is not None:
                 assert np.isfinite(packet.weights).all()
                 assert packet.time is None or math.isfinite(packet.time)
@@ -179,6 +181,6 @@ def test_any_bytes(data):
     """Catches an exception that mutated packets do not reach."""
     link.decode(data)
     link.decode(b"\x06" + data)
-    mocap.parse_packet(data)
+    read_performance.parse_packet(data)
     vmc.decode(data, vmc.Received())
-    osc.messages(b"#bundle\0" + data)
+    vmc.messages(b"#bundle\0" + data)

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from stga_addon.driving.inverse import write_performance
-from stga_addon.driving.live.receiver import Receiver, leaves_this_machine
-from stga_addon.driving.live.sources import SOURCES
-from stga_addon.driving.live.stream import MAX_SENDERS, Stream
-from stga_addon.driving.live.take import Recording, eased, resting, row_of
+from stga_addon.driving.live.sources import SOURCES, Receiver, leaves_this_machine
+from stga_addon.driving.live.stream import MAX_SENDERS, Recording, Stream, eased, resting, row_of
 from stga_addon.driving.names import COLUMN
 from stga_addon.driving.read_performance import read_performance
 from stga_addon.errors import StgaError
@@ -109,7 +107,7 @@ def test_nothing_grows():
 
 def test_on_loopback(monkeypatch):
     """Catches a socket that waits, listens where it was not told to, or holds Blender up while it is flooded."""
-    monkeypatch.setattr("stga_addon.driving.live.receiver.MAX_DATAGRAMS", 50)
+    monkeypatch.setattr("stga_addon.driving.live.sources.MAX_DATAGRAMS", 50)
     receiver = Receiver(LINK, port=free_port())
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     assert receiver.read() == []

@@ -9,10 +9,9 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.export.playback import Playback
 from stga_addon.export.web import data_file
-from stga_addon.export.web.container import FixedPoint, pack
-from stga_addon.export.web.page import PAGE_MODULES, PLAYER, element_script, modules
+from stga_addon.export.web.data_file import FixedPoint, pack
+from stga_addon.export.web.page import PAGE_MODULES, PLAYER, SCRIPT_NAME, element_script, modules, write_web
 from stga_addon.export.web.rig import BAKE_TOLERANCE_M, baked_rig
-from stga_addon.export.web.write import SCRIPT_NAME, write_web
 
 from .conftest import make_head
 from .web_data import read_web_data, splats_of

@@ -12,10 +12,9 @@ from stga_addon.avatar.light import AvatarLight
 from stga_addon.avatar.splats import Splats
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
-from stga_addon.light.bounce import Bounce
 from stga_addon.light.harmonics import rotated, uniform
 from stga_addon.light.relight import Relighter
-from stga_addon.light.transfer import transfer_of
+from stga_addon.light.transfer import Bounce, transfer_of
 from stga_addon.light.values import Light, Lighting
 from stga_addon.render.render import render_colors, to_uint8
 

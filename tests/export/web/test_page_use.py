@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 from export.web.browser import Browser
-from stga_addon.driving.head_map import head_map
+from stga_addon.driving.head_map import head_map, page_controls
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
-from stga_addon.driving.page_controls import page_controls
 from stga_addon.driving.performance import Performance
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.write import SCRIPT_NAME, write_web
+from stga_addon.export.web.page import SCRIPT_NAME, write_web
 from stga_addon.flame.forward import FlameFrame, flame_forward
 
 from .conftest import Head, show

@@ -1,6 +1,6 @@
 // @ts-check
 // Lashes: dark splats around the eyes that stand off the mesh, and throw shadows that the mesh does not. The rules are
-// those of STGA for Blender's light/lashes.py.
+// those of STGA for Blender's light/surface.py.
 
 /**
  * @import { Surface } from './surface.js'

@@ -1,6 +1,6 @@
 // @ts-check
 // GLSL that lights splats: the shadow map of the sun, and a pass that computes the color of each splat once. The rules are
-// those of STGA for Blender's light/relight.py, light/shadows.py and raster/cpu/shade.py.
+// those of STGA for Blender's light/relight.py, light/lamps.py and raster/cpu/shade.py.
 
 import { FACE_TEXELS, SPLAT_TEXELS, TEXTURE_WIDTH, tailColor } from './shaders.js';
 import { ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT } from './likeness.js';

@@ -1,5 +1,5 @@
 // @ts-check
-// How much of an avatar's recorded colors a light keeps. The rules are those of STGA for Blender's light/likeness.py.
+// How much of an avatar's recorded colors a light keeps. The rules are those of STGA for Blender's light/relight.py.
 
 /** @import { Bounce } from './bounce.js' */
 
