@@ -99,7 +99,7 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
 
 
 def test_images_of_recorded_light_say_so(extension, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches F12 and animations that do not say that they show another light than the panel, or say it of each image."""
+    """Catches F12 and animations whose light is not the panel's, and which do not say so, or do for each image."""
     scene, cast = bpy.context.scene, "the light of this frame"
     shown, _ = show(with_light(textured(avatar_of("stga"))))
     camera_at()
