@@ -130,6 +130,7 @@ def track(
     footage, source = _stored(footage, out), _source(footage, head_file, landmarks)
     if landmarks is not None:
         found = read_landmarks(footage, landmarks)
+        _check_faces(footage, found)
         places_file = landmarks / PLACES_FILE
         places, reliable = read_places(places_file, len(head.model.faces))
         _begin(out, source)
@@ -151,7 +152,6 @@ def track(
             if is_new:  # what it holds is of no use for other footage
                 shutil.rmtree(out)
             raise
-    _check_faces(footage, found)
     check_count(found, places)
     neutral = places.on(head.model.v_template, head.model.faces)
     if np.ptp(neutral[reliable], axis=0).max() < MIN_FACE_M:
