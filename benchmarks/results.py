@@ -21,7 +21,8 @@ from stga_addon import __version__
 
 HEADER = """# Results
 
-Written by `python benchmarks/results.py {capture}`, on {machine}. RUN is a new folder. Compare figures within a table.
+Written by `python benchmarks/results.py {capture}`, on {machine}. RUN is a
+new folder. Compare figures within a table.
 
 PSNR in dB, higher is better; LPIPS, lower is better; means over views. *val*: the camera held out of training. *test*:
 expressions held out of training, all cameras. *head*: pixels inside the head mask. *moving*: pixels of the triangles
