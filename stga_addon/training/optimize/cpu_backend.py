@@ -13,7 +13,7 @@ from ...raster.cpu.threads import threads
 from ..settings import TrainingSettings
 from . import adam, driven_offsets
 from .backend import Batch
-from .flame_refinement import frame_gradient
+from .flame_refinement import Tracking, frame_gradient
 from .frames import FrameStore
 from .losses import image_gradient, tile_rectangles, whole_image
 from .state import TrainState
@@ -100,18 +100,29 @@ class CpuBackend:
             antialiased=self._settings.antialiased, buffers=self._buffers,
         )  # fmt: skip
 
-    def _refine_tracking(self, batch: Batch, rows: np.ndarray) -> None:
-        """Step the timestep's FLAME parameters along the gradient of the loss, computed from the splats' gradients."""
-        store, state, timestep = self._frames, self.state, batch.view.timestep
-        assert store.tracking is not None
-        frames, gradients = store.of(timestep), state.gradients
-        splats, face = state.parameters, state.face
+    def mesh_gradient(
+        self, view: View, target: np.ndarray, background: np.ndarray, sh_degree: int
+    ) -> tuple[float, np.ndarray]:
+        """The image loss of a view, and its gradient (V, 3) with respect to the timestep's mesh; nothing is stepped."""
+        rows, _, loss = self._backward(view, target, background, sh_degree, None)
+        assert loss is not None
+        return loss, self._vertex_gradient(view.timestep, rows)
+
+    def _vertex_gradient(self, timestep: int, rows: np.ndarray) -> np.ndarray:
+        """(V, 3) gradient with respect to the timestep's mesh, from the splats' gradients."""
+        store, state = self._frames, self.state
+        frames, splats, face = store.of(timestep), state.parameters, state.face
         for name, offset in state.driven_offsets.items():
             shift = offset_of(offset.value, store.signals(timestep)(name))
             splats = splats._replace(xyz=splats.xyz + shift[face])
-        gradients_of_frames = frame_gradient(splats, face, gradients, rows, frames)
-        vertex_gradient = frame_backward(store.mesh(timestep), store.capture.faces, frames, *gradients_of_frames)
-        store.tracking.step(timestep, vertex_gradient, batch.refinement_rate)
+        gradients_of_frames = frame_gradient(splats, face, state.gradients, rows, frames)
+        return frame_backward(store.mesh(timestep), store.capture.faces, frames, *gradients_of_frames)
+
+    def _refine_tracking(self, batch: Batch, rows: np.ndarray) -> None:
+        """Step the timestep's FLAME parameters along the gradient of the loss."""
+        store, timestep = self._frames, batch.view.timestep
+        assert isinstance(store.tracking, Tracking)
+        store.tracking.step(timestep, self._vertex_gradient(timestep, rows), batch.refinement_rate)
         store.clear()
 
     def _step_offsets(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:

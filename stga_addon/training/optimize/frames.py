@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -12,11 +13,19 @@ from ...avatar.offsets.table import OFFSETS
 from ...avatar.strain import color_range, strain_basis
 from ...capture.model import Capture
 from ..settings import TrainingSettings
-from .flame_refinement import Tracking
 from .hull_points import voxel_size
 
 CACHED_TIMESTEPS = 12
 """Timesteps kept in memory: about 1 MB each for 10,000 triangles."""
+
+
+class MovedHead(Protocol):
+    """Meshes of some timesteps in place of the capture's, which may change."""
+
+    def refines(self, timestep: int) -> bool: ...
+
+    def mesh(self, timestep: int) -> np.ndarray:
+        """(V, 3) in meters."""
 
 
 @dataclass
@@ -39,7 +48,7 @@ class FrameStore:
         capture: Capture,
         convention: str,
         strain: bool = False,
-        tracking: Tracking | None = None,
+        tracking: MovedHead | None = None,
         limits: np.ndarray | None = None,
     ) -> None:
         """limits (F, 2, 3): lowest and highest strain that is followed; None: COLOR_RANGE."""

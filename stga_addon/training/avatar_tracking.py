@@ -1,0 +1,225 @@
+"""Tracking by a finished avatar: pose and expression such that the avatar, its splats fixed, looks like the images.
+
+Landmarks and dense tracking know a face in general; an avatar knows its person, with hair and teeth. The gradient is
+that of the training's own loss, passed from the splats to the head's parameters. L-BFGS follows it in coordinates in
+which the Gauss-Newton matrix of points of the surface is the identity, so that few renderings are enough.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..avatar.file import Avatar
+from ..capture.images import read_view
+from ..capture.mesh_geometry import vertex_normals
+from ..capture.model import Capture, View
+from ..errors import StgaError
+from ..flame.forward import RIGID_SIZE, TRANSLATION_SIZE, flame_forward, frame_of
+from ..flame.sequence import FlameSequence, with_identity
+from ..tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
+from ..tracking.dense_terms import POINT_SHARE, inside, projection_derivative
+from ..tracking.head_model import HeadModel
+from ..tracking.photo_consistency import facing, in_sight
+from ..tracking.posed_points import PosedPoints
+from ..tracking.seen_surface import surface_points
+from ..tracking.solve import WEIGHT_EXCESS_SIGMA, parameter_precision
+from .optimize.cpu_backend import CpuBackend
+from .optimize.frames import FrameStore
+from .optimize.image_preparation import image_preparation
+from .optimize.state import new_offset, new_state
+from .schedule import sh_degree
+from .settings import TrainingSettings
+
+RENDERINGS = 9
+"""Of each view of a timestep: more of them hardly lower the loss."""
+MAX_HEIGHT_PX = 802
+"""Images higher than this are shrunk to it."""
+POINTS, MIN_COSINE, VISIBILITY_SIDE_PX = 6000, 0.15, 160
+"""Points of the surface; of the angle between normal and camera, below which one does not count; size of the depth
+image that hidden ones are found in."""
+EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
+"""Standard deviations of a timestep's parameters from those that it starts with."""
+FIRST_STEP = 0.01
+"""Length of the first step, as a share of the one down a loss as steep as the points say: it is steeper."""
+
+
+@dataclass(frozen=True)
+class AvatarTracking:
+    """Parameters (T, E + 18) of timesteps, and the loss of their images, (T,), where they started and where they are."""
+
+    timesteps: tuple[int, ...]
+    parameters: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+
+
+def track_by_avatar(
+    avatar: Avatar,
+    settings: TrainingSettings,
+    capture: Capture,
+    timesteps: Sequence[int] | None = None,
+    report: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> AvatarTracking:
+    """Refine the parameters of a tracked capture of the avatar's person, from where they are.
+
+    settings: with which the avatar was trained, whose background and exposures the images have. timesteps: None: all.
+    Raises StgaError where the capture is not tracked with FLAME or the bundled head, or is of another head.
+    """
+    tracker = _Tracker(avatar, settings, capture)
+    chosen = capture.timesteps if timesteps is None else tuple(timesteps)
+    found = []
+    for number, timestep in enumerate(chosen):
+        report("Tracking by the avatar", number, len(chosen))
+        found.append(tracker.solve(timestep))
+    report("Tracking by the avatar", len(chosen), len(chosen))
+    parameters, before, after = zip(*found, strict=True)
+    return AvatarTracking(tuple(chosen), np.stack(parameters), np.array(before), np.array(after))
+
+
+class _Posed:
+    """The head at the parameters that are being tried, in place of the capture's (`FrameStore`)."""
+
+    def __init__(self, sequence: FlameSequence) -> None:
+        self._sequence = with_identity(sequence)
+        self.values = np.zeros(0)
+
+    def refines(self, timestep: int) -> bool:
+        return True
+
+    def mesh(self, timestep: int) -> np.ndarray:
+        offset = self._sequence.frame(timestep).dynamic_offset
+        return flame_forward(self._sequence.model, np.zeros(0), frame_of(self.values, offset))
+
+
+class _Tracker:
+    def __init__(self, avatar: Avatar, settings: TrainingSettings, capture: Capture) -> None:
+        from ..flame.forward_torch import flame_tensors  # torch takes seconds to load
+
+        sequence = capture.flame
+        if sequence is None:
+            raise StgaError(f"{capture.root}: is not tracked with FLAME or the bundled head")
+        if settings.convention != "stga":
+            raise StgaError(f"{settings.convention}: only avatars of the convention 'stga' can track")
+        if not np.array_equal(avatar.faces, capture.faces):
+            raise StgaError(f"{capture.root}: is of another head than the avatar")
+        self._capture, self._settings, self._sequence = capture, settings, sequence
+        self._views: dict[int, list[View]] = {}
+        for view in (view for views in capture.views.values() for view in views):
+            self._views.setdefault(view.timestep, []).append(view)
+        self._prepare = image_preparation(capture, settings)
+        person = with_identity(sequence).model
+        self._head, self._tensors = HeadModel(person, "flame"), flame_tensors(person)
+        self._points = surface_points(self._head, POINTS)
+        self._posed_points = PosedPoints(person, self._points)
+        self._posed = _Posed(sequence)
+        state = new_state(avatar.splats)
+        state.driven_offsets = {name: new_offset(own) for name, own in avatar.driven_offsets.items()}
+        limits = avatar.strain_range
+        self._frames = FrameStore(capture, settings.convention, settings.follows_strain, self._posed, limits)
+        self._backend = CpuBackend(settings, self._frames, state)
+
+    def solve(self, timestep: int) -> tuple[np.ndarray, float, float]:
+        """Parameters (E + 18,), and loss before and after; as tracked where no view shows the timestep."""
+        from scipy.linalg import solve_triangular
+        from scipy.optimize import minimize
+
+        tracked = self._sequence.frame(timestep).parameters
+        shots = [self._read(view) for view in self._views.get(timestep, ())]
+        if not shots:
+            return tracked, 0.0, 0.0
+        precision = self._precision()
+        root = np.linalg.cholesky(self._gauss_newton(tracked, timestep, shots) + np.diag(precision))
+
+        def energy(whitened: np.ndarray) -> tuple[float, np.ndarray]:
+            change = solve_triangular(root, whitened, lower=True, trans=1)
+            loss, gradient = self._loss(tracked + change, timestep, shots)
+            excess = self._excess(tracked + change)
+            gradient += precision * change + excess / WEIGHT_EXCESS_SIGMA**2
+            prior = precision @ change**2 + (excess**2).sum() / WEIGHT_EXCESS_SIGMA**2
+            return loss + prior / 2, solve_triangular(root, gradient, lower=True)
+
+        start = np.zeros(len(tracked))
+        kept = [energy(start)]
+        scale = FIRST_STEP * max(float(np.linalg.norm(kept[0][1])), 1e-9)
+
+        def scaled(values: np.ndarray) -> tuple[float, np.ndarray]:
+            found = kept[0] if not values.any() else energy(scale * values)
+            return found[0], scale * found[1]
+
+        options = {"maxfun": RENDERINGS, "maxiter": RENDERINGS}
+        best = minimize(scaled, start, jac=True, method="L-BFGS-B", options=options).x
+        values = tracked + solve_triangular(root, scale * best, lower=True, trans=1)
+        before, after = (self._loss(own, timestep, shots)[0] for own in (tracked, values))
+        return (values, before, after) if after < before else (tracked, before, before)
+
+    def _read(self, view: View) -> tuple[View, np.ndarray]:
+        background = [round(255 * part) for part in self._settings.background]
+        scale = min(1.0, MAX_HEIGHT_PX / view.camera.height)
+        view, image, mask = read_view(view, scale, (background[0], background[1], background[2]))
+        if self._prepare is not None:
+            image, _ = self._prepare(view, image, mask)
+        image = np.ascontiguousarray(image).view()
+        image.setflags(write=False)  # like the loader's: Numba compiles for one type only
+        return view, image
+
+    def _precision(self) -> np.ndarray:
+        """(E + 18,) inverse variances of the change; joints that the model lacks do not turn."""
+        count = self._head.model.n_expression
+        sigma = np.repeat(
+            (EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M),
+            (count, RIGID_SIZE - TRANSLATION_SIZE, TRANSLATION_SIZE),
+        )
+        absent = np.repeat(~np.array(self._head.joints), 3)
+        precision = sigma**-2.0
+        rigid = slice(count, count + len(absent))
+        precision[rigid] = np.where(absent, parameter_precision(self._head)[rigid], precision[rigid])
+        return precision
+
+    def _excess(self, values: np.ndarray) -> np.ndarray:
+        """(E + 18,) by which weights leave 0 to 1."""
+        found = np.zeros(len(values))
+        if self._head.model.expression_names:
+            weights = values[:-RIGID_SIZE]
+            found[:-RIGID_SIZE] = weights - np.clip(weights, 0, 1)
+        return found
+
+    def _loss(
+        self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]
+    ) -> tuple[float, np.ndarray]:
+        """The images' loss in the points' units, and its gradient (E + 18,)."""
+        from ..flame.forward_torch import parameters_gradient
+
+        self._posed.values = values
+        self._frames.clear()
+        total, by_vertex = 0.0, np.zeros_like(self._capture.neutral)
+        background = np.array(self._settings.background, np.float32)
+        for view, image in shots:
+            weight = POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255)
+            loss, gradient = self._backend.mesh_gradient(view, image, background, sh_degree(self._settings, 1.0))
+            total += weight * loss
+            by_vertex += weight * gradient
+        offset = self._sequence.frame(timestep).dynamic_offset
+        return total, parameters_gradient(self._tensors, frame_of(values, offset), by_vertex)
+
+    def _gauss_newton(self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
+        """(E + 18, E + 18): how much a change of each parameter changes what the images show at points of the surface."""
+        self._posed.values = values
+        mesh, faces = self._posed.mesh(timestep), self._capture.faces
+        at, normals = self._points.on(mesh, faces), self._points.on(vertex_normals(mesh, faces), faces)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+        curvature = np.zeros((len(at), 3, 3))
+        for view, image in shots:
+            camera = view.camera
+            level = pyramid(camera, image, at.mean(0))[0]
+            pixels, depth = level.camera.project(at)
+            small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
+            cosine = facing(camera, at, normals)
+            seen = (cosine > MIN_COSINE) & in_sight(small, mesh, faces, at) & inside(level.camera, pixels, depth)
+            slopes = np.stack(sampled(list(level.gradient), pixels), -1)  # (N, 3 channels, 2)
+            moved = slopes @ projection_derivative(level.camera, at) / NOISE_LEVELS
+            weight = POINT_SHARE * (cosine * seen)[:, None] * CHANNEL_WEIGHTS
+            curvature += np.einsum("nc,ncx,ncy->nxy", weight, moved, moved)
+        _, jacobian = self._posed_points.linearized(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+        flat = jacobian.reshape(-1, jacobian.shape[2])
+        return np.asarray(flat.T @ (curvature @ jacobian).reshape(flat.shape))
