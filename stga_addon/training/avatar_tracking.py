@@ -46,7 +46,7 @@ FIRST_STEP = 0.01
 
 @dataclass(frozen=True)
 class AvatarTracking:
-    """Parameters (T, E + 18) of timesteps, and the loss of their images, (T,), where they started and where they are."""
+    """Parameters (T, E + 18) of timesteps, and the loss of their images (T,) where they started and where they are."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
@@ -203,7 +203,7 @@ class _Tracker:
         return total, parameters_gradient(self._tensors, frame_of(values, offset), by_vertex)
 
     def _gauss_newton(self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
-        """(E + 18, E + 18): how much a change of each parameter changes what the images show at points of the surface."""
+        """(E + 18, E + 18): how much parameters change what the images show at points of the surface."""
         self._posed.values = values
         mesh, faces = self._posed.mesh(timestep), self._capture.faces
         at, normals = self._points.on(mesh, faces), self._points.on(vertex_normals(mesh, faces), faces)

@@ -68,7 +68,7 @@ def test_it_finds_the_head(person: Person, lost: tuple[Capture, dict[int, np.nda
     assert np.median(after[:-1] / before[:-1]) < 0.3
     assert after[-1] < 0.8  # a third of a pixel
     assert (found.after <= found.before).all()
-    assert stages[0] == (0, len(TIMESTEPS)) and stages[-1] == (len(TIMESTEPS),) * 2
+    assert [stages[0], stages[-1]] == [(0, len(TIMESTEPS)), (len(TIMESTEPS),) * 2]
 
 
 def test_another_head(person: Person, lost: tuple[Capture, dict[int, np.ndarray]]) -> None:
