@@ -24,7 +24,7 @@ BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
 BLENDERS = ("stga_addon/scene/", "stga_addon/development/demo/studio.py", "operators/", "ui/")
 """Where Blender's modules are imported."""
 HEAVY = {"torch", "numba", "wgpu"}
-TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/flame/forward_torch.py")
+TRAININGS = ("stga_addon/raster/", "stga_addon/training/")
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},

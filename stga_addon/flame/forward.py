@@ -9,6 +9,8 @@ from .model import FlameModel
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
 """The last numbers of a frame's parameters: axis-angles of five joints, and the translation. Expression comes first."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
+SMALL_ANGLE = 1e-4
+"""Radians, below which a quotient by the squared angle is its limit."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,22 @@ def axis_angle_matrices(axis_angle: np.ndarray) -> np.ndarray:
     return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
+def cross_matrices(vectors: np.ndarray) -> np.ndarray:
+    """(N, 3, 3): the matrices of x ↦ vector × x, of vectors (N, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([np.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2)
+
+
+def left_jacobian(angles: np.ndarray) -> np.ndarray:
+    """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of it amounts to."""
+    angle = float(np.linalg.norm(angles))
+    cross = cross_matrices(angles[None])[0]
+    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
+    third = (1 - np.sinc(angle / np.pi)) / angle**2 if angle > SMALL_ANGLE else 1 / 6
+    return np.asarray(np.eye(3) + second * cross + third * cross @ cross)
+
+
 def shaped_vertices(
     model: FlameModel, shape: np.ndarray, expr: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:
@@ -87,14 +105,64 @@ def flame_forward(
     """
     offsets = [offset for offset in (static_offset, frame.dynamic_offset) if offset is not None]
     shaped = shaped_vertices(model, shape, frame.expr, np.sum(offsets, axis=0) if offsets else None)
-    joints = joint_positions(model, shaped)
-    rotations = axis_angle_matrices(frame.pose)
-    corrected = shaped + model.posedirs @ (rotations[1:] - np.eye(3)).ravel()
-    world_rotation, world_joint = rotations.copy(), joints.copy()
+    posed = _posed(model, shaped, frame)
+    vertices = np.einsum("vab,vb->va", posed.skin, posed.corrected) + model.weights @ posed.moved
+    return np.asarray(vertices + frame.translation)
+
+
+def parameters_gradient(model: FlameModel, frame: FlameFrame, vertex_gradient: np.ndarray) -> np.ndarray:
+    """(E + 18,) gradient of a scalar with respect to the frame's `parameters`, from that with respect to its vertices
+    (V, 3): the reverse of `flame_forward`, of a model whose template has the identity and the static offset.
+    """
+    shaped = model.v_template + model.shapedirs[:, :, model.n_identity :] @ frame.expr
+    posed = _posed(model, shaped if frame.dynamic_offset is None else shaped + frame.dynamic_offset, frame)
+    force = model.weights.T @ vertex_gradient  # (5, 3), by where each joint moves what it carries
+    by_corrected = np.einsum("vab,va->vb", posed.skin, vertex_gradient)
+    outer = (vertex_gradient[:, :, None] * posed.corrected[:, None]).reshape(-1, 9)
+    by_world = (model.weights.T @ outer).reshape(-1, 3, 3) - force[:, :, None] * posed.joints[:, None]
+    by_place, by_joint = force.copy(), -np.einsum("jab,ja->jb", posed.world, force)
+    by_local = np.zeros_like(by_world)
+    for joint in reversed(range(len(model.parents))):
+        parent = int(model.parents[joint])
+        if parent < 0:
+            by_local[joint] = by_world[joint]
+            by_joint[joint] += by_place[joint]
+            continue
+        turn, bone = posed.world[parent], posed.joints[joint] - posed.joints[parent]
+        by_local[joint] = turn.T @ by_world[joint]
+        by_world[parent] += by_world[joint] @ posed.local[joint].T + np.outer(by_place[joint], bone)
+        by_place[parent] += by_place[joint]
+        by_joint[joint] += turn.T @ by_place[joint]
+        by_joint[parent] -= turn.T @ by_place[joint]
+    by_local[1:] += np.tensordot(by_corrected, model.posedirs, 2).reshape(-1, 3, 3)
+    twist = by_local @ posed.local.swapaxes(1, 2)
+    torque = np.stack([twist[:, k - 1, k - 2] - twist[:, k - 2, k - 1] for k in range(3)], 1)
+    by_pose = [left_jacobian(own).T @ by_turn for own, by_turn in zip(frame.pose, torque, strict=True)]
+    by_shaped = by_corrected + model.j_regressor.T @ by_joint
+    by_expression = np.tensordot(by_shaped, model.shapedirs[:, :, model.n_identity :], 2)
+    return np.concatenate([by_expression, *by_pose, vertex_gradient.sum(0)])
+
+
+@dataclass(frozen=True)
+class _Posed:
+    """Of a frame: joints (5, 3) and vertices with pose correctives (V, 3), both unposed; rotations (5, 3, 3) of the
+    joints in their parents and in the world; `moved` (5, 3): a joint takes x to R x + moved; R blended (V, 3, 3)."""
+
+    joints: np.ndarray
+    corrected: np.ndarray
+    local: np.ndarray
+    world: np.ndarray
+    moved: np.ndarray
+    skin: np.ndarray
+
+
+def _posed(model: FlameModel, shaped: np.ndarray, frame: FlameFrame) -> _Posed:
+    joints, local = joint_positions(model, shaped), axis_angle_matrices(frame.pose)
+    corrected = shaped + model.posedirs @ (local[1:] - np.eye(3)).ravel()
+    world, places = local.copy(), joints.copy()
     for joint, parent in enumerate(model.parents.tolist()):
         if parent >= 0:
-            world_rotation[joint] = world_rotation[parent] @ rotations[joint]
-            world_joint[joint] = world_joint[parent] + world_rotation[parent] @ (joints[joint] - joints[parent])
-    moved = world_joint - np.einsum("jab,jb->ja", world_rotation, joints)  # each joint's x -> R x + moved
-    skin = np.einsum("vj,jab->vab", model.weights, world_rotation)
-    return np.asarray(np.einsum("vab,vb->va", skin, corrected) + model.weights @ moved + frame.translation)
+            world[joint] = world[parent] @ local[joint]
+            places[joint] = places[parent] + world[parent] @ (joints[joint] - joints[parent])
+    moved = places - np.einsum("jab,jb->ja", world, joints)
+    return _Posed(joints, corrected, local, world, moved, np.einsum("vj,jab->vab", model.weights, world))

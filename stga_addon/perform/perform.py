@@ -23,8 +23,8 @@ from ..worker.status import StatusWriter, status_writer
 
 LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
 """Rooms that a worker which trains loads before it begins."""
-TORCH_MODULES = ("flame.forward_torch", "raster.cpu.autograd")
-"""Modules in them that import torch, which takes seconds; a training that refines tracking loads the first itself."""
+TORCH_MODULES = ("raster.cpu.autograd",)
+"""Modules in them that import torch, which takes seconds."""
 PREVIEW_INTERVAL_S = 4.0
 """Seconds between two previews of a training."""
 WORK: dict[type[Any], tuple[str, str]] = {

@@ -4,11 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, axis_angle_matrices
+from ..flame.forward import (
+    POSE_SIZE,
+    RIGID_SIZE,
+    TRANSLATION_SIZE,
+    axis_angle_matrices,
+    cross_matrices,
+    left_jacobian,
+)
 from ..flame.model import FlameModel
-
-SMALL_ANGLE = 1e-4
-"""Radians, below which a quotient by the squared angle is its limit."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class PosedPoints:
     def linearized(self, coefficients: np.ndarray, rigid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
         posed, count = self._posed(coefficients, rigid), len(self.barycentric)
-        turns = [_left_jacobian(angles) for angles in posed.angles]
+        turns = [left_jacobian(angles) for angles in posed.angles]
         first, share = self.dirs.shape[2], self._corner_weights.sum(2)
         found = np.empty((count, 3, first + RIGID_SIZE))
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
@@ -111,7 +115,7 @@ class PosedPoints:
         return np.asarray((posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
 
     def _by_joints(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (N, 3, 15) by the axis-angles of the joints, whose `_left_jacobian` is given; no correctives.
+        """Derivatives (N, 3, 15) by the axis-angles of the joints, whose `left_jacobian` is given; no correctives.
 
         Turning a joint turns about it what it and the joints below it carry, each with its share of the skin.
         """
@@ -161,13 +165,6 @@ def _moves(rotations: np.ndarray, places: np.ndarray, joints: np.ndarray) -> np.
     return np.asarray(places - rotations @ joints)
 
 
-def cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """(N, 3, 3): the matrices of x ↦ vector × x, of vectors (N, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([np.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2)
-
-
 def _below(parents: list[int]) -> np.ndarray:
     """(J, J): 1 where a joint (column) is one (row) or is carried by it."""
     found = np.eye(len(parents))
@@ -175,12 +172,3 @@ def _below(parents: list[int]) -> np.ndarray:
         if parent >= 0:
             found[:, joint] += found[:, parent]
     return found
-
-
-def _left_jacobian(angles: np.ndarray) -> np.ndarray:
-    """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of it amounts to."""
-    angle = float(np.linalg.norm(angles))
-    cross = cross_matrices(angles[None])[0]
-    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
-    third = (1 - np.sinc(angle / np.pi)) / angle**2 if angle > SMALL_ANGLE else 1 / 6
-    return np.asarray(np.eye(3) + second * cross + third * cross @ cross)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..capture.model import evenly_spread
-from ..flame.forward import axis_angle_matrices
+from ..flame.forward import axis_angle_matrices, cross_matrices
 from ..flame.model import torso_faces
 from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, robust, sampled
 from .dense_terms import (
@@ -28,7 +28,6 @@ from .dense_terms import (
 from .fit import HeadFit
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
-from .posed_points import cross_matrices
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
 from .torso_motion import TorsoMotion, TorsoPoints

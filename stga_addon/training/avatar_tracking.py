@@ -15,7 +15,7 @@ from ..capture.images import read_view
 from ..capture.mesh_geometry import vertex_normals
 from ..capture.model import Capture, View
 from ..errors import StgaError
-from ..flame.forward import RIGID_SIZE, TRANSLATION_SIZE, flame_forward, frame_of
+from ..flame.forward import RIGID_SIZE, TRANSLATION_SIZE, flame_forward, frame_of, parameters_gradient
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
 from ..tracking.dense_terms import POINT_SHARE, inside, projection_derivative
@@ -94,8 +94,6 @@ class _Posed:
 
 class _Tracker:
     def __init__(self, avatar: Avatar, settings: TrainingSettings, capture: Capture) -> None:
-        from ..flame.forward_torch import flame_tensors  # torch takes seconds to load
-
         sequence = capture.flame
         if sequence is None:
             raise StgaError(f"{capture.root}: is not tracked with FLAME or the bundled head")
@@ -109,7 +107,7 @@ class _Tracker:
             self._views.setdefault(view.timestep, []).append(view)
         self._prepare = image_preparation(capture, settings)
         person = with_identity(sequence).model
-        self._head, self._tensors = HeadModel(person, "flame"), flame_tensors(person)
+        self._head = HeadModel(person, "flame")
         self._points = surface_points(self._head, POINTS)
         self._posed_points = PosedPoints(person, self._points)
         self._posed = _Posed(sequence)
@@ -188,8 +186,6 @@ class _Tracker:
         self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]
     ) -> tuple[float, np.ndarray]:
         """The images' loss in the points' units, and its gradient (E + 18,)."""
-        from ..flame.forward_torch import parameters_gradient
-
         self._posed.values = values
         self._frames.clear()
         total, by_vertex = 0.0, np.zeros_like(self._capture.neutral)
@@ -200,7 +196,7 @@ class _Tracker:
             total += weight * loss
             by_vertex += weight * gradient
         offset = self._sequence.frame(timestep).dynamic_offset
-        return total, parameters_gradient(self._tensors, frame_of(values, offset), by_vertex)
+        return total, parameters_gradient(self._head.model, frame_of(values, offset), by_vertex)
 
     def _gauss_newton(self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
         """(E + 18, E + 18): how much parameters change what the images show at points of the surface."""

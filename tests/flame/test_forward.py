@@ -9,12 +9,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from stga_addon.flame.forward import FlameFrame, flame_forward, neutral_frame
-from stga_addon.flame.forward_torch import axis_angle_matrices, flame_tensors
-from stga_addon.flame.forward_torch import flame_forward as torch_forward
+from stga_addon.flame.forward import FlameFrame, flame_forward, frame_of, neutral_frame, parameters_gradient
 from stga_addon.flame.model import FlameModel, read_flame
 
 from .conftest import random_arrays, random_frame
+from .torch_flame import axis_angle_matrices, flame_tensors
+from .torch_flame import flame_forward as torch_forward
 
 
 def _torch_vertices(model: FlameModel, shape: np.ndarray, frames: list[FlameFrame], offset=None) -> np.ndarray:
@@ -121,3 +121,20 @@ def test_equals_smplx(tmp_path: Path) -> None:
     ours = flame_forward(model, shape, frame)
     assert np.abs(ours - np.load(Path(__file__).with_name("smplx_vertices.npy"))).max() < 1e-5
     assert np.abs(ours - model.v_template).max() > 0.05  # the pose did something
+
+
+@pytest.mark.parametrize("frame", [random_frame(8, 4), frame_of(np.zeros(22))], ids=["posed", "at zero"])
+def test_the_gradient_is_autograds(tiny_flame: FlameModel, frame: FlameFrame) -> None:
+    """Catches a joint, a corrective or a joint's place that depends on the expression left out of the reverse, and a
+    division by an angle of zero."""
+    offset, outer = np.random.default_rng(9).normal(0, 0.01, (2, 40, 3))
+    frame = replace(frame, dynamic_offset=offset)
+    person = replace(tiny_flame, v_template=tiny_flame.v_template + 0.01)
+    values = torch.tensor(frame.parameters, dtype=torch.float64, requires_grad=True)
+    expr, pose, translation = values[None].tensor_split([-18, -3], dim=1)
+    vertices = torch_forward(
+        flame_tensors(person, torch.float64), torch.zeros(person.n_identity, dtype=torch.float64), expr,
+        pose.reshape(1, 5, 3), translation, torch.tensor(offset),
+    )  # fmt: skip
+    (expected,) = torch.autograd.grad((vertices * torch.tensor(outer)).sum(), values)
+    np.testing.assert_allclose(parameters_gradient(person, frame, outer), expected, rtol=1e-9, atol=1e-12)

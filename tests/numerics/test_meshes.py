@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 from flame.conftest import model_of, random_arrays, random_frame
+from flame.torch_flame import axis_angle_matrices, flame_tensors
+from flame.torch_flame import flame_forward as torch_forward
 from raster import reference
 from raster.test_kernels import embed
 from scipy.spatial.transform import Rotation
@@ -12,8 +14,6 @@ from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_local, to_w
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.camera import Camera
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.flame.forward_torch import axis_angle_matrices, flame_tensors
-from stga_addon.flame.forward_torch import flame_forward as torch_forward
 from stga_addon.flame.quaternions import from_matrices
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters

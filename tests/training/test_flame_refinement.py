@@ -1,7 +1,6 @@
 """FLAME's parameters refined while training: the gradient, what it brings, and who gets to see the refined meshes."""
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -136,16 +135,6 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
     found = tracking.gradient(3, frame_backward(tracking.mesh(3), capture.faces, frames(), *parts))
     expected = differences(tracking, 3, lambda: loss().item(), 1e-6)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-
-
-def test_the_gradient_needs_no_sympy(right: Made, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an import of autograd's that takes half a second, and three where it has no bytecode."""
-    monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
-    tracking = refinable_tracking(right[0], "stga")
-    assert tracking is not None
-    mesh = tracking.mesh(3)
-    found = tracking.gradient(3, np.ones_like(mesh))
-    np.testing.assert_allclose(found[-3:], len(mesh), rtol=1e-5)  # of the translation
 
 
 @pytest.mark.parametrize("name", GROUPS)

@@ -2,14 +2,14 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 
 from ...avatar.embedding import FaceFrames
 from ...capture.model import Capture
 from ...errors import StgaError
-from ...flame.forward import POSE_SIZE, TRANSLATION_SIZE, FlameFrame, frame_of
+from ...flame.forward import POSE_SIZE, TRANSLATION_SIZE, FlameFrame, frame_of, parameters_gradient
 from ...flame.sequence import FlameSequence, sequence_mesh, with_identity
 from ...raster.cpu.layout import Parameters
 
@@ -52,8 +52,6 @@ class Tracking:
 
     def __init__(self, sequence: FlameSequence, timesteps: Collection[int]) -> None:
         """timesteps: which ones to refine."""
-        from ...flame.forward_torch import flame_tensors, parameters_gradient  # torch takes seconds to load
-
         self.sequence = sequence
         self.tracked = np.stack([sequence.frame(timestep).parameters for timestep in sequence.timesteps])
         self.trained = np.isin(sequence.timesteps, list(timesteps))
@@ -66,7 +64,6 @@ class Tracking:
         self._row = {timestep: row for row, timestep in enumerate(sequence.timesteps)}
         self._source = lru_cache(CACHED_TIMESTEPS)(sequence.frame)
         self._person = replace(with_identity(sequence), frame=self.frame)
-        self._gradient = partial(parameters_gradient, flame_tensors(self._person.model))
 
     def refines(self, timestep: int) -> bool:
         return timestep in self._row and bool(self.trained[self._row[timestep]])
@@ -107,7 +104,7 @@ class Tracking:
 
     def gradient(self, timestep: int, vertex_gradient: np.ndarray) -> np.ndarray:
         """(P,) gradient with respect to the timestep's parameters, from that with respect to its vertices (V, 3)."""
-        return self._gradient(self.frame(timestep), vertex_gradient)
+        return parameters_gradient(self._person.model, self.frame(timestep), vertex_gradient)
 
 
 def refinable_tracking(capture: Capture, convention: str) -> Tracking:

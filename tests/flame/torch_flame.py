@@ -1,12 +1,10 @@
-"""FLAME's forward pass in torch: batched over frames and differentiable (NumPy: `forward`)."""
+"""FLAME's forward pass in torch, batched over frames and differentiable: an independent witness of `flame.forward`."""
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
-from .forward import POSE_SIZE, TRANSLATION_SIZE, FlameFrame
-from .model import JOINTS, FlameModel
+from stga_addon.flame.model import JOINTS, FlameModel
 
 
 @dataclass(frozen=True)
@@ -80,19 +78,3 @@ def flame_forward(
     skin = torch.einsum("vj,tjab->tvab", flame.weights, rotation)
     posed = (skin @ corrected[..., None])[..., 0] + flame.weights @ moved
     return posed + translation[:, None]
-
-
-def parameters_gradient(flame: FlameTensors, frame: FlameFrame, vertex_gradient: np.ndarray) -> np.ndarray:
-    """(P,) float64 gradient with respect to a frame's `parameters`, from that with respect to its vertices (V, 3).
-
-    flame: of float32, with the person's identity in it.
-    """
-    parameters = torch.tensor(frame.parameters[None], dtype=torch.float32, requires_grad=True)
-    expr, pose, translation = parameters.tensor_split([-POSE_SIZE - TRANSLATION_SIZE, -TRANSLATION_SIZE], dim=1)
-    offset = None if frame.dynamic_offset is None else torch.tensor(frame.dynamic_offset, dtype=torch.float32)
-    no_shape = parameters.new_zeros(0)
-    vertices = flame_forward(flame, no_shape, expr, pose.reshape(1, -1, 3), translation, offset)
-    outer = torch.tensor(vertex_gradient[None], dtype=torch.float32)
-    # `grad` would import SymPy, in half a second, if it were handed the outer gradient.
-    (gradient,) = torch.autograd.grad((vertices * outer).sum(), parameters)
-    return gradient[0].numpy().astype(np.float64)
