@@ -1,79 +1,325 @@
-"""Tracking by a finished avatar: where it brings a head that is off, and what it leaves alone."""
+"""A head tracked by its own avatar, finished or in training: the gradient, what it brings, and who gets to see it."""
 
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 
+from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_backward
 from stga_addon.avatar.file import Avatar
+from stga_addon.capture.images import read_view
 from stga_addon.capture.model import Capture
+from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
-from stga_addon.flame.forward import FlameFrame, frame_of
-from stga_addon.flame.sequence import sequence_mesh
-from stga_addon.training.avatar_tracking import AvatarTracking, track_by_avatar
+from stga_addon.files import read_npz, write_npz
+from stga_addon.flame.forward import parameters_gradient
+from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
+from stga_addon.progress import Cancelled
+from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.training.optimize.avatar_tracking import AvatarTracking, RefinedTracking, track_by_avatar
+from stga_addon.training.optimize.cpu_backend import frame_gradient
 from stga_addon.training.optimize.trainer import Trainer
+from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
+from stga_addon.training.run.folder import Run, read_run
+from stga_addon.training.run.loop import train
+from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.tracking_file import with_refined_tracking
+from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import TrainingSettings
 
 from .heads import TIMESTEPS, write_head
-from .test_flame_refinement import trained
+from .toys import quick_settings
 
-TRAINED = TIMESTEPS[:-1]
-Person = tuple[Avatar, TrainingSettings]
-
-
-@pytest.fixture(scope="module")
-def person(tmp_path_factory: pytest.TempPathFactory) -> Person:
-    """An avatar whose training saw the right meshes."""
-    capture, _ = write_head(tmp_path_factory.mktemp("right"), error=0.0)
-    trainer: Trainer = trained(capture, 300)
-    settings = trainer.settings
-    avatar = Avatar(
-        trainer.state.averaged(), settings.convention, capture.neutral.astype(np.float32), capture.faces,
-        antialiased=settings.antialiased,
-    )  # fmt: skip
-    return avatar, settings
+Made = tuple[Capture, dict[int, np.ndarray]]
+NAMES = ("origin", "rotation", "scale")
+WHITE = np.ones(3, np.float32)
 
 
 @pytest.fixture(scope="module")
-def lost(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, dict[int, np.ndarray]]:
-    """The same head, tracked a few millimeters and degrees off, and its true meshes."""
+def lost(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Tracked a few millimeters and degrees off."""
     return write_head(tmp_path_factory.mktemp("lost"))
 
 
-def millimeters(capture: Capture, found: AvatarTracking, true: dict[int, np.ndarray]) -> np.ndarray:
-    """(T,) mean distance of the vertices from where they are."""
-    assert capture.flame is not None
-    frames = dict(zip(found.timesteps, found.parameters, strict=True))
-    moved = replace(capture.flame, frame=lambda t: frame_with(capture, t, frames[t]))
-    away = [sequence_mesh(moved, t) - true[t] for t in found.timesteps]
+@pytest.fixture(scope="module")
+def right(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return write_head(tmp_path_factory.mktemp("right"), error=0.0)
+
+
+@pytest.fixture(scope="module")
+def person(right: Made) -> tuple[Avatar, TrainingSettings]:
+    """An avatar whose training saw the right meshes."""
+    capture, settings = right[0], quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=())
+    trainer = Trainer(capture, settings, {})
+    views = capture.views["train"]
+    ready = {view.name: read_view(view) for view in views}
+    for n, view in zip(range(300), view_order(views, 1, 0), strict=False):
+        small, image, mask = ready[view.name]
+        trainer.step(small, image, n / 300, mask)
+    neutral = capture.neutral.astype(np.float32)
+    return Avatar(trainer.state.averaged(), settings.convention, neutral, capture.faces), settings
+
+
+def millimeters(capture: Capture, true: dict[int, np.ndarray]) -> np.ndarray:
+    """(T,) mean distance of a capture's vertices from where they should be."""
+    away = [capture.mesh(timestep) - true[timestep] for timestep in TIMESTEPS]
     return 1000 * np.linalg.norm(away, axis=-1).mean(1)
 
 
-def frame_with(capture: Capture, timestep: int, values: np.ndarray) -> FlameFrame:
-    assert capture.flame is not None
-    return frame_of(values, capture.flame.frame(timestep).dynamic_offset)
-
-
-def test_it_finds_the_head(person: Person, lost: tuple[Capture, dict[int, np.ndarray]]) -> None:
-    """Catches a gradient or a preconditioner with a wrong sign, axis or joint, and steps that stop too early: the true
-    meshes are known, and those of the last timestep are tracked right already."""
+def test_a_finished_avatar_finds_the_head(person: tuple[Avatar, TrainingSettings], lost: Made) -> None:
+    """Catches a gradient or a preconditioner with a wrong sign, axis or joint, steps that stop too early, and a drift
+    of the last timestep, which is tracked right already."""
     capture, true = lost
-    stages: list[tuple[int, int]] = []
-    found = track_by_avatar(*person, capture, report=lambda stage, done, total: stages.append((done, total)))
-    assert capture.flame is not None
-    start = np.stack([capture.flame.frame(t).parameters for t in found.timesteps])
-    before = millimeters(capture, replace(found, parameters=start), true)
-    after = millimeters(capture, found, true)
+    tracking, stages = RefinedTracking(capture, "stga"), list[tuple[int, int]]()
+
+    def report(done: int, total: int) -> bool:
+        stages.append((done, total))
+        return False
+
+    found = track_by_avatar(*person, capture, report=report)
+    tracking.take(found, TIMESTEPS)
+    before, after = millimeters(capture, true), millimeters(tracking.refined(capture), true)
     assert (before[:-1] > 2).all()
     assert np.median(after[:-1] / before[:-1]) < 0.3
     assert after[-1] < 0.8  # a third of a pixel
     assert (found.after <= found.before).all()
-    assert [stages[0], stages[-1]] == [(0, len(TIMESTEPS)), (len(TIMESTEPS),) * 2]
-
-
-def test_another_head(person: Person, lost: tuple[Capture, dict[int, np.ndarray]]) -> None:
-    capture = lost[0]
+    assert stages == [(done, len(TIMESTEPS)) for done in range(len(TIMESTEPS))]
+    with pytest.raises(Cancelled):
+        track_by_avatar(*person, capture, report=lambda done, total: done == 2)
     with pytest.raises(StgaError, match="another head"):
         track_by_avatar(*person, replace(capture, faces=capture.faces[:-1]))
-    with pytest.raises(StgaError, match="is not tracked"):
-        track_by_avatar(*person, replace(capture, flame=None))
+
+
+def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
+    """Catches changes that go to the wrong timesteps where a budget allows only some."""
+    tracking = RefinedTracking(lost[0], "stga")
+    some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
+    tracking.take(AvatarTracking((0, 5), some, np.zeros(2), np.zeros(2)), TIMESTEPS[:-1])
+    np.testing.assert_allclose((tracking.parameters - tracking.tracked)[:, 0], [1, 2, 3, 4, 0])
+
+
+def differences(tracking: RefinedTracking, timestep: int, loss: Callable[[], float], step: float) -> np.ndarray:
+    """(P,) central differences of a loss; step: meters by which vertices move, about."""
+    row, before = tracking.sequence.timesteps.index(timestep), tracking.parameters.copy()
+    sizes = step * np.repeat([250.0, 10.0, 1.0], [2, 15, 3])
+    found = []
+    for number, size in enumerate(sizes):
+        values = []
+        for sign in (1, -1):
+            tracking.parameters = before.copy()
+            tracking.parameters[row, number] += sign * size
+            values.append(loss())
+        found.append((values[0] - values[1]) / (2 * size))
+    tracking.parameters = before
+    return np.array(found)
+
+
+def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
+    """Catches a sign, a transposed rotation, a joint or a component taken for another, and what turns or grows a splat
+    left out: against differences of a made-up loss of where splats are and how they lie."""
+    capture, _ = lost
+    tracking = RefinedTracking(capture, "stga")
+    generator = torch.Generator().manual_seed(0)
+    face = np.random.default_rng(0).integers(0, len(capture.faces), 300)
+    xyz, rotation, log_scale = (
+        torch.randn(len(face), size, generator=generator, dtype=torch.float64) * spread
+        for size, spread in ((3, 0.01), (4, 1.0), (3, 0.5))
+    )
+    toward, along = (torch.randn(len(face), 3, *more, generator=generator, dtype=torch.float64) for more in ((), (3,)))
+
+    def frames() -> FaceFrames:
+        return face_frames(tracking.mesh(3), capture.faces, capture.neutral)
+
+    def loss() -> torch.Tensor:
+        origin, turn, scale = (torch.from_numpy(getattr(frames(), name)[face]) for name in NAMES)
+        w, x, y, z = (rotation / rotation.norm(dim=1, keepdim=True)).unbind(1)
+        own = torch.stack(
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+             2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1
+        ).reshape(-1, 3, 3)  # fmt: skip
+        place = scale[:, None] * (turn @ xyz[..., None])[..., 0] + origin
+        axes = scale[:, None, None] * turn @ own * log_scale.exp()[:, None]
+        return (toward * place).sum() + 0.1 * (along * (axes @ axes.mT)).sum()
+
+    leaves = [tensor.requires_grad_() for tensor in (xyz, rotation, log_scale)]
+    gradients = torch.autograd.grad(loss(), leaves)
+    splats, asked = (Parameters(*(t.detach().numpy() for t in ts), None, None) for ts in (leaves, gradients))
+    parts = frame_gradient(splats, face, asked, np.arange(len(face)), frames())
+    by_vertex = frame_backward(tracking.mesh(3), capture.faces, frames(), *parts)
+    assert capture.flame is not None
+    found = parameters_gradient(with_identity(capture.flame).model, tracking.frame(3), by_vertex)
+    expected = differences(tracking, 3, lambda: loss().item(), 1e-6)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.fixture(scope="module")
+def run_folder(lost: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An unbroken run."""
+    out = tmp_path_factory.mktemp("tracked") / "run"
+    train(lost[0], out, make_run(lost[0]))
+    return out
+
+
+def make_run(capture: Capture, **changes: Any) -> Run:
+    ours = {"iterations": 40, "lattice": 1, "tracking": True, "driven_offsets": ("strain_position",)}
+    settings = quick_settings("global", **{**ours, **changes})
+    return Run(capture.root, capture.root / "model.npz", "vhap", settings)
+
+
+def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
+    """Catches a training that goes on with the meshes of before, and tracking that leads nowhere: meshes come closer to
+    where they should be, and so do pictures of an unseen view."""
+    capture, true = lost
+    quality = {}
+    for on in (True, False):
+        train(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
+        quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
+    before, after = millimeters(capture, true), millimeters(with_refined_tracking(capture, tmp_path / "True"), true)
+    assert np.median(after[:-1] / before[:-1]) < 0.6
+    assert quality[True] > quality[False] + 1.0
+
+
+def test_stopped_and_resumed_is_the_unbroken_run(lost: Made, run_folder: Path, tmp_path: Path) -> None:
+    """Catches anything of the tracking that a step depends on and a checkpoint does not hold."""
+    capture, _ = lost
+    train(capture, tmp_path, make_run(capture), report=lambda progress: progress.iteration >= 31)
+    assert read_checkpoint(tmp_path).rounds == 1
+    train(capture, tmp_path, make_run(capture), resume=True)
+    ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))
+    assert ours.rounds == theirs.rounds == 2
+    np.testing.assert_array_equal(ours.tracking, theirs.tracking)
+    np.testing.assert_array_equal(ours.state.parameters.xyz, theirs.state.parameters.xyz)
+    moved, expected = (checkpoint.state.driven_offsets["strain_position"] for checkpoint in (ours, theirs))
+    assert np.abs(expected.value).max() > 0
+    np.testing.assert_array_equal(moved.value, expected.value)
+
+
+def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_path: Path) -> None:
+    """Catches a run that continues with the tracked meshes after having been trained on refined ones."""
+    run = shutil.copytree(run_folder, tmp_path / "run")
+    with pytest.raises(StgaError, match="was begun with other settings"):
+        train(lost[0], run, make_run(lost[0], tracking=False), resume=True)
+    checkpoint = read_checkpoint(run)
+    checkpoint.tracking = None
+    write_checkpoint(run, checkpoint)
+    with pytest.raises(StgaError, match="its checkpoint's refined tracking does not fit"):
+        train(lost[0], run, make_run(lost[0]), resume=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("parameters", np.zeros(20), "a field is missing or malformed"),
+        ("parameters", np.full((5, 20), np.nan), "tracking/parameters holds a value that is not finite"),
+        ("change", np.zeros(20), r"as version 0\.2\.0 did"),
+    ],
+)
+def test_damaged_checkpoints(run_folder: Path, tmp_path: Path, name: str, value: np.ndarray, says: str) -> None:
+    """Catches an array that training would go on with to nonsense."""
+    arrays = read_npz(run_folder / "checkpoint.npz")
+    if name == "change":
+        del arrays["tracking/parameters"]
+    write_npz(tmp_path / "checkpoint.npz", {**arrays, f"tracking/{name}": value})
+    with pytest.raises(StgaError, match=says):
+        read_checkpoint(tmp_path)
+
+
+def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_folder: Path) -> None:
+    """Catches a quality measured on other meshes than were trained on, and meshes of another capture's timesteps."""
+    capture, _ = lost
+    checkpoint, tracking = read_checkpoint(run_folder), RefinedTracking(capture, "stga")
+    assert checkpoint.tracking is not None
+    tracking.parameters = checkpoint.tracking
+    shown = with_refined_tracking(capture, run_folder)
+    for timestep in TIMESTEPS:
+        np.testing.assert_allclose(shown.mesh(timestep), tracking.mesh(timestep), atol=1e-12)
+        assert np.abs(shown.mesh(timestep) - capture.mesh(timestep)).max() > 1e-4
+    other = with_refined_tracking(right[0], run_folder)
+    np.testing.assert_array_equal(other.mesh(2), right[0].mesh(2))
+    assert with_refined_tracking(capture, run_folder.parent) is capture
+
+
+def test_the_file_is_a_motion(lost: Made, run_folder: Path) -> None:
+    """Catches a file that neither `render --motion` nor Blender's Apply Motion could play."""
+    capture, _ = lost
+    assert capture.flame is not None
+    motion = read_motion(run_folder / "tracking.npz", capture.flame.model)
+    shown = with_refined_tracking(capture, run_folder)
+    assert motion.timesteps == TIMESTEPS
+    for timestep in TIMESTEPS:
+        np.testing.assert_allclose(sequence_mesh(motion, timestep), shown.mesh(timestep), atol=1e-12)
+
+
+def test_commands_use_the_refined_meshes(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Catches a command that opens a run's capture past `refined`."""
+    best = max(line["psnr"] for line in read_metrics(run_folder))
+    assert main(["eval", str(run_folder)]) == 0
+    assert f"PSNR {best:.3f} dB" in capsys.readouterr().out
+    root = read_run(run_folder).capture
+    cameras = ["--cameras", str(root / "transforms_val.json")]
+    assert main(["render", str(run_folder), *cameras, "--out", str(tmp_path / "run")]) == 0
+    avatar = [str(run_folder / "avatar.npz"), "--capture", str(root), "--flame", str(root / "model.npz")]
+    assert main(["render", *avatar, *cameras, "--out", str(tmp_path / "tracked")]) == 0
+    assert "was trained on refined meshes" in caplog.text
+    ours, theirs = (read_bytes(tmp_path / name) for name in ("run", "tracked"))
+    assert ours.keys() == theirs.keys()
+    assert all(ours[name] != theirs[name] for name in ours)
+    motion = ["--motion", str(run_folder / "tracking.npz")]
+    assert main(["render", str(run_folder), *motion, *cameras, "--out", str(tmp_path / "motion")]) == 0
+    for name in ours:
+        played, shown = (np.asarray(Image.open(tmp_path / kind / name)).astype(int) for kind in ("motion", "run"))
+        assert np.abs(played - shown).max() <= 2  # the avatar's neutral mesh is float32
+
+
+def read_bytes(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
+    """Catches a traceback for a file that was written by something else."""
+    arrays = read_npz(run_folder / "tracking.npz")
+    for name, value, says in (
+        ("timesteps", np.arange(2), "timesteps: expected 5 whole numbers"),
+        ("tracked", np.zeros((2, 20)), r"tracked has shape \(2, 20\), expected 5 timesteps first"),
+    ):
+        write_npz(tmp_path / "tracking.npz", {**arrays, name: value})
+        with pytest.raises(StgaError, match=rf"tracking\.npz: {says}"):
+            with_refined_tracking(lost[0], tmp_path)
+
+
+def test_a_run_that_refines_nothing_leaves_nothing(lost: Made, run_folder: Path, tmp_path: Path) -> None:
+    """Catches a file of the run that was there before, which the new one's avatar would be shown with."""
+    shutil.copy(run_folder / "tracking.npz", tmp_path)
+    train(lost[0], tmp_path, make_run(lost[0], tracking=False, iterations=3))
+    assert not (tmp_path / "tracking.npz").exists()
+
+
+def test_where_it_cannot_work(
+    toy: Capture,
+    lost: Made,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a traceback where there are no parameters, and a GPU that trains on while nothing is refined."""
+    with pytest.raises(StgaError, match="is not tracked with FLAME"):
+        Trainer(toy, quick_settings("global", tracking=True), {})
+    with pytest.raises(StgaError, match="needs the embedding convention 'stga'"):
+        Trainer(lost[0], quick_settings("gaussian-avatars", tracking=True), {})
+    with pytest.raises(StgaError, match=r"effect tracking=on: .* on the CPU only, not on gpu"):
+        Trainer(lost[0], quick_settings("global", tracking=True), {}, device="gpu")
+    monkeypatch.setattr("stga_addon.perform.training.choose_device", lambda wanted: ("gpu:Card", "why"))
+    root = lost[0].root
+    train_on = ["train", str(root), "--flame", str(root / "model.npz"), "--device", "gpu", "--iterations", "2"]
+    assert main([*train_on, "--out", str(tmp_path / "run"), "--effect", "tracking=on"]) == 2
+    assert "FLAME's parameters are refined on the CPU only" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -21,7 +21,6 @@ class Batch:
     selected    (F,) bool triangles whose splats are trained; None trains all
     rates       learning rate by parameter name, and "sh_rest"
     accumulate  whether screen gradients are summed for density control
-    refinement_rate  share of the full learning rates for the timestep's FLAME parameters; 0 leaves them unchanged
     """
 
     view: View
@@ -32,7 +31,6 @@ class Batch:
     selected: np.ndarray | None
     rates: Mapping[str, float]
     accumulate: bool = True
-    refinement_rate: float = 0.0
 
 
 class Backend(Protocol):

@@ -13,7 +13,6 @@ from ...raster.cpu.threads import threads
 from ..settings import TrainingSettings
 from . import adam, driven_offsets
 from .backend import Batch
-from .flame_refinement import Tracking, frame_gradient
 from .frames import FrameStore
 from .losses import image_gradient, tile_rectangles, whole_image
 from .state import TrainState
@@ -39,8 +38,6 @@ class CpuBackend:
         rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
         epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
         self._step_offsets(batch, rows, epsilon)
-        if batch.refinement_rate:
-            self._refine_tracking(batch, rows)
         self._add_limit_gradients(rows)
         adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
         if batch.accumulate:
@@ -106,30 +103,16 @@ class CpuBackend:
         """The image loss of a view, and its gradient (V, 3) with respect to the timestep's mesh; nothing is stepped."""
         rows, _, loss = self._backward(view, target, background, sh_degree, None)
         assert loss is not None
-        return loss, self._vertex_gradient(view.timestep, rows)
-
-    def _vertex_gradient(self, timestep: int, rows: np.ndarray) -> np.ndarray:
-        """(V, 3) gradient with respect to the timestep's mesh, from the splats' gradients."""
         store, state = self._frames, self.state
-        frames, splats, face = store.of(timestep), state.parameters, state.face
+        frames, splats, face = store.of(view.timestep), state.parameters, state.face
         for name, offset in state.driven_offsets.items():
-            shift = offset_of(offset.value, store.signals(timestep)(name))
+            shift = offset_of(offset.value, store.signals(view.timestep)(name))
             splats = splats._replace(xyz=splats.xyz + shift[face])
-        gradients_of_frames = frame_gradient(splats, face, state.gradients, rows, frames)
-        return frame_backward(store.mesh(timestep), store.capture.faces, frames, *gradients_of_frames)
-
-    def _refine_tracking(self, batch: Batch, rows: np.ndarray) -> None:
-        """Step the timestep's FLAME parameters along the gradient of the loss."""
-        store, timestep = self._frames, batch.view.timestep
-        assert isinstance(store.tracking, Tracking)
-        store.tracking.step(timestep, self._vertex_gradient(timestep, rows), batch.refinement_rate)
-        store.clear()
+        by_frame = frame_gradient(splats, face, state.gradients, rows, frames)
+        return loss, frame_backward(store.mesh(view.timestep), store.capture.faces, frames, *by_frame)
 
     def _step_offsets(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:
-        """Step the driven offsets.
-
-        Before the mesh is refined, whose signals the gradient is of, and before the limits' gradients are added.
-        """
+        """Step the driven offsets, before the limits' gradients are added."""
         state = self.state
         driven_offsets.step(
             state.driven_offsets, rows, state.face, state.gradients.xyz,
@@ -150,3 +133,24 @@ class CpuBackend:
             limit = np.float32(settings.distance_limit) * self._frames.units
             weight, gradient = settings.distance_weight, state.gradients.xyz
             distance_limit(rows, state.parameters.xyz, face, unbound, limit, weight, gradient)
+
+
+def frame_gradient(
+    splats: Parameters, face: np.ndarray, gradients: Parameters, rows: np.ndarray, frames: FaceFrames
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients of the face frames from those of their splats `rows` (M,), as `frame_backward` takes them.
+
+    Returns those of translation (F, 3), rotation (F, 3) and scale (F,). A frame translates, rotates and scales all its
+    splats alike, so each is a sum over its splats.
+    """
+    (x, y, z), (fx, fy, fz) = splats.xyz[rows].T, gradients.xyz[rows].T
+    (q0, q1, q2, q3), (v0, v1, v2, v3) = splats.rotation[rows].T, gradients.rotation[rows].T
+    rotation = (  # of position (cross product), plus of orientation (half of the quaternion's gradient)
+        y * fz - z * fy + (q0 * v1 - q1 * v0 + q2 * v3 - q3 * v2) / 2,
+        z * fx - x * fz + (q0 * v2 - q2 * v0 + q3 * v1 - q1 * v3) / 2,
+        x * fy - y * fx + (q0 * v3 - q3 * v0 + q1 * v2 - q2 * v1) / 2,
+    )
+    scale = x * fx + y * fy + z * fz + gradients.log_scale[rows].sum(1)
+    on, count = face[rows], len(frames.origin)
+    sums = [np.bincount(on, column, count) for column in (fx, fy, fz, *rotation, scale)]
+    return np.stack(sums[:3], -1) / frames.scale[:, None], np.stack(sums[3:6], -1), sums[6]

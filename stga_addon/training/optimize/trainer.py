@@ -10,9 +10,9 @@ from ...errors import StgaError
 from ...render.device import adapter_name
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
+from .avatar_tracking import RefinedTracking
 from .backend import Backend, Batch
 from .cpu_backend import CpuBackend
-from .flame_refinement import RefinementState, refinable_tracking, refinement_rate
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .outlines import Outline, read_outlines
@@ -43,7 +43,7 @@ class Trainer:
         """
         self.capture, self.settings = capture, settings
         self.strategy = make_strategy(settings, selection)
-        self.tracking = refinable_tracking(capture, settings.convention) if settings.tracking else None
+        self.tracking = RefinedTracking(capture, settings.convention) if settings.tracking else None
         self.frames = FrameStore(capture, settings.convention, settings.follows_strain, self.tracking, strain_range)
         self.iteration, self.visit = 0, -1
         self.last_timestep: int | None = None
@@ -74,13 +74,10 @@ class Trainer:
         visit: int,
         last_timestep: int | None,
         initial_count: int,
-        tracking: RefinementState | None,
     ) -> None:
         """Restore, beside the state given at construction, everything that the next step depends on."""
         self.iteration, self.visit = iteration, visit
         self.last_timestep, self.initial_count = last_timestep, initial_count
-        if self.tracking is not None and tracking is not None:
-            self.tracking.state = tracking
 
     def step(
         self,
@@ -121,7 +118,6 @@ class Trainer:
                 selected=selected,
                 rates=learning_rates(settings.rates, progress),
                 accumulate=selected is None or self.strategy.region is not None,
-                refinement_rate=refinement_rate(progress) if self.tracking is not None and selected is None else 0.0,
             )
         )
         self.iteration += 1

@@ -15,12 +15,11 @@ from ...avatar.offsets.table import OFFSETS
 from ...avatar.splats import ARRAYS
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
-from ..optimize.flame_refinement import RefinementState
 from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from .folder import CHECKPOINT, SELECTION
 
 VERSION = 3
-REFINEMENT, IDENTITY = "tracking/", "identity"
+TRACKING, IDENTITY = "tracking/parameters", "identity"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
 OTHER_RUN = "belongs to another run than run.json beside it; remove it, or train into another folder"
@@ -34,7 +33,8 @@ class Checkpoint:
     best_difference  of avatar.npz (`Quality.detail_difference`); ∞ before the first evaluation
     losses     of the last global iterations
     identity   digest of the run's identity
-    tracking   of refined FLAME parameters; None where they are not refined
+    tracking   (T, P) float64 `RefinedTracking.parameters`; None where they are not refined
+    rounds     in which they were
     """
 
     state: TrainState
@@ -46,7 +46,8 @@ class Checkpoint:
     best_difference: float
     evaluations: int
     losses: list[float]
-    tracking: RefinementState | None = None
+    tracking: np.ndarray | None = None
+    rounds: int = 0
     identity: str = ""
 
 
@@ -74,9 +75,10 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
     arrays = {k: array for k, array in arrays_of(checkpoint.state).items() if not k.startswith("gradients/")}
-    parts = {f"{name}/": offset for name, offset in checkpoint.state.driven_offsets.items()}
-    for prefix, part in {**parts, REFINEMENT: checkpoint.tracking}.items():
-        arrays.update({prefix + name: array for name, array in (vars(part) if part is not None else {}).items()})
+    for effect, offset in checkpoint.state.driven_offsets.items():
+        arrays.update({f"{effect}/{name}": array for name, array in vars(offset).items()})
+    if checkpoint.tracking is not None:
+        arrays[TRACKING] = checkpoint.tracking
     values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
     arrays["meta"] = _packed(json.dumps({"version": VERSION, **values}))
     write_npz(folder / CHECKPOINT, arrays)
@@ -90,7 +92,12 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         meta = _meta(arrays.pop("meta"))
         if meta.pop("version") != VERSION:
             raise StgaError(f"{path}: was written by another version")
-        refinement = _refinement(path, arrays)
+        tracking = arrays.pop(TRACKING, None)
+        if tracking is not None:
+            timesteps, parameters = tracking.shape
+            check_array(path, TRACKING, tracking, "float64", (timesteps, parameters))
+        elif _taken(arrays, "tracking/"):
+            raise StgaError(f"{path}: refines the tracking as version 0.2.0 did; train into another folder")
         offsets = {name: offset for name in OFFSETS if (offset := _offset(path, arrays, name)) is not None}
         if any(array.ndim == 0 for array in arrays.values()):
             raise StgaError(f"{path}: an array has no rows")
@@ -99,7 +106,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         state = state_of({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         _check_state(path, state)
         state.driven_offsets = offsets
-        return Checkpoint(state=state, tracking=refinement, **meta)
+        return Checkpoint(state=state, tracking=tracking, **meta)
     except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise StgaError(f"{path}: a field is missing or malformed ({error!s:.200})") from error
 
@@ -113,7 +120,8 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
     meta = json.loads(packed.tobytes())
     if not isinstance(meta, dict):
         raise ValueError("meta is no object")
-    lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0}
+    meta.setdefault("rounds", 0)
+    lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0, "rounds": 0}
     for name, low in lowest.items():
         if type(meta.get(name)) is not int or not low <= meta[name] < MAX_COUNT:
             raise ValueError(f"{name} is {shorten(meta.get(name))}, expected a whole number from {low} up")
@@ -146,21 +154,6 @@ def _check_state(path: Path, state: TrainState) -> None:
     whole = {"steps": "int32", "face": "int32", "unbound": "bool"}
     for name, array in arrays_of(state).items():
         check_array(path, name, array, whole.get(name, "float32"), (n, *tails.get(name.rpartition("/")[2], ())))
-
-
-def _refinement(path: Path, arrays: dict[str, np.ndarray]) -> RefinementState | None:
-    """Taken out of a checkpoint's arrays, None where there is none. Raises StgaError naming an array that is wrong."""
-    taken = _taken(arrays, REFINEMENT)
-    if not taken:
-        return None
-    found = RefinementState(**taken)
-    whole = found.change.shape
-    if len(whole) != 2:
-        raise StgaError(f"{path}: {REFINEMENT}change has shape {whole}, expected (timesteps, numbers)")
-    shapes = {"change": whole, "first": whole, "second": whole[1:], "steps": whole[:1]}
-    for name, array in taken.items():
-        check_array(path, REFINEMENT + name, array, "int64" if name == "steps" else "float64", shapes[name])
-    return found
 
 
 def _offset(path: Path, arrays: dict[str, np.ndarray], name: str) -> OffsetState | None:

@@ -5,7 +5,7 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -130,6 +130,8 @@ class _Loop:
             if self.session.run.continuation is not None and not self.evaluator.lines:
                 self._evaluate()  # the avatar before, which the others are compared with
             self._train(interrupts)
+            if self._is_finished():
+                self.session.track_unseen(self._tracks(interrupts))
             self._evaluate(perceptual=self._is_finished())  # LPIPS takes long, so a run that is stopped goes without
             self.session.write_checkpoint(self.evaluator)
             if self._is_finished():
@@ -156,6 +158,8 @@ class _Loop:
         with session.loader() as loader:
             while not session.spent().share >= 1:
                 session.step(loader, perf_counter)
+                if session.tracking_is_due and not session.track(perf_counter, self._tracks(interrupts)):
+                    break
                 if self.evaluator.is_due(session.spent()):
                     self._evaluate()
                     if self._is_finished():
@@ -166,6 +170,12 @@ class _Loop:
                 self.speed = (session.trainer.iteration - first) / max(session.elapsed_s - started, 1e-9)
                 if self.report(self._progress("Training")) or interrupts:
                     break
+
+    def _tracks(self, interrupts: list[int]) -> Callable[[int, int], bool]:
+        """What tracking by the avatar reports to."""
+        return lambda done, total: (
+            self.report(self._progress(f"Tracking by the avatar: {done} of {total}")) or bool(interrupts)
+        )
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Evaluate, keep the avatar where that says so, and append a line of metrics."""

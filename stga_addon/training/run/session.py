@@ -16,12 +16,14 @@ from ...capture.loader import ViewLoader
 from ...capture.model import Capture, ViewExposure, evenly_spread
 from ...errors import StgaError
 from ...files import replacing
+from ...progress import Cancelled
 from ...schema import to_json
 from ...selection import select_capture
 from ..evaluate.evaluation_views import EvaluationView, choose_evaluation_views, read_evaluation_view
 from ..evaluate.evaluator import Evaluation, Evaluator, Spent
 from ..evaluate.match_exposure import known_exposure
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
+from ..optimize.avatar_tracking import track_by_avatar
 from ..optimize.image_preparation import image_preparation
 from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
@@ -37,6 +39,8 @@ from .residual_file import write_residuals
 from .strain_range import STRAIN_RANGE, require_color_range, strain_range_of, trained_strain_range
 from .tracking_file import TRACKING, with_refined_tracking, write_tracking
 
+TRACKING_START_SHARE, TRACKING_TIME_SHARE = 0.5, 0.2
+"""Of the budget, after which the avatar tracks its head; and of a budget in seconds, what that may take."""
 RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
 RESIDUAL_VIEWS = 24
@@ -99,6 +103,48 @@ class Session:
         if loss is not None:
             self.losses.append(loss)
 
+    @property
+    def tracking_is_due(self) -> bool:
+        """Whether the avatar is to track the training's timesteps now."""
+        tracking = self.trainer.tracking
+        return tracking is not None and not tracking.rounds and self.spent().share >= TRACKING_START_SHARE
+
+    def track(self, clock: Callable[[], float], report: Callable[[int, int], bool]) -> bool:
+        """Track the training's timesteps by the avatar; returns False where the report said to stop."""
+        tracking, begin, seconds = self.trainer.tracking, clock(), self.settings.seconds
+        assert tracking is not None
+        done = self._tracked(
+            sorted({view.timestep for view in self.capture.views["train"]}),
+            None if seconds is None else TRACKING_TIME_SHARE * seconds,
+            report,
+        )
+        tracking.rounds += done
+        self.elapsed_s += clock() - begin
+        return done
+
+    def track_unseen(self, report: Callable[[int, int], bool]) -> None:
+        """Track the timesteps of other splits by the avatar, whose splats they do not change."""
+        tracking, seconds = self.trainer.tracking, self.settings.seconds
+        views = self.capture.views
+        seen = {view.timestep for view in views["train"]}
+        unseen = sorted({view.timestep for own in views.values() for view in own} - seen)
+        if tracking is not None and tracking.rounds == 1 and unseen:
+            self._tracked(unseen, None if seconds is None else TRACKING_TIME_SHARE * seconds, report)
+            tracking.rounds += 1
+
+    def _tracked(self, timesteps: list[int], seconds: float | None, report: Callable[[int, int], bool]) -> bool:
+        tracking = self.trainer.tracking
+        assert tracking is not None
+        try:
+            found = track_by_avatar(
+                self.avatar(), self.settings, tracking.refined(self.capture), timesteps, seconds, report
+            )
+        except Cancelled:
+            return False
+        tracking.take(found, timesteps)
+        self.trainer.frames.clear()
+        return True
+
     def evaluate(self, evaluator: Evaluator, perceptual: bool) -> Evaluation:
         """Evaluate the avatar as it would be written now."""
         share, refines = min(1.0, self.spent().share), self.trainer.tracking is not None
@@ -147,7 +193,7 @@ class Session:
         write_avatar(self.folder / AVATAR, self.avatar())
         refined = self.trainer.tracking
         if refined is not None:
-            write_tracking(self.folder, refined.sequence, refined.parameters(), refined.tracked)
+            write_tracking(self.folder, refined.sequence, refined.parameters, refined.tracked)
 
     def write_checkpoint(self, evaluator: Evaluator) -> None:
         trainer = self.trainer
@@ -156,7 +202,8 @@ class Session:
         checkpoint = Checkpoint(
             trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
             self.elapsed_s, evaluator.best_difference, evaluator.count, list(self.losses),
-            None if trainer.tracking is None else trainer.tracking.state, self.run.identity.digest,
+            None if trainer.tracking is None else trainer.tracking.parameters,
+            0 if trainer.tracking is None else trainer.tracking.rounds, self.run.identity.digest,
         )  # fmt: skip
         write_checkpoint(self.folder, checkpoint)
 
@@ -241,11 +288,11 @@ def resume_session(capture: Capture, folder: Path, run: Run, report: Report) -> 
 
 def _restore(folder: Path, trainer: Trainer, checkpoint: Checkpoint) -> None:
     here, there = trainer.tracking, checkpoint.tracking
-    if (None if here is None else here.tracked.shape) != (None if there is None else there.change.shape):
+    if (None if here is None else here.tracked.shape) != (None if there is None else there.shape):
         raise StgaError(f"{folder}: its checkpoint's refined tracking does not fit the capture or the settings")
-    trainer.restore(
-        checkpoint.iteration, checkpoint.visit, checkpoint.last_timestep, checkpoint.initial_count, checkpoint.tracking
-    )
+    trainer.restore(checkpoint.iteration, checkpoint.visit, checkpoint.last_timestep, checkpoint.initial_count)
+    if here is not None and there is not None:
+        here.parameters, here.rounds = there, checkpoint.rounds
 
 
 def _strain_range(folder: Path, capture: Capture, run: Run, report: Report) -> np.ndarray | None:

@@ -6,35 +6,41 @@ which the Gauss-Newton matrix of points of the surface is the identity, so that 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from time import perf_counter
 
 import numpy as np
 
-from ..avatar.file import Avatar
-from ..capture.images import read_view
-from ..capture.mesh_geometry import vertex_normals
-from ..capture.model import Capture, View
-from ..errors import StgaError
-from ..flame.forward import RIGID_SIZE, TRANSLATION_SIZE, flame_forward, frame_of, parameters_gradient
-from ..flame.sequence import FlameSequence, with_identity
-from ..tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
-from ..tracking.dense_terms import POINT_SHARE, inside, projection_derivative
-from ..tracking.head_model import HeadModel
-from ..tracking.photo_consistency import facing, in_sight
-from ..tracking.posed_points import PosedPoints
-from ..tracking.seen_surface import surface_points
-from ..tracking.solve import WEIGHT_EXCESS_SIGMA, parameter_precision
-from .optimize.cpu_backend import CpuBackend
-from .optimize.frames import FrameStore
-from .optimize.image_preparation import image_preparation
-from .optimize.state import new_offset, new_state
-from .schedule import sh_degree
-from .settings import TrainingSettings
+from ...avatar.file import Avatar
+from ...capture.flame_capture import with_sequence
+from ...capture.images import read_view
+from ...capture.mesh_geometry import vertex_normals
+from ...capture.model import Capture, View, evenly_spread
+from ...errors import StgaError
+from ...flame.forward import RIGID_SIZE, TRANSLATION_SIZE, FlameFrame, flame_forward, frame_of, parameters_gradient
+from ...flame.sequence import FlameSequence, sequence_mesh, with_identity
+from ...progress import Cancelled
+from ...tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
+from ...tracking.dense_terms import POINT_SHARE, inside, projection_derivative
+from ...tracking.head_model import HeadModel
+from ...tracking.photo_consistency import facing, in_sight
+from ...tracking.posed_points import PosedPoints
+from ...tracking.seen_surface import surface_points
+from ...tracking.solve import WEIGHT_EXCESS_SIGMA, parameter_precision
+from ..schedule import sh_degree
+from ..settings import TrainingSettings
+from .cpu_backend import CpuBackend
+from .frames import FrameStore
+from .image_preparation import image_preparation
+from .state import new_offset, new_state
 
-RENDERINGS = 9
+RENDERINGS = 6
 """Of each view of a timestep: more of them hardly lower the loss."""
-MAX_HEIGHT_PX = 802
-"""Images higher than this are shrunk to it."""
+MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
+"""Cameras, spread over the rig, whose images are compared; images higher than this are shrunk to it."""
+CACHED_TIMESTEPS = 12
+"""FLAME frames kept in memory, with their dynamic offsets."""
 POINTS, MIN_COSINE, VISIBILITY_SIDE_PX = 6000, 0.15, 160
 """Points of the surface; of the angle between normal and camera, below which one does not count; size of the depth
 image that hidden ones are found in."""
@@ -54,25 +60,77 @@ class AvatarTracking:
     after: np.ndarray
 
 
+class RefinedTracking:
+    """The motion of a head that its avatar tracks while it is trained: meshes in place of the capture's.
+
+    tracked     (T, P) the capture's parameters
+    parameters  (T, P) those of now
+    rounds      how often the avatar has tracked
+    """
+
+    def __init__(self, capture: Capture, convention: str) -> None:
+        """Raises StgaError where the capture has no parameters, or for an embedding convention without gradients."""
+        if convention != "stga":
+            raise StgaError(f"--effect tracking=on: needs the embedding convention 'stga', got '{convention}'")
+        if capture.flame is None:
+            raise StgaError(
+                f"{capture.root}: is not tracked with FLAME, so --effect tracking=on cannot refine its parameters"
+            )
+        self.sequence = capture.flame
+        self.tracked = np.stack([self.sequence.frame(timestep).parameters for timestep in self.sequence.timesteps])
+        self.parameters, self.rounds = self.tracked.copy(), 0
+        self._row = {timestep: row for row, timestep in enumerate(self.sequence.timesteps)}
+        self._source = lru_cache(CACHED_TIMESTEPS)(self.sequence.frame)
+        self._person = replace(with_identity(self.sequence), frame=self.frame)
+
+    def refines(self, timestep: int) -> bool:
+        return timestep in self._row
+
+    def frame(self, timestep: int) -> FlameFrame:
+        return frame_of(self.parameters[self._row[timestep]], self._source(timestep).dynamic_offset)
+
+    def mesh(self, timestep: int) -> np.ndarray:
+        """(V, 3) meters."""
+        return sequence_mesh(self._person, timestep)
+
+    def refined(self, capture: Capture) -> Capture:
+        """The capture with the parameters of now."""
+        return with_sequence(capture, replace(self.sequence, frame=self.frame))
+
+    def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> None:
+        """Give some timesteps what was found: those in between that were left out change as their neighbors do."""
+        rows, at = ([self._row[timestep] for timestep in own] for own in (timesteps, found.timesteps))
+        change = found.parameters - self.parameters[at]
+        between = [np.interp(rows, at, column) for column in change.T]
+        self.parameters = self.parameters.copy()
+        self.parameters[rows] += np.stack(between, axis=1)
+
+
 def track_by_avatar(
     avatar: Avatar,
     settings: TrainingSettings,
     capture: Capture,
     timesteps: Sequence[int] | None = None,
-    report: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    seconds: float | None = None,
+    report: Callable[[int, int], bool] = lambda done, total: False,
 ) -> AvatarTracking:
     """Refine the parameters of a tracked capture of the avatar's person, from where they are.
 
-    settings: with which the avatar was trained, whose background and exposures the images have. timesteps: None: all.
-    Raises StgaError where the capture is not tracked with FLAME or the bundled head, or is of another head.
+    settings: with which the avatar was trained, whose background and exposures the images have. timesteps: None: all;
+    as many of them, evenly spread, as `seconds` allow. report: how many are done; returns whether to stop.
+    Raises StgaError where the capture has no parameters or is of another head, and Cancelled.
     """
-    tracker = _Tracker(avatar, settings, capture)
-    chosen = capture.timesteps if timesteps is None else tuple(timesteps)
-    found = []
-    for number, timestep in enumerate(chosen):
-        report("Tracking by the avatar", number, len(chosen))
-        found.append(tracker.solve(timestep))
-    report("Tracking by the avatar", len(chosen), len(chosen))
+    tracker, found = _Tracker(avatar, settings, capture), []
+    chosen, begin = list(capture.timesteps if timesteps is None else timesteps), perf_counter()
+    number = 0
+    while number < len(chosen):
+        if report(number, len(chosen)):
+            raise Cancelled
+        found.append(tracker.solve(chosen[number]))
+        number += 1
+        if number == 1 and seconds is not None:
+            most = int(seconds / (perf_counter() - begin))
+            chosen = sorted({chosen[0], *evenly_spread(chosen, max(2, most))})
     parameters, before, after = zip(*found, strict=True)
     return AvatarTracking(tuple(chosen), np.stack(parameters), np.array(before), np.array(after))
 
@@ -97,8 +155,6 @@ class _Tracker:
         sequence = capture.flame
         if sequence is None:
             raise StgaError(f"{capture.root}: is not tracked with FLAME or the bundled head")
-        if settings.convention != "stga":
-            raise StgaError(f"{settings.convention}: only avatars of the convention 'stga' can track")
         if not np.array_equal(avatar.faces, capture.faces):
             raise StgaError(f"{capture.root}: is of another head than the avatar")
         self._capture, self._settings, self._sequence = capture, settings, sequence
@@ -123,7 +179,7 @@ class _Tracker:
         from scipy.optimize import minimize
 
         tracked = self._sequence.frame(timestep).parameters
-        shots = [self._read(view) for view in self._views.get(timestep, ())]
+        shots = [self._read(view) for view in evenly_spread(self._views.get(timestep, []), MAX_VIEWS)]
         if not shots:
             return tracked, 0.0, 0.0
         precision = self._precision()
