@@ -12,14 +12,17 @@ from ..requests.values import Evaluate
 from ..training.evaluate.lpips import MIN_SIDE_PX
 from ..training.evaluate.metrics import Quality, evaluate_avatar, psnr_recorded
 from ..training.run.folder import AVATAR, WORLD_FILE
-from ..training.run.open_run import open_refined
+from ..training.run.open_run import open_run
+from ..training.run.tracking_file import with_refined_tracking
 
 
 def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
-    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder. Raises StgaError."""
+    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder; of timesteps without training views, also
+    with the heads as they were before the avatar tracked them. Raises StgaError."""
     folder, split = request.run, request.split
     report(Progress(stage="Evaluating"))
-    capture = open_refined(folder, request.capture, request.flame)
+    tracked = open_run(folder, request.capture, request.flame).capture
+    capture = with_refined_tracking(tracked, folder)
     views = capture.views.get(split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")
@@ -30,7 +33,12 @@ def evaluate_run(request: Evaluate, report: Report, say: Say) -> Written:
         quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})
-    return Written(path, (f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)))
+    lines = [f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)]
+    unseen = {view.timestep for view in views} - {view.timestep for view in capture.views.get("train", ())}
+    if unseen and capture is not tracked:
+        before = _describe(evaluate_avatar(avatar, tracked, split))
+        lines.insert(1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}")
+    return Written(path, tuple(lines))
 
 
 def _details(quality: Quality) -> list[str]:

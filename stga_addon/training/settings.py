@@ -104,7 +104,7 @@ class TrainingSettings:
     torso          hull points below the neck follow FLAME's root joint, not the head's nearest triangle
     exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
                    images, which are corrected when they are read; where it drifts, several rows with their timestep
-    tracking       refine FLAME's expression, joints and translation of each training timestep (`tracking`)
+    tracking       whether the avatar tracks its own head halfway (`RefinedTracking`)
     effects        effect -> "on" or "off" where the user has decided; the others are decided from the capture
                    (`effects.plan`). None: these settings are final
     """

@@ -13,6 +13,7 @@ from capture.factory import ball, flame_parameters, write_flame_capture, write_m
 from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
 from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
+from stga_addon.capture.model import Capture  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.export.ply import read_ply  # noqa: E402
 from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
@@ -20,7 +21,7 @@ from stga_addon.flame.sequence import read_motion  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
-from stga_addon.training.optimize.flame_refinement import Tracking  # noqa: E402
+from stga_addon.training.optimize.avatar_tracking import RefinedTracking  # noqa: E402
 from stga_addon.training.run.tracking_file import with_refined_tracking, write_tracking  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -87,13 +88,18 @@ def test_a_file_from_a_start_frame(scene):
     assert bpy.context.scene.frame_end == 14
 
 
+def write_refined(folder: Path, capture: Capture, rng: np.random.Generator) -> None:
+    """A run's file, whose parameters are disturbed."""
+    tracking = RefinedTracking(capture, "stga")
+    refined = tracking.tracked + rng.normal(0, 0.05, tracking.tracked.shape)
+    write_tracking(folder, tracking.sequence, refined, tracking.tracked)
+
+
 def test_a_runs_refined_tracking(scene, tmp_path):
     """Catches a head that does not get to where its avatar was trained: timesteps 0, 1 and 3, refined."""
-    tracking = Tracking(scene.own, scene.own.timesteps)
-    tracking.state.steps[:] = 1
-    tracking.state.change[:] = np.random.default_rng(0).normal(0, 0.05, tracking.tracked.shape)
-    write_tracking(tmp_path, tracking.sequence, tracking.parameters(), tracking.tracked)
-    shown = with_refined_tracking(open_capture(scene.folder, scene.model_file), tmp_path)
+    capture = open_capture(scene.folder, scene.model_file)
+    write_refined(tmp_path, capture, np.random.default_rng(0))
+    shown = with_refined_tracking(capture, tmp_path)
     assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3
     assert bpy.ops.stga.apply_motion(filepath=str(tmp_path / "tracking.npz"), start=0) == {"FINISHED"}
     for timestep in scene.own.timesteps:
@@ -110,10 +116,7 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
         np.savez(path, **np.load(path), dynamic_offset=offset)
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
     own = open_capture(folder, model)
-    tracking = Tracking(own.flame, own.flame.timesteps)
-    tracking.state.steps[:] = 1
-    tracking.state.change[:] = rng.normal(0, 0.05, tracking.tracked.shape)
-    write_tracking(tmp_path, tracking.sequence, tracking.parameters(), tracking.tracked)
+    write_refined(tmp_path, own, rng)
     shown = with_refined_tracking(own, tmp_path)
     path = str(tmp_path / "tracking.npz")
     bpy.ops.stga.apply_motion(filepath=path, start=0, place=place)

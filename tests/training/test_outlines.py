@@ -47,7 +47,7 @@ def splats_after_a_turn(capture: Capture, needle: list[float], masks: bool = Tru
     top = int(capture.neutral[capture.faces].mean(1)[:, 1].argmax())
     place(trainer, int(np.flatnonzero(trainer.state.face == top)[0]), needle)
     count = len(trainer)
-    trainer.restore(199, 0, None, count, None)
+    trainer.restore(199, 0, None, count)
     view = capture.views["train"][0]
     trainer.step(view, read_image(view), 0.5)
     return count, len(trainer)
