@@ -83,8 +83,8 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     those that only later timesteps show or, without any, of all. Gray if no view shows any.
     """
     first = views[0].timestep
-    color, seen = _mean_colors(capture, [view for view in views if view.timestep == first])
-    late_color, late = _mean_colors(capture, _later_views([view for view in views if view.timestep != first]))
+    color, seen = mean_colors(capture, [view for view in views if view.timestep == first])
+    late_color, late = mean_colors(capture, _later_views([view for view in views if view.timestep != first]))
     late &= ~seen
     color[late] = late_color[late]
     shown = seen | late
@@ -106,7 +106,7 @@ def _later_views(views: Sequence[View]) -> list[View]:
     return chosen
 
 
-def _mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """Mean color (F, 3) from 0 to 1 of each triangle in the views, and (F,) bool whether any shows it."""
     total, count = np.zeros((len(capture.faces), 3)), np.zeros(len(capture.faces))
     for view in views:
@@ -123,20 +123,24 @@ def _mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, n
 
 
 def _other_side(capture: Capture, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles that are not `shown` (F,) bool but whose mirror images are, and these; none where they are few, or the
-    mesh is not symmetric."""
-    none = np.zeros(0, int)
+    """`mirror_images` of the triangles that are not `shown` (F,) bool; none where they are few."""
+    hidden, partner = mirror_images(capture, ~shown, shown)
     corners = capture.neutral[capture.faces]
-    centers, edges = corners.mean(1), corners[:, 1:] - corners[:, :1]
-    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    few = area[hidden].sum() < MIN_ONE_SIDED_SHARE * area.sum()
+    return (hidden[:0], partner[:0]) if few else (hidden, partner)
+
+
+def mirror_images(capture: Capture, hidden: np.ndarray, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles that are `hidden` (F,) bool and whose mirror images are `shown`, and these; none where the mesh is not
+    symmetric."""
+    centers = capture.neutral[capture.faces].mean(1)
     across = centers * [-1, 1, 1] + [2 * centers[:, 0].mean(), 0, 0]
     distance, partner = cKDTree(centers).query(across)
-    hidden = np.flatnonzero(~shown & shown[partner])
+    rows = np.flatnonzero(hidden & shown[partner])
     if np.median(distance) > MAX_ASYMMETRY_SHARE * np.linalg.norm(np.ptp(capture.neutral, axis=0)):
-        return none, none
-    if area[hidden].sum() < MIN_ONE_SIDED_SHARE * area.sum():
-        return none, none
-    return hidden, partner[hidden]
+        rows = rows[:0]
+    return rows, partner[rows]
 
 
 def _nearest_shown(capture: Capture, shown: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -12,14 +12,15 @@ from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .frames import FrameStore
 from .outlines import Outline, prune_outside
 from .state import TrainState
+from .unseen_sides import UnseenSides
 
 EXTEND_LOCAL_SHARE = 0.5
 """Share of an extension's budget that trains what the new takes need, before all splats are trained."""
 MAX_REGION_SPLIT_SHARE = 0.1
 """Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""
 
-OUTLINE_INTERVAL = 200
-"""Iterations between turns of `OutlineControl`."""
+OUTLINE_INTERVAL, SIDE_INTERVAL = 200, 100
+"""Iterations between turns of `OutlineControl` and `SideReset`."""
 
 
 class Strategy(Protocol):
@@ -178,6 +179,20 @@ class OutlineControl:
         coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
         frames = partial(self.frames.moved, coefficients=coefficients)
         return prune_outside(state, frames, self.outlines(), self.region)
+
+
+@dataclass(frozen=True)
+class SideReset:
+    """Gives splats on sides that the only camera never shows their color back."""
+
+    sides: Callable[[], UnseenSides]
+    applies: bool
+
+    def is_due(self, iteration: int, progress: float) -> bool:
+        return self.applies and _at_interval(iteration, SIDE_INTERVAL)
+
+    def apply(self, state: TrainState, iteration: int) -> TrainState:
+        return self.sides().restore(state)
 
 
 def _at_interval(iteration: int, interval: int) -> bool:

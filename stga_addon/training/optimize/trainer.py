@@ -17,7 +17,8 @@ from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .outlines import Outline, read_outlines
 from .state import TrainState, new_state, with_offsets
-from .strategies import DensityControl, OutlineControl, PostStep, StrayReset, make_strategy
+from .strategies import DensityControl, OutlineControl, PostStep, SideReset, StrayReset, make_strategy
+from .unseen_sides import UnseenSides, unseen_sides
 
 
 class Trainer:
@@ -132,11 +133,20 @@ class Trainer:
     def _outlines(self) -> list[Outline]:
         return read_outlines(self.capture, self.settings.seed)
 
+    @cached_property
+    def _sides(self) -> UnseenSides:
+        return unseen_sides(self.capture)
+
+    @cached_property
+    def _has_one_camera(self) -> bool:
+        return len({view.camera_index for view in self.capture.views["train"]}) == 1
+
     def _post_step(self, progress: float) -> None:
         steps: tuple[PostStep, ...] = (
             StrayReset(self.settings, self.frames.units, self.strategy.region),
             DensityControl(self.settings, self.initial_count, self.strategy.region),
             OutlineControl(self.settings, self.frames, lambda: self._outlines, self.strategy.region),
+            SideReset(lambda: self._sides, self._has_one_camera and self.strategy.region is None),
         )
         due = [step for step in steps if step.is_due(self.iteration, progress)]
         if due:
