@@ -4,19 +4,25 @@ For work that is many small steps of NumPy, which threads do not share: each ste
 matrices among threads that are too small for it.
 """
 
+import hashlib
 import os
 import pickle
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from traceback import format_exc
 from types import TracebackType
 from typing import IO, Any
 
+import numpy as np
+
 from ..errors import StgaError
+from ..files import read_npz, write_npz
 from .launch import end_with_this_process, start_python
 from .own_python import own_python
 from .stdout import claim_stdout
@@ -27,6 +33,8 @@ THREADS_VARIABLE = "OMP_NUM_THREADS"
 SINGLE = dict.fromkeys((THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 """Environment variables of a helper."""
 REPORT_INTERVAL_S = 0.2
+STEPS_KEY = "steps"
+"""In the file of a kept result: how many steps it took."""
 STEP, RESULT, ERROR = "step", "result", "error"
 """What a helper's messages are: a pair of this and a value."""
 
@@ -43,19 +51,23 @@ class Helpers:
     """Processes that are started when there is work for two, and end with the `with` block.
 
     count: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to MAX_HELPERS. With one, all work
-    is done in this process.
+    is done in this process. folder: of the results that `map` keeps; None: none is kept.
     """
 
-    def __init__(self, count: int | None = None) -> None:
+    def __init__(self, count: int | None = None, folder: Path | None = None) -> None:
         limit = os.environ.get(THREADS_VARIABLE, "")
         usual = min(int(limit) if limit.isdecimal() else processors(), MAX_HELPERS)
-        self._count = usual if count is None else count
+        self._count, self._folder = usual if count is None else count, folder
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> "Helpers":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End the processes, whatever they are working on."""
         for process in self._processes:
             process.kill()
         for process in self._processes:
@@ -65,17 +77,35 @@ class Helpers:
                 pipe.close()
         self._processes = []
 
-    def map(self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None]) -> list[Any]:
+    def map(
+        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None], keep: bool = False
+    ) -> list[Any]:
         """The results of work(*part, step) of every part, in order.
 
         work: a function of a module, which calls `step` after each of its steps; parts and results can be pickled.
-        done: is told how many steps there were, of all parts together; what it raises ends the work.
+        done: is told how many steps there were, of all parts together; what it raises ends the work. keep: results are
+        arrays by name; each is kept in the folder as soon as there is one, and read from there instead of working on an
+        equal part again.
         Raises what work raises, and StgaError where a helper ends before its work does.
         """
+        if keep and self._folder is not None:
+            work, parts = _kept, [(self._folder / f"{_digest(work, part)}.npz", work, part) for part in parts]
         count = min(self._count, len(parts))
         if count < 2:
             steps = _Counter()
             return [work(*part, lambda: done(steps.add())) for part in parts]
+        return self._shared(work, parts, done, count)
+
+    def run(self, work: Callable[..., Any], part: tuple, done: Callable[[int], None]) -> Any:
+        """The result of work(*part, step) of one helping process, as `map`; for what is not worth two."""
+        if self._count < 2:
+            return self.map(work, [part], done)[0]
+        return self._shared(work, [part], done, 1)[0]
+
+    def _shared(
+        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None], count: int
+    ) -> list[Any]:
+        """The results of so many helping processes."""
         while len(self._processes) < count:
             self._processes.append(_start())
         task = _Task(work, parts)
@@ -90,6 +120,29 @@ class Helpers:
             raise task.errors[0]
         done(task.steps.value)
         return task.results
+
+
+def _digest(work: Callable[..., Any], part: tuple) -> str:
+    """Changes with any of the arguments."""
+    return hashlib.sha256(pickle.dumps((work.__qualname__, part), pickle.HIGHEST_PROTOCOL)).hexdigest()[:32]
+
+
+def _kept(file: Path, work: Callable[..., dict[str, Any]], part: tuple, step: Step) -> dict[str, Any]:
+    """The result of work(*part, step), read from the file where it is there and whole, else written into it."""
+    with suppress(StgaError, KeyError, TypeError):
+        found = read_npz(file)
+        for _ in range(int(found.pop(STEPS_KEY))):
+            step()
+        return found
+    steps = _Counter()
+
+    def counted() -> None:
+        steps.add()
+        step()
+
+    found = work(*part, counted)
+    write_npz(file, {**found, STEPS_KEY: np.array(steps.value)})
+    return found
 
 
 class _Counter:

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
@@ -61,12 +62,48 @@ def test_results_are_those_of_one_process_in_order():
             assert [square for square, _ in found] == [number**2 for number in range(21)]
             assert (told[-1], told) == (21, sorted(told))
             pids |= {pid for _, pid in found}
+        pids |= {pid for _, pid in helpers.run(squares, (0, 3), told.append)}
     assert os.getpid() not in pids
     assert 1 <= len(pids) <= 3
     with Helpers(1) as alone:
         told = []
         assert {pid for part in alone.map(squares, PARTS, told.append) for _, pid in part} == {os.getpid()}
         assert told == list(range(1, 22))
+        assert {pid for _, pid in alone.run(squares, (0, 3), told.append)} == {os.getpid()}
+
+
+def halves(numbers, folder, step):
+    """Work whose results are kept; each call leaves a file."""
+    for _ in numbers:
+        step()
+    (folder / f"{time.monotonic_ns()}").touch()
+    return {"half": numbers / 2}
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_was_found_is_not_worked_on_again(tmp_path, count):
+    """Catches an interrupted tracking that begins anew, one that takes results of other arguments, and a progress that
+    lacks what was kept."""
+    called = tmp_path / "called"
+    called.mkdir()
+    parts = [(np.arange(3.0) + number, called) for number in range(4)]
+
+    def interrupt(steps):
+        if len(list(called.iterdir())) >= 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), Helpers(count, tmp_path / "kept") as helpers:
+        helpers.map(halves, parts, interrupt, keep=True)
+    before, told = len(list((tmp_path / "kept").glob("*.npz"))), []
+    assert before >= 1
+    calls = len(list(called.iterdir()))
+    with Helpers(count, tmp_path / "kept") as helpers:
+        found = helpers.map(halves, parts, told.append, keep=True)
+        np.testing.assert_array_equal([own["half"] for own in found], [part[0] / 2 for part in parts])
+        assert told[-1] == 12
+        assert len(list(called.iterdir())) == calls + 4 - before
+        helpers.map(halves, [(np.arange(3.0) + 9, called), parts[0]], told.append, keep=True)
+    assert len(list(called.iterdir())) == calls + 4 - before + 1
 
 
 @pytest.mark.parametrize(
