@@ -1,6 +1,7 @@
 """Human-readable formatting of quantities and tables."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 
 def format_duration(seconds: float) -> str:
@@ -27,3 +28,31 @@ def format_table(rows: Sequence[tuple[str, str]]) -> list[str]:
     """Lines of labels and values, the values below each other."""
     width = max((len(label) for label, _ in rows), default=0)
     return [f"{label:<{width}}  {value}" for label, value in rows]
+
+
+def describe_figures(figures: Mapping[str, float]) -> list[str]:
+    """Figures of any work as short lines for a narrow panel, without those that are not known yet.
+
+    per_second  iterations; left_s: seconds that are left
+    psnr, psnr_unmatched   of the last evaluation, dB, the second one without fitting the exposure of views
+    error_px, unexplained  of a tracked head: median distance from its landmarks, share of the face that images do not
+                           look like
+    """
+    loss = ("loss", "loss {:.4f}")
+    quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)
+    if "psnr_unmatched" in figures:
+        quality = (("psnr", "PSNR {:.2f} dB (exposure fitted)"), ("psnr_unmatched", "{:.2f} dB without")), (loss,)
+    pairs = (
+        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
+        *quality,
+        (("error_px", "{:.1f} px off landmarks"), ("unexplained", "{:.0%} of the face unexplained")),
+        (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
+    )
+    lines = []
+    for pair in pairs:
+        known = [
+            (text, figures[name], name) for name, text in pair if figures.get(name) and not math.isnan(figures[name])
+        ]
+        parts = [text.format(format_duration(value) if name == "left_s" else value) for text, value, name in known]
+        lines.append("   ".join(parts).replace(",", "\u202f"))
+    return [line for line in lines if line]

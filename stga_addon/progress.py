@@ -1,13 +1,21 @@
 """Progress of work, whatever it is, and how it is reported and cancelled."""
 
+import math
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 from typing import TypeVar
 
 import numpy as np
 
 Item = TypeVar("Item")
+
+PACE_SHARE = 0.1
+"""Share of the work, the last that was done, whose pace says how much time is left."""
+MAX_STEP_SHARE = 0.03
+"""Of the work in a step, beyond which it was done before, by what was interrupted, and says nothing of the pace."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,28 @@ Report = Callable[[Progress], bool]
 """Called now and then; returns True to stop and keep what there is."""
 Say = Callable[[str], None]
 """Called with a line for people."""
+
+
+class TimeLeft:
+    """Seconds that are left of work, as its share grows."""
+
+    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
+        self._clock = clock
+        self._last = clock(), 0.0
+        self._steps: deque[tuple[float, float]] = deque()
+        """Seconds and shares of the steps that tell the pace."""
+
+    def after(self, share: float) -> float:
+        """Once `share` of the work is done; NaN where the pace is not known yet."""
+        now, (before, begun) = self._clock(), self._last
+        self._last = now, share
+        if 0 <= share - begun <= MAX_STEP_SHARE:
+            self._steps.append((now - before, share - begun))
+        seconds, done = map(sum, zip(*self._steps, strict=True)) if self._steps else (0.0, 0.0)
+        while done > PACE_SHARE and done - self._steps[0][1] >= PACE_SHARE:
+            first = self._steps.popleft()
+            seconds, done = seconds - first[0], done - first[1]
+        return (1 - share) * seconds / done if done >= PACE_SHARE / 10 else math.nan
 
 
 class Cancelled(Exception):

@@ -4,8 +4,8 @@ import textwrap
 from typing import Any
 
 from ..operators import ids, monitor
+from ..stga_addon.format import describe_figures
 from ..stga_addon.requests.monitor_state import STORED, Kind, RequestState
-from ..stga_addon.training.run.progress import describe_figures
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
 from .text import columns, draw_text

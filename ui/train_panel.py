@@ -10,10 +10,9 @@ from ..operators.analyze import chosen_effects
 from ..operators.common import is_head, package, scene_settings
 from ..operators.train import TrainOptions
 from ..operators.training_python import has_training_python
-from ..stga_addon.format import format_duration
+from ..stga_addon.format import describe_figures, format_duration
 from ..stga_addon.requests.monitor_state import Kind, RequestState
 from ..stga_addon.scene import tags
-from ..stga_addon.training.run.progress import describe_figures
 from ..stga_addon.training.run.tracking_file import TRACKING
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve

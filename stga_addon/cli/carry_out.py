@@ -1,12 +1,12 @@
 """Carrying out a request on the command line: progress on a terminal, and what there is to say."""
 
-import math
 import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..files import write_npz
+from ..format import describe_figures
 from ..progress import Progress, ignore
 from ..requests.results import Result, Selected
 from ..requests.values import Request, Select, SelectForTake
@@ -14,7 +14,11 @@ from ..requests.values import Request, Select, SelectForTake
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+LAYOUT, LAYOUT_WITH_TIME_LEFT = (
+    "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}",
+    "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
+)
+"""Of work that says itself how much time is left, and of other work."""
 
 
 def carry_out(request: Request, with_bar: bool = True) -> Result:
@@ -56,7 +60,10 @@ class ProgressBar:
             self._bar = self._open()
         self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
         self._stage = progress.stage
-        self._bar.set_postfix_str("; ".join(filter(None, [_figures(progress), progress.detail])), refresh=False)
+        figures = progress.figures()
+        self._bar.bar_format = LAYOUT if "left_s" in figures else LAYOUT_WITH_TIME_LEFT
+        told = [*describe_figures(figures), progress.detail]
+        self._bar.set_postfix_str("; ".join(filter(None, told)), refresh=False)
         self._bar.update(progress.share - self._bar.n)
         return False
 
@@ -76,16 +83,3 @@ class ProgressBar:
         self._bar.clear()
         print(line, flush=True)
         sys.stderr.flush()
-
-
-def _figures(progress: Progress) -> str:
-    """The figures of a training in a line, without those that are not known yet."""
-    figures = progress.figures()
-    texts = {"per_second": "{:.1f} it/s", "loss": "loss {:.4f}", "psnr": "PSNR {:.2f}", "splats": "{:.0f} splats"}
-    if not figures.get("iteration"):
-        return ""
-    known = {name: figures[name] for name in texts if not math.isnan(figures.get(name, math.nan))}
-    parts = {name: texts[name].format(value) for name, value in known.items()}
-    if "psnr_unmatched" in figures and "psnr" in parts:
-        parts["psnr"] += f" (exposure fitted; {figures['psnr_unmatched']:.2f} without)"
-    return ", ".join(parts.values())

@@ -27,4 +27,13 @@ def test_a_fitted_psnr_is_called_so(capsys: pytest.CaptureFixture[str]) -> None:
     with ProgressBar() as bar:
         bar.report(Progress(0.0, figures=lambda: figures))
         bar.report(Progress(1.0, figures=lambda: figures))
-    assert "PSNR 31.00 (exposure fitted; 25.00 without)" in capsys.readouterr().err
+    assert "PSNR 31.00 dB (exposure fitted)   25.00 dB without" in capsys.readouterr().err
+
+
+def test_time_left_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches the bar's own guess beside the time left that the work says."""
+    for figures, guesses in (({"left_s": 31.0}, False), ({}, True)):
+        with ProgressBar() as bar:
+            bar.report(Progress(0.5, "Landmarks", figures=lambda figures=figures: figures))
+        written = capsys.readouterr().err
+        assert ("31 s left" in written, "<" in written) == (not guesses, guesses)

@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 
 from stga_addon.capture.model import Capture
+from stga_addon.format import describe_figures
 from stga_addon.report import run_summary
 from stga_addon.report.run_summary import CURVE, CurveUpdater, report_run, summarize_continuation, summarize_run
 from stga_addon.training.evaluate.forecast import describe_forecast
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.loop import train
-from stga_addon.training.run.progress import Progress, describe_figures
+from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import make_settings
 
 

@@ -1,6 +1,7 @@
 """Requests: what is written down, what is refused, and that a worker does what the same process would."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -20,9 +21,10 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_json
+from stga_addon.format import describe_figures
 from stga_addon.perform import perform as performing
 from stga_addon.perform.perform import perform, perform_in_folder
-from stga_addon.progress import Progress
+from stga_addon.progress import Progress, TimeLeft
 from stga_addon.requests import folder as folders
 from stga_addon.requests.folder import (
     FILES,
@@ -51,7 +53,6 @@ from stga_addon.requests.values import (
     Train,
 )
 from stga_addon.training.run.folder import Run, write_run
-from stga_addon.training.run.progress import describe_figures
 from stga_addon.training.settings import make_settings
 from stga_addon.worker.launch import start_worker
 from stga_addon.worker.status import (
@@ -209,6 +210,25 @@ def test_figures_in_short_lines() -> None:
     assert describe_figures({}) == []
     figures = {"iteration": 900, "per_second": 12.34, "left_s": 125.0, "splats": 61234.0, "psnr": 30.0}
     assert describe_figures(figures) == ["12.3 it/s   2.1 min left", "PSNR 30.00 dB", "61\u202f234 splats"]
+    tracked = {"left_s": 31.0, "error_px": 1.92, "unexplained": 0.043}
+    assert describe_figures(tracked) == ["31 s left", "1.9 px off landmarks   4% of the face unexplained"]
+
+
+def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
+    """Catches a time left that is that of an average over slow and fast work, or of work that an interrupted call had
+    done before and that is only read now."""
+    now = 0.0
+    left = TimeLeft(lambda: now)
+    assert math.isnan(left.after(0.0))
+    left.after(0.5)  # done before
+    for share in np.linspace(0.51, 0.7, 20):
+        now += 3
+        told = left.after(share)
+    assert told == pytest.approx(0.3 * 300)
+    for share in np.linspace(0.71, 0.85, 15):
+        now += 1
+        told = left.after(share)
+    assert told == pytest.approx(0.15 * 100)
 
 
 @pytest.mark.slow

@@ -1,13 +1,11 @@
 """Progress of a training run, and the figures of it that people read."""
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...avatar.file import Avatar
-from ...format import format_duration
 
 
 @dataclass(frozen=True)
@@ -48,24 +46,3 @@ class Progress:
 
 Report = Callable[[Progress], bool]
 """Called after every iteration; returns True to stop early and keep what is trained."""
-
-
-def describe_figures(figures: Mapping[str, float]) -> list[str]:
-    """`Progress.figures` as short lines for a narrow panel, without those that are not known yet."""
-    loss = ("loss", "loss {:.4f}")
-    quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)
-    if "psnr_unmatched" in figures:
-        quality = (("psnr", "PSNR {:.2f} dB (exposure fitted)"), ("psnr_unmatched", "{:.2f} dB without")), (loss,)
-    pairs = (
-        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
-        *quality,
-        (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
-    )
-    lines = []
-    for pair in pairs:
-        known = [
-            (text, figures[name], name) for name, text in pair if figures.get(name) and not math.isnan(figures[name])
-        ]
-        parts = [text.format(format_duration(value) if name == "left_s" else value) for text, value, name in known]
-        lines.append("   ".join(parts).replace(",", "\u202f"))
-    return [line for line in lines if line]
