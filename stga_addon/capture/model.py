@@ -74,6 +74,11 @@ def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
     return [items[n] for n in np.linspace(0, len(items) - 1, limit).round().astype(int)]
 
 
+def parts_of(timesteps: Sequence[int], limit: int) -> list[list[int]]:
+    """Consecutive parts of at most `limit` timesteps, the same on every machine; at least one."""
+    return [part.tolist() for part in np.array_split(np.array(timesteps), max(1, -(-len(timesteps) // limit)))]
+
+
 def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
     """(label, value) lines: recording, tracking, warnings. Reads no image."""
     views = [view for split in capture.views.values() for view in split]

@@ -1,5 +1,6 @@
 """Making an avatar from footage, as requests ask for it: tracking, then training."""
 
+import math
 from dataclasses import replace
 from time import perf_counter
 
@@ -25,7 +26,10 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
     inputs, and as both do."""
 
     def report_tracking(progress: Progress) -> bool:
-        return report(replace(progress, share=TRACKING_SHARE * progress.share, stage=f"Tracking: {progress.stage}"))
+        share, stage = TRACKING_SHARE * progress.share, f"Tracking: {progress.stage}"
+        figures = dict(progress.figures())
+        figures["left_s"] = figures.get("left_s", math.nan) + (request.train.settings.seconds or 0.0)
+        return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
         return report(replace(progress, share=TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share))

@@ -7,18 +7,19 @@ under that view's lighting, looks like the images.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ..capture.model import evenly_spread
+from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
 from ..worker.helpers import Helpers, Step
 from .appearance import Sample, Texture, average_texture, pyramid, robust
 from .dense_head import HELD_OUT_LEVEL, REGIONS, UPPER_FACE, DenseHead
 from .dense_terms import Misfit, PyramidView, flow_start, misfit, photo_term, samples
-from .fit import HeadFit, TimestepLandmarks, by_visibility, observed_landmarks, triangulated
+from .fit import HeadFit, LandmarkVisibility, TimestepLandmarks, observed_landmarks, triangulated
 from .landmarks import Report
-from .seen_surface import RecordedTake, excerpt, parts_of
+from .seen_surface import RecordedTake, excerpt
 from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smooth_take
 
 MIN_TIMESTEPS = 6
@@ -65,12 +66,12 @@ MAX_UPPER_MISS_M = 0.01
 
 @dataclass(frozen=True)
 class DenseFit:
-    """fit; landmarks, of which those in regions that disagree are moved to the fit; how badly images are explained at
-    each timestep."""
+    """fit; landmarks, of which those in regions that disagree are moved to the fit; how badly the regions (R,) are
+    explained at each timestep."""
 
     fit: HeadFit
     landmarks: Mapping[int, TimestepLandmarks]
-    misfit: Mapping[int, Misfit]
+    misfit: Mapping[int, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -86,13 +87,12 @@ class _Shot:
 
 @dataclass(frozen=True)
 class _Solved:
-    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit of the regions (R,) in coarse images,
-    misfit, distances of the landmarks (L,), and whether it is better than the start."""
+    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit, distances of the landmarks (L,), and
+    whether it is better than the start."""
 
     values: np.ndarray
     visible: np.ndarray
     terms: tuple[np.ndarray, np.ndarray]
-    coarse: np.ndarray
     misfit: Misfit
     missed: np.ndarray
     better: bool
@@ -119,24 +119,26 @@ def fit_dense(
     chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
     head, total = DenseHead(fit.head, take.places, take.reliable), 2 * len(chosen) + len(timesteps)
 
-    def in_parts(work: Callable[..., list], parts: Sequence[tuple], before: int) -> list:
+    def in_parts(work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False) -> list:
         every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
         stage = "Refinement" if settled else "Dense tracking"
-        results = helpers.map(work, every, lambda steps: report(stage, before + steps, total))
-        return [one for result in results for one in result]
+        return helpers.map(work, every, lambda steps: report(stage, before + steps, total), keep)
 
     weights = np.maximum(head.rest([head.reduced(fit.parameters[t]) for t in chosen]), SETTLED_WEIGHT if settled else 0)
     some = parts_of(chosen, TEXTURE_PART_TIMESTEPS)
     rows = np.split(weights, np.cumsum([len(part) for part in some])[:-1])
-    texture = average_texture(in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0))
-    coarse = in_parts(_started_part, [(part, texture) for part in some], len(chosen))
+    sampled = in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0)
+    texture = average_texture([sample for part in sampled for sample in part])
+    coarse = np.concatenate(in_parts(_started_part, [(part, texture) for part in some], len(chosen)))
     usual = np.quantile(coarse, USUAL_QUANTILE, axis=0)
     parts = [(part, texture, usual, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
-    solved = dict(zip(timesteps, in_parts(_solved_part, parts, 2 * len(chosen)), strict=True))
-    values, terms = np.stack([own.values for own in solved.values()]), [own.terms for own in solved.values()]
-    smooth = smooth_take(head.head, values, terms, fit.ordered)
+    found = in_parts(_solved_part, parts, 2 * len(chosen), keep=True)
+    solved = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
+    terms = list(zip(solved["matrix"], solved["right"], strict=True))
+    smooth = smooth_take(head.head, solved["values"], terms, fit.ordered)
     moved = replace(fit, parameters={t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)})
-    return DenseFit(moved, _agreeing(head, moved, take, solved), {t: own.misfit for t, own in solved.items()})
+    landmarks = _agreeing(head, moved, take, solved["missed"], solved["better"])
+    return DenseFit(moved, landmarks, dict(zip(timesteps, solved["misfit"], strict=True)))
 
 
 def _sampled_part(fit: HeadFit, take: RecordedTake, weights: np.ndarray, step: Step) -> list[Sample]:
@@ -149,20 +151,20 @@ def _sampled_part(fit: HeadFit, take: RecordedTake, weights: np.ndarray, step: S
     return found
 
 
-def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> list[np.ndarray]:
-    """For each timestep of a part, how badly its regions (R,) are explained in coarse images from where the fit is."""
+def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> np.ndarray:
+    """(T, R) how badly the regions are explained in coarse images from where the fit is, at the timesteps of a part."""
     solver, found = _Solver(fit, take), []
     for timestep in sorted(take.landmarks):
         shot = solver.shot(timestep)
         found.append(solver.started(shot, texture, shot.start, solver.visible(shot, shot.start))[1].regions)
         step()
-    return found
+    return np.stack(found)
 
 
 def _solved_part(
     fit: HeadFit, take: RecordedTake, texture: Texture, usual: np.ndarray, settled: bool, step: Step
-) -> list["_Solved"]:
-    """The timesteps of a part, solved one from the other."""
+) -> dict[str, np.ndarray]:
+    """The timesteps of a part, solved one from the other; by name, T of what `_Solved` has of each."""
     solver = _Solver(fit, take, SETTLED_GAIN if settled else 0.0)
     before: tuple[_Shot, _Solved] | None = None
     solved: list[_Solved] = []
@@ -171,7 +173,16 @@ def _solved_part(
         solved.append(solver.solve(shot, texture, before, usual))
         before = shot, solved[-1]
         step()
-    return solved[::-1] if settled else solved
+    if settled:
+        solved.reverse()
+    return {
+        "values": np.stack([own.values for own in solved]),
+        "matrix": np.stack([own.terms[0] for own in solved]),
+        "right": np.stack([own.terms[1] for own in solved]),
+        "misfit": np.stack([own.misfit.regions for own in solved]),
+        "missed": np.stack([own.missed for own in solved]),
+        "better": np.array([own.better for own in solved]),
+    }
 
 
 class _Solver:
@@ -180,6 +191,7 @@ class _Solver:
     def __init__(self, fit: HeadFit, take: RecordedTake, min_gain: float = 0.0) -> None:
         self.head, self._min_gain = DenseHead(fit.head, take.places, take.reliable), min_gain
         self._fit, self._take = fit, take
+        self._visibility = LandmarkVisibility(fit.head, take.places)
 
     def shot(self, timestep: int) -> _Shot:
         """Read a timestep."""
@@ -190,7 +202,7 @@ class _Solver:
             own = world.camera(camera)
             views.append(PyramidView(camera.world_to_camera.tobytes(), own, pyramid(own, image, center)))
         model, places, reliable = self._fit.head.model, self._take.places, self._take.reliable
-        seen = by_visibility(self._take.landmarks[timestep], self._fit.head, places, parameters, world)
+        seen = self._visibility.weighted(self._take.landmarks[timestep], parameters, world)
         found = triangulated(seen, reliable, places.on(model.v_template, model.faces), world.scale)
         return _Shot(views, observed_landmarks(found, world, reliable), start, np.zeros(len(REGIONS), bool))
 
@@ -215,11 +227,9 @@ class _Solver:
             shot = replace(shot, by_landmarks=shot.by_landmarks | astray)
             best = self._descended(shot, texture, shot.start, visible, START_STEPS)
             best, visible = self._refined(shot, texture, best)
-        return self._judged(shot, texture, best, visible, error.regions)
+        return self._judged(shot, texture, best, visible)
 
-    def _judged(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, coarse: np.ndarray
-    ) -> _Solved:
+    def _judged(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray) -> _Solved:
         """The result, or the start where the result is not better."""
         by_images = self._by_images(shot, visible)
         old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, values))
@@ -231,7 +241,7 @@ class _Solver:
             stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
             terms = stiff, -prior_terms(self.head.head, values)[1]  # which the prior does not move
         found, missed = self._evidence(shot, texture, values, visible), self._missed(shot.landmarks, values)
-        return _Solved(values, visible, terms, coarse, found, missed, better)
+        return _Solved(values, visible, terms, found, missed, better)
 
     def _evidence(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray) -> Misfit:
         """How badly the points that are not fitted are explained."""
@@ -333,19 +343,21 @@ class _Solver:
 
 
 def _agreeing(
-    head: DenseHead, fit: HeadFit, take: RecordedTake, solved: Mapping[int, _Solved]
+    head: DenseHead, fit: HeadFit, take: RecordedTake, missed: np.ndarray, better: np.ndarray
 ) -> dict[int, TimestepLandmarks]:
-    """The take's landmarks, moved towards the fit in regions where they miss it by more than they mostly do."""
-    regions = [head.landmark_region == number for number in range(len(REGIONS))]
-    used = [own & take.reliable for own in regions]
-    missed = {t: [np.median(own.missed[use]) if use.any() else 0.0 for use in used] for t, own in solved.items()}
-    usual = np.median(list(missed.values()), axis=0)
+    """The take's landmarks, moved towards the fit in regions where they miss it by more than they mostly do.
+
+    missed (T, L), better (T,): of `_Solved` at the take's timesteps.
+    """
+    regions = [(head.landmark_region == number) & take.reliable for number in range(len(REGIONS))]
+    medians = [np.median(missed[:, use], axis=1) if use.any() else np.zeros(len(missed)) for use in regions]
+    by_region = np.stack(medians, axis=1)
+    beyond = np.maximum(by_region - np.median(by_region, axis=0), 0) * better[:, None]
     moved = {}
-    for timestep, own in take.landmarks.items():
-        values = head.reduced(fit.parameters[timestep])
+    for timestep, far in zip(sorted(take.landmarks), beyond, strict=True):
+        own, values = take.landmarks[timestep], head.reduced(fit.parameters[timestep])
         at = head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
-        beyond = np.maximum(np.array(missed[timestep]) - usual, 0) * solved[timestep].better
-        weight = robust(beyond, DISAGREEMENT_M)[head.landmark_region][:, None]
+        weight = robust(far, DISAGREEMENT_M)[head.landmark_region][:, None]
         seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
         moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)
     return moved

@@ -277,6 +277,10 @@ class _Crop:
 class FaceNetworks:
     """Detector, landmarks and scores, each read when it is first needed."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For helping processes, which read the networks themselves."""
+        return {}
+
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
         """Landmarks (478, 2) in pixels of at most two faces; see `Detector`."""
         return [points[:, :2] for points in self._landmarks(image, MAX_FACES)]

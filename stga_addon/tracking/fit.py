@@ -1,6 +1,6 @@
 """From landmarks of all cameras and timesteps to a head in meters: scale, identity, expression and pose."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +9,7 @@ from ..capture.camera import Camera
 from ..capture.mesh_geometry import Similarity, similarity, vertex_normals, weighted_procrustes
 from ..capture.model import evenly_spread
 from ..flame.forward import POSE_SIZE, RIGID_SIZE
+from ..worker.helpers import Step
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .solve import Observation, in_order, person, solve_identity, solve_take
@@ -107,14 +108,14 @@ def fit_head(
     places: SurfacePoints,
     reliable: np.ndarray,
     take: Mapping[int, TimestepLandmarks],
-    report: Callable[[str, int, int], None] = lambda stage, done, total: None,
     metric: bool = False,
+    step: Step = lambda: None,
 ) -> HeadFit:
     """Fit the model to the landmarks of the timesteps of `take`, each of which `determines_pose`.
 
     Rounds of triangulation, identity and scale from timesteps spread over the take, then all timesteps; from the second
     round on, a camera's landmarks count by the angle at which it sees the surface. metric: the world of the cameras is
-    in meters, and the size of the head is the person's.
+    in meters, and the size of the head is the person's. step: follows each of ROUNDS.
     """
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
@@ -126,7 +127,6 @@ def fit_head(
     seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
     solved, ordered = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE)), True
     for number in range(ROUNDS):
-        report("Fit", number, ROUNDS)
         at = places.on(subject.model.v_template, subject.model.faces)
         found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
         observed = {t: observed_landmarks(found[t], world, reliable) for t in spread}
@@ -142,11 +142,9 @@ def fit_head(
             alone = solve_take(subject, places, take_observed, solved, ordered=False)
             ordered = in_order(subject, places, take_observed, alone)
         solved = solve_take(subject, places, take_observed, solved, ordered)
-        seen = {
-            t: by_visibility(take[t], subject, places, values, world)
-            for t, values in zip(timesteps, solved, strict=True)
-        }
-    report("Fit", ROUNDS, ROUNDS)
+        visibility = LandmarkVisibility(subject, places)
+        seen = {t: visibility.weighted(take[t], values, world) for t, values in zip(timesteps, solved, strict=True)}
+        step()
     return HeadFit(subject, shape, dict(zip(timesteps, solved, strict=True)), world, ordered=ordered)
 
 
@@ -172,10 +170,11 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
     seen = (pixels - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
     center = points.mean(0)
     system = np.column_stack([points - center, np.ones(len(points))])
+    solve = np.linalg.pinv(system, len(system) * np.finfo(np.float64).eps)
     stretch = np.ones(len(points))
     rotation, place = np.eye(3), np.zeros(3)
     for _ in range(POSIT_ITERATIONS):
-        rows = np.linalg.lstsq(system, seen * stretch[:, None], rcond=None)[0].T  # (2, 4)
+        rows = (solve @ (seen * stretch[:, None])).T  # (2, 4)
         size = float(np.sqrt(np.linalg.norm(rows[0, :3]) * np.linalg.norm(rows[1, :3])))
         u, _, vt = np.linalg.svd(rows[:, :3] / size, full_matrices=False)
         across = u @ vt
@@ -188,15 +187,16 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
 
 def triangulated(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float) -> Triangulation:
     """The landmarks in the cameras' world; `head` (N, 3) meters and `scale` tell how far away a single camera's are."""
-    found = triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
     if len(landmarks.cameras) > 1:
-        return found
+        return triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
     camera, pixels = landmarks.cameras[0], landmarks.points[0]
+    seen = landmarks.confidence[0] * reliable > 0
     origin, directions = rays(camera, pixels)
     guess = np.tile(origin, (len(head), 1))
-    guess[found.seen] = pose_from_one_camera(camera, pixels[found.seen], head[found.seen] / scale)
+    guess[seen] = pose_from_one_camera(camera, pixels[seen], head[seen] / scale)
     depth = ((guess - origin) * directions).sum(1, keepdims=True)
-    return replace(found, position=origin + depth * directions)
+    across = seen[:, None, None] * (np.eye(3) - directions[:, :, None] * directions[:, None])
+    return Triangulation(origin + depth * directions, across, np.zeros(len(head)), seen)
 
 
 def observed_landmarks(found: Triangulation, world: Similarity, reliable: np.ndarray) -> Observation:
@@ -235,15 +235,23 @@ def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:
     return rigid
 
 
-def by_visibility(
-    landmarks: TimestepLandmarks, subject: HeadModel, places: SurfacePoints, parameters: np.ndarray, world: Similarity
-) -> TimestepLandmarks:
-    """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY where it faces away."""
-    model = subject.model
-    normals = places.on(vertex_normals(model.v_template, model.faces), model.faces) @ head_rotation(parameters).T
-    at = PosedPoints(model, places).positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
-    towards = np.stack([world.apply(camera.position) - at for camera in landmarks.cameras])
-    length = np.linalg.norm(towards, axis=2) * np.maximum(np.linalg.norm(normals, axis=1), 1e-9)
-    cosine = (normals * towards).sum(2) / length
-    visibility = np.clip(cosine, 0, 1) ** 2 + MIN_VISIBILITY
-    return replace(landmarks, confidence=landmarks.confidence * visibility)
+class LandmarkVisibility:
+    """How squarely cameras see the surface of a person's head at the places of its landmarks."""
+
+    def __init__(self, subject: HeadModel, places: SurfacePoints) -> None:
+        model = subject.model
+        self._points = PosedPoints(model, places)
+        self._normals = places.on(vertex_normals(model.v_template, model.faces), model.faces)
+
+    def weighted(self, landmarks: TimestepLandmarks, parameters: np.ndarray, world: Similarity) -> TimestepLandmarks:
+        """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY where it faces away."""
+        _, squared = self.seen(parameters, np.stack([world.apply(camera.position) for camera in landmarks.cameras]))
+        return replace(landmarks, confidence=landmarks.confidence * (squared + MIN_VISIBILITY))
+
+    def seen(self, parameters: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (N, 3) of the landmarks, and squared cosines (C, N) of the angles between their normals and cameras
+        at `eyes` (C, 3), in the head's world; 0 where the surface faces away."""
+        at = self._points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+        normals, towards = self._normals @ head_rotation(parameters).T, eyes[:, None] - at
+        length = np.linalg.norm(towards, axis=2) * np.maximum(np.linalg.norm(normals, axis=1), 1e-9)
+        return at, np.clip((normals * towards).sum(2) / length, 0, 1) ** 2

@@ -8,7 +8,7 @@ import numpy as np
 from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE
-from .fit import TimestepLandmarks, by_visibility, observed_landmarks, rigid_start, triangulated
+from .fit import LandmarkVisibility, TimestepLandmarks, observed_landmarks, rigid_start, triangulated
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
@@ -127,7 +127,8 @@ def _slope(head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandm
     for _ in range(ROUNDS):
         seen, starts = _observed(subject, places, views)
         frames = frames if len(frames) else np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
-        sides = (by_visibility(view, subject, places, own, HERE) for view, own in zip(views, frames, strict=True))
+        visibility = LandmarkVisibility(subject, places)
+        sides = (visibility.weighted(view, own, HERE) for view, own in zip(views, frames, strict=True))
         observed = [
             replace(own, root=own.root * (LANDMARK_SIGMA_M / NOISE_SIGMA_M), weight=own.weight * side.confidence[0])
             for own, side in zip(seen, sides, strict=True)

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..capture.model import parts_of
 from ..errors import StgaError
 from ..files import read_npz, write_npz
+from ..worker.helpers import MAX_HELPERS, Helpers, Step
 from .face_networks import Detector
 from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
@@ -22,6 +24,9 @@ MAX_PIXELS, MAX_CONFIDENCE = 1e5, 1e6
 scores in place of shares."""
 MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames with a second face, beyond which the footage is not of one person."""
+MIN_PART_TIMESTEPS = 50
+"""Of a camera's parts, which are worked on at once, and as many as there may be helpers: each decodes a video from the
+key frame before it, or from the beginning."""
 MIN_OVERLAP = 0.3
 """Two faces whose boxes share this much of their area are one, found twice."""
 
@@ -44,10 +49,13 @@ def landmark_file(folder: Path, camera: str) -> Path:
     return folder / (name if name != PLACES_FILE else name.replace("h", "%68", 1))
 
 
-def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report: Report) -> dict[str, CameraLandmarks]:
+def detect_landmarks(
+    footage: Footage, detector: Detector, folder: Path, helpers: Helpers, report: Report
+) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they are already.
 
-    A frame with several faces counts as one without a face. Raises StgaError for a camera that often sees several.
+    detector: can be handed to helping processes. A frame with several faces counts as one without a face.
+    Raises StgaError for a camera that often sees several.
     """
     total = sum(len(camera.timesteps) for camera in footage.cameras)
     found: dict[str, CameraLandmarks] = {}
@@ -55,7 +63,10 @@ def detect_landmarks(footage: Footage, detector: Detector, folder: Path, report:
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)
         if not path.exists():
-            write_camera(path, _detect(camera, detector, partial(_count, report, done, total)))
+            limit = max(MIN_PART_TIMESTEPS, -(-len(camera.timesteps) // MAX_HELPERS))
+            parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
+            detected = helpers.map(_detect, parts, partial(_count, report, done, total))
+            write_camera(path, _of_one_person(camera, [faces for part in detected for faces in part]))
         found[camera.name] = read_camera(path, camera)  # in the file's precision, whether it was detected now or before
         done += len(camera.timesteps)
         report("Landmarks", done, total)
@@ -192,15 +203,19 @@ def _count(report: Report, done: int, total: int, number: int) -> None:
     report("Landmarks", done + number, total)
 
 
-def _detect(camera: FootageCamera, detector: Detector, report: Callable[[int], None]) -> CameraLandmarks:
-    faces: list[np.ndarray | None] = []
-    several: list[int] = []
-    for number, timestep in enumerate(camera.timesteps):
-        seen = _distinct(detector.detect(camera.image(timestep)))
-        if len(seen) > 1:
-            several.append(timestep)
-        faces.append(seen[0] if len(seen) == 1 else None)
-        report(number + 1)
+def _detect(camera: FootageCamera, timesteps: list[int], detector: Detector, step: Step) -> list[list[np.ndarray]]:
+    """The faces (N, 2) of each timestep."""
+    found = []
+    for timestep in timesteps:
+        found.append(_distinct(detector.detect(camera.image(timestep))))
+        step()
+    return found
+
+
+def _of_one_person(camera: FootageCamera, seen: list[list[np.ndarray]]) -> CameraLandmarks:
+    """Raises StgaError where too many of the timesteps show several faces."""
+    several = [timestep for timestep, faces in zip(camera.timesteps, seen, strict=True) if len(faces) > 1]
+    faces = [own[0] if len(own) == 1 else None for own in seen]
     if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
         raise StgaError(
             f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of {len(camera.timesteps)} frames "

@@ -1,6 +1,6 @@
 """Pictures of the head over the footage, for whoever watches the tracking."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
@@ -25,8 +25,9 @@ FIRST_CAMERAS = 3
 COLUMNS = 2
 """Most frames of a picture, in each direction."""
 
-Show = Callable[[Callable[[], np.ndarray | None]], None]
-"""Called with what draws a picture (SIZE, SIZE, 3) uint8 for those who watch; None: there is nothing to see."""
+Show = Callable[[Callable[[], np.ndarray | None], Mapping[str, float]], None]
+"""Called with what draws a picture (SIZE, SIZE, 3) uint8 for those who watch, None: there is nothing to see; and with
+figures of how well the head fits (`format.describe_figures`)."""
 
 
 def picture_of_first_frame(

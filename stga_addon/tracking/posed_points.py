@@ -48,7 +48,7 @@ class PosedPoints:
         self.weights, self.parents = model.weights[rows], model.parents.tolist()
         self.posedirs = model.posedirs[rows] if model.posedirs.any() else None
         self.joints = model.j_regressor @ model.v_template
-        self.joint_dirs = np.einsum("jv,vak->jak", model.j_regressor, model.shapedirs)
+        self.joint_dirs = np.tensordot(model.j_regressor, model.shapedirs, 1)
         self._below = _below(self.parents)
         self._corner_weights = (self.weights * self.barycentric.reshape(-1, 1)).T.reshape(len(self.parents), -1, 3)
         self._last: tuple[bytes, _Posed] | None = None

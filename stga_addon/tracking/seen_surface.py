@@ -68,11 +68,6 @@ class RecordedTake:
     metric: bool = False
 
 
-def parts_of(timesteps: Sequence[int], most: int) -> list[list[int]]:
-    """Parts of a take of at most so many timesteps, the same on every machine."""
-    return [part.tolist() for part in np.array_split(np.array(timesteps), -(-len(timesteps) // most))]
-
-
 def excerpt(fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]) -> tuple[HeadFit, RecordedTake]:
     """The fit and the take at some timesteps."""
     own = replace(fit, parameters={t: fit.parameters[t] for t in timesteps})

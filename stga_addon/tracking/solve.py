@@ -205,9 +205,9 @@ def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray, 
     for _ in range(TAKE_ITERATIONS):
         for number, values in enumerate(state):
             blocks[number], right[number] = terms(first + number, values)
-            precision, pull = prior_terms(head, values)
-            blocks[number][np.diag_indices(size)] += precision
-            right[number] += pull
+        precision, pull = prior_terms(head, state)
+        blocks[:, np.arange(size), np.arange(size)] += precision
+        right += pull
         if ordered and len(state) > 2:
             step = _smooth_step(blocks, right, state, stiffness)
         else:

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..capture.mesh_geometry import vertex_normals
-from ..capture.model import evenly_spread
+from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
 from ..worker.helpers import Helpers, Step
-from .fit import HeadFit, by_visibility, observed_landmarks, rigid_start, triangulated
+from .fit import HeadFit, LandmarkVisibility, observed_landmarks, rigid_start, triangulated
 from .head_model import HeadModel
 from .landmarks import Report
 from .photo_consistency import Sweep
@@ -22,7 +22,6 @@ from .seen_surface import (
     near_landmarks,
     no_masks,
     outlines_agree,
-    parts_of,
     seen_surface,
     surface_points,
     with_outlines,
@@ -82,10 +81,8 @@ def fit_surface(
     if not several:
         return fit
     chosen = evenly_spread(several, SURFACE_TIMESTEPS)
-    visible = {
-        t: by_visibility(own, fit.head, take.places, fit.parameters[t], fit.to_capture)
-        for t, own in take.landmarks.items()
-    }
+    visibility = LandmarkVisibility(fit.head, take.places)
+    visible = {t: visibility.weighted(own, fit.parameters[t], fit.to_capture) for t, own in take.landmarks.items()}
     take = replace(take, landmarks=visible)
     early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
     steps = early + len(timesteps)

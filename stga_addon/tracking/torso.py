@@ -9,12 +9,14 @@ pushed forward, the torso is shifted as well; and its cloth bends, where that ex
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from ..capture.model import evenly_spread
 from ..flame.forward import axis_angle_matrices, cross_matrices
 from ..flame.model import torso_faces
+from ..worker.helpers import Helpers, Step
 from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, robust, sampled
 from .dense_terms import (
     FLOW_ITERATIONS,
@@ -34,6 +36,7 @@ from .torso_motion import TorsoMotion, TorsoPoints
 from .torso_points import Carrier, Motion, SeenPoints, at_depth, compared, seen_points
 from .torso_take import (
     NECK,
+    BothWays,
     PosedTorso,
     TorsoPose,
     TorsoShot,
@@ -82,7 +85,9 @@ class FollowedTorso:
     points: TorsoPoints | None = None
 
 
-def follow_torso(fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Footage, report: Report) -> FollowedTorso:
+def follow_torso(
+    fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Footage, helpers: Helpers, report: Report
+) -> FollowedTorso:
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
 
     The torso turns about the neck's joint; the head is not moved. Parameters are returned as they are where the torso
@@ -99,7 +104,8 @@ def follow_torso(fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Fo
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
     some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
-    motions = _motions(take, seen, some, report)
+    walk = BothWays(helpers, report, len(some) + 3 * len(unchanged))
+    motions = _motions(take, seen, some, walk)
     deep = at_depth(take, seen, motions)
     found = compared(take, deep, motions, some)
     own = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
@@ -109,7 +115,7 @@ def follow_torso(fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Fo
         return FollowedTorso(fit, unchanged, motion=TorsoMotion(motion, misfit, 0.0))
     name = own if motion == "own" else motion
     points = TorsoPoints(middle, deep[name].at)
-    bending = found_bending(take, motions[name], points, some, report) if name == "shifted" else None
+    bending = found_bending(take, motions[name], points, some, walk) if name == "shifted" else None
     return _followed(fit, take, motions[name], bending, TorsoMotion(motion, misfit, 0.0), points)
 
 
@@ -138,14 +144,14 @@ def _followed(
     return FollowedTorso(fit, heads, offsets, motion, points)
 
 
-def _motions(take: TorsoTake, seen: SeenPoints, some: Sequence[int], report: Report) -> dict[str, Motion]:
+def _motions(take: TorsoTake, seen: SeenPoints, some: Sequence[int], walk: BothWays) -> dict[str, Motion]:
     """The motions that the torso may have; some: timesteps at which it is followed first, to find the points' depth."""
     everything = sorted(take.parameters)
     seen = at_depth(take, seen, {})["stereo"]
-    rough = take.motion(_Follower(take, seen, shifts=False).follow(some, report), rigid=False)
-    seen = at_depth(take, seen, {"own": rough})["own"]
-    turned = _Follower(take, seen, shifts=False).follow(everything, report)
-    shifted = _Follower(take, seen, shifts=True).follow(everything, report)
+    (rough,) = _poses(walk, [(take, seen, False)], some)
+    seen = at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
+    both = [(take, seen, shifts) for shifts in (False, True)]
+    turned, shifted = _poses(walk, both, everything)
     return {
         "head": {t: PosedTorso(values) for t, values in take.parameters.items()},
         "still": take.motion(dict.fromkeys(everything, turned[seen.timestep]), rigid=False),
@@ -174,6 +180,19 @@ def _cameras(footage: Footage, timestep: int) -> list[FootageCamera]:
     return evenly_spread(seen, MAX_CAMERAS)
 
 
+def _poses(
+    walk: BothWays, parts: Sequence[tuple[TorsoTake, SeenPoints, bool]], timesteps: Sequence[int]
+) -> list[dict[int, TorsoPose]]:
+    """For each of `_Follower`'s arguments, the torso's pose by timestep."""
+    found = walk.along(_follow, parts, parts[0][1].timestep, timesteps)
+    return [{timestep: TorsoPose(**arrays) for timestep, arrays in own.items()} for own in found]
+
+
+def _follow(take: TorsoTake, seen: SeenPoints, shifts: bool, way: Sequence[int], step: Step) -> dict[str, np.ndarray]:
+    poses = _Follower(take, seen, shifts).follow(way, step)
+    return {"turn": np.stack([pose.turn for pose in poses]), "shift": np.stack([pose.shift for pose in poses])}
+
+
 class _Follower:
     """The pose of the torso over a take, by Gauss–Newton on the images of points below the head."""
 
@@ -183,19 +202,15 @@ class _Follower:
         self._first = TorsoPose(head_turn(take.parameters[seen.timestep]), np.zeros(3))
         self._carrier = Carrier(take, take.with_torso(seen.timestep, self._first, shifts), seen.at)
 
-    def follow(self, timesteps: Sequence[int], report: Report) -> dict[int, TorsoPose]:
-        """By timestep, from the one whose points are followed to both ends of the take."""
-        middle, poses = self._seen.timestep, {self._seen.timestep: self._first}
-        later = [timestep for timestep in timesteps if timestep > middle]
-        earlier = [timestep for timestep in reversed(timesteps) if timestep < middle]
-        for way in (later, earlier):
-            before, shot = middle, self._take.shot(middle)
-            for timestep in way:
-                report("Torso", len(poses), len(timesteps))
-                now = self._take.shot(timestep)
-                poses[timestep] = self._solved(timestep, now, before, shot, poses[before])
-                before, shot = timestep, now
-        return {timestep: poses[timestep] for timestep in sorted(poses)}
+    def follow(self, way: Sequence[int], step: Step) -> list[TorsoPose]:
+        """At the timesteps of a way, which begins with the one whose points are followed."""
+        poses, shot = [self._first], self._take.shot(way[0])
+        for before, timestep in pairwise(way):
+            now = self._take.shot(timestep)
+            poses.append(self._solved(timestep, now, before, shot, poses[-1]))
+            shot = now
+            step()
+        return poses
 
     def _solved(
         self, timestep: int, shot: TorsoShot, before: int, shot_before: TorsoShot, pose: TorsoPose

@@ -1,6 +1,6 @@
 """The frames of a tracked take in which the torso is followed, and the head's parameters with any orientation of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,12 @@ from ..capture.mesh_geometry import silhouette
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT
 from ..flame.quaternions import from_matrices, to_axis_angle
+from ..worker.helpers import Helpers
 from .appearance import pyramid
 from .dense_terms import PyramidView, inside
 from .fit import HeadFit
 from .footage.model import FootageCamera
+from .landmarks import Report
 from .write_capture import posed_mesh
 
 ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")
@@ -50,9 +52,11 @@ class TorsoPose:
 
 @dataclass(frozen=True)
 class TorsoShot:
-    """A timestep: by number of the camera its image, and the pixels (H, W) bool of the head at EVIDENCE_LEVEL."""
+    """A timestep: by number of the camera its image, its mask (H, W) uint8, and the pixels (H, W) bool of the head at
+    EVIDENCE_LEVEL."""
 
     views: Mapping[int, PyramidView]
+    masks: Mapping[int, np.ndarray]
     heads: Mapping[int, np.ndarray]
 
     def shows(self, number: int, at: np.ndarray) -> np.ndarray:
@@ -142,19 +146,42 @@ class TorsoTake:
     def shot(self, timestep: int) -> TorsoShot:
         """Read a timestep; images are of constant size, as optical flow needs them."""
         mesh = self.mesh(self.parameters[timestep])
-        views, heads = {}, {}
+        views, masks, heads = {}, {}, {}
         for number, source in enumerate(self.cameras):
             mask = source.mask(timestep) if timestep in source.timesteps else None
             if mask is not None:
                 camera = self._fit.to_capture.camera(source.camera)
                 levels = pyramid(camera, _masked(source.image(timestep), mask), self._center)
                 views[number] = PyramidView(bytes([number]), camera, levels)
-                heads[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera)
-        return TorsoShot(views, heads)
+                heads[number], masks[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera), mask
+        return TorsoShot(views, masks, heads)
 
     def head_pixels(self, mesh: np.ndarray, camera: Camera) -> np.ndarray:
         """(H, W) bool: the head without its torso, and what is beside it."""
         return grown(silhouette(mesh, self.model.faces[~self.torso], camera), HEAD_MARGIN)
+
+
+class BothWays:
+    """Work along a take, from one timestep to both ends, on which each timestep's result begins with that before: by
+    helping processes, each on a way."""
+
+    def __init__(self, helpers: Helpers, report: Report, total: int) -> None:
+        self._helpers, self._report, self._done, self._total = helpers, report, 0, total
+
+    def along(
+        self, work: Callable[..., dict[str, np.ndarray]], parts: Sequence[tuple], first: int, timesteps: Sequence[int]
+    ) -> list[dict[int, dict[str, np.ndarray]]]:
+        """For each part, by timestep, the rows of the arrays that work(*part, way, step) gives for both ways."""
+        later = [first, *(t for t in timesteps if t > first)]
+        earlier = [first, *(t for t in reversed(timesteps) if t < first)]
+        every, done = [(*part, way) for part in parts for way in (later, earlier)], self._done
+        found = self._helpers.map(work, every, lambda n: self._report("Torso", done + n, self._total), keep=True)
+        self._done += len(parts) * (len(later) + len(earlier) - 2)
+        rows = [
+            {t: {name: array[row] for name, array in own.items()} for row, t in enumerate(way)}
+            for (*_, way), own in zip(every, found, strict=True)
+        ]
+        return [dict(sorted({**a, **b}.items())) for a, b in zip(rows[::2], rows[1::2], strict=True)]
 
 
 def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:
@@ -194,5 +221,8 @@ def grown(where: np.ndarray, share: float) -> np.ndarray:
 
 def _masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The image (H, W, 3) uint8 over plain gray."""
-    share = mask[..., None].astype(np.float32) / 255
-    return np.asarray(image * share + PLAIN_LEVEL * (1 - share) + 0.5, np.uint8)
+    laid, edge = image.copy(), (mask > 0) & (mask < 255)
+    share = mask[edge][:, None].astype(np.float32) / 255
+    laid[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
+    laid[mask == 0] = PLAIN_LEVEL
+    return laid

@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from os.path import realpath
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from .face_networks import FaceNetworks
 from .fit import (
     MAX_HEAD_SCALE,
     MIN_FACE_M,
+    ROUNDS,
     HeadFit,
     TimestepLandmarks,
     determines_pose,
@@ -40,7 +41,7 @@ from .fit import (
     is_metric,
 )
 from .focal_length import solved_focal
-from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, image_name, is_written
+from .folder import KEPT_FOLDER, LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, image_name, is_written
 from .footage.model import Footage, FootageCamera
 from .footage.stored import StoredFrames, with_stored
 from .head_model import HeadModel, read_head_model
@@ -71,6 +72,10 @@ MAX_USUAL_SHARE = 0.04
 where no camera is in step with another, and 0.2 mirrored."""
 
 
+LONG_TAKE = 50
+"""Timesteps from which the fit to landmarks is worth a helping process: its small matrices are slower in threads."""
+
+
 @dataclass(frozen=True)
 class TrackingReport:
     """What `track` found, as written to tracking.json.
@@ -96,7 +101,7 @@ class TrackingReport:
 
     @property
     def median_px(self) -> float:
-        return float(np.median([error for errors in self.reprojection_px.values() for error in errors.values()]))
+        return _median_px(self.reprojection_px)
 
 
 def track(
@@ -108,91 +113,62 @@ def track(
     world: str = "auto",
     mattes: bool = True,
     report: Report = lambda stage, done, total: None,
-    show: Show = lambda draw: None,
+    show: Show = lambda draw, figures: None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
     head_file: a head model; None: the bundled one, which is copied into the capture.
     landmarks: folder of landmark files in place of the networks'.
     mattes: whether they are made for frames without a mask (`with_mattes`).
-    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks, frames of videos in OUT/images: called again
-    after an interruption, those cameras and frames are not worked on again. world: "head": meters as the head's size
-    says, y up, the head near the origin; "keep": that of the cameras, which is scaled about its origin where it is not
-    in meters; "auto": as the calibration says, else "head". show: given pictures of how the head fits, the first one
-    within seconds.
+    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks, frames of videos in OUT/images, and in
+    OUT/unfinished what helping processes found: called again after an interruption, that is not worked on again.
+    world: "head": meters as the head's size says, y up, the head near the origin; "keep": that of the cameras, which is
+    scaled about its origin where it is not in meters; "auto": as the calibration says, else "head".
+    show: given pictures and figures of how the head fits, the first one within seconds.
     Raises StgaError.
     """
     if is_written(out):
         raise StgaError(f"{out}: already holds a capture; give another --out")
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
-    head, is_new = read_head_model(head_file), not out.exists()
+    head = read_head_model(head_file)
     footage, source = _stored(footage, out), _source(footage, head_file, landmarks)
-    if landmarks is not None:
-        found = read_landmarks(footage, landmarks)
-        _check_faces(footage, found)
-        places_file = landmarks / PLACES_FILE
-        places, reliable = read_places(places_file, len(head.model.faces))
-        _begin(out, source)
-        for timestep, camera in footage.views():
-            if isinstance(camera.frames, StoredFrames):
-                camera.image(timestep)  # in order, before helping processes ask for some
-    else:
-        detector = FaceNetworks()
-        report("Head model", 0, 1)
-        places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
-        _begin(out, source)
-        places_file = out / LANDMARKS_FOLDER / PLACES_FILE
-        write_places(places_file, places, reliable)
-        show(partial(picture_of_first_frame, head, footage, detector, places, reliable))
-        try:
-            found = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, report)
-            _check_faces(footage, found)
-        except StgaError:
-            if is_new:  # what it holds is of no use for other footage
-                shutil.rmtree(out)
-            raise
-    check_count(found, places)
-    neutral = places.on(head.model.v_template, head.model.faces)
-    if np.ptp(neutral[reliable], axis=0).max() < MIN_FACE_M:
-        raise StgaError(f"{places_file}: face: its landmarks lie in one point of the head model; expected a face")
-    detected, found = found, _reliable(found, reliable)
-    take = _take(footage, found, reliable, neutral)
-    if not take:
-        raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
-    if footage.focal == "usual":
-        report("Focal length", 0, 1)
-        footage = _with_focal(footage, solved_focal(head, places, reliable, take))
-        take = _take(footage, found, reliable, neutral)
-    keep = world == "keep" or (world == "auto" and footage.keeps_world)
-    metric = keep and is_metric(head, places, reliable, take)
-    fit = fit_head(head, places, reliable, take, report, metric)
-    _check_cameras(footage, reprojection_errors(fit, places, reliable, take, footage, found))
-    show(partial(picture_of_fit, fit, footage))
-    recorded = RecordedTake(places, reliable, take, partial(_images, footage), partial(_masks, footage), metric)
-    with Helpers() as helpers:
+    with Helpers(folder=out / KEPT_FOLDER) as helpers:
+        if landmarks is None:
+            seen = _detected(head, head_file, footage, source, out, helpers, report, show)
+        else:
+            seen = _given(head, footage, landmarks)
+            _begin(out, source)
+        _check_seen(head, seen, (landmarks or out / LANDMARKS_FOLDER) / PLACES_FILE)
+        footage, take = _with_take(head, footage, seen, report)
+        keep = world == "keep" or (world == "auto" and footage.keeps_world)
+        metric = keep and is_metric(head, seen.places, seen.reliable, take)
+        fit = _fitted(head, seen, take, metric, helpers, report)
+        errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
+        _check_cameras(footage, errors)
+        show(partial(picture_of_fit, fit, footage), {"error_px": _median_px(errors)})
+        images, masks = partial(_images, footage), partial(_masks, footage)
+        recorded = RecordedTake(seen.places, seen.reliable, take, images, masks, metric)
         fit, misfits = by_images(head, fit, recorded, helpers, report)
-    show(partial(picture_of_fit, fit, footage))
-    fit = in_cameras_world(fit) if keep else fit
-    errors = reprojection_errors(fit, places, reliable, take, footage, found)
-    parameters = interpolated(fit.parameters, footage.timesteps)
-    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
-    matte_warnings: tuple[str, ...] = ()
-    if mattes:
-
-        def head_pixels(timestep: int, camera: FootageCamera) -> np.ndarray:
-            return silhouette(posed_mesh(fit, parameters[timestep]), fit.head.model.faces, cameras[camera.name])
-
-        plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
-        source = {**source, "plates": [list(map(str, plates)), _state(plates)]}
-        footage, matte_warnings = with_mattes(footage, head_pixels, out, source, report)
-    torso = follow_torso(fit, parameters, footage, report)
+        fit = in_cameras_world(fit) if keep else fit
+        errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
+        shares = [share for own in misfits.values() for share in own.values()]
+        quality = {"error_px": _median_px(errors)} | ({"unexplained": float(np.mean(shares))} if shares else {})
+        show(partial(picture_of_fit, fit, footage), quality)
+        parameters = interpolated(fit.parameters, footage.timesteps)
+        matte_warnings: tuple[str, ...] = ()
+        if mattes:
+            plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
+            source = {**source, "plates": [list(map(str, plates)), _state(plates)]}
+            head_pixels = _HeadPixels(fit, parameters)
+            footage, matte_warnings = with_mattes(footage, head_pixels, out, source, helpers, report)
+        torso = follow_torso(fit, parameters, footage, helpers, report)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
         fit.to_capture.scale,
-        _warnings(footage, found, fit, keep and not metric)
-        + scale_warnings(fit, places, reliable, footage, found)
+        _warnings(footage, seen.found, fit, keep and not metric)
+        + scale_warnings(fit, seen.places, seen.reliable, footage, seen.found)
         + matte_warnings,
         misfits,
         torso.motion,
@@ -204,21 +180,118 @@ def track(
     write_contact_sheet(
         out / SHEET_FILE,
         footage,
-        cameras,
+        {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras},
         lambda timestep: posed_mesh(torso.fit, torso.parameters[timestep], torso.offsets.get(timestep)),
         fit.head.model.faces,
         result.reprojection_px,
         result.image_misfit,
     )
     if landmarks is not None:  # what a correction of the capture starts from
-        write_landmarks(out / LANDMARKS_FOLDER, detected, places, reliable)
+        write_landmarks(out / LANDMARKS_FOLDER, seen.detected, seen.places, seen.reliable)
     if torso.points is not None:
         write_torso_points(out, torso.points)
     if head_file is None:
         with replacing(out / BUNDLED_MODEL) as copy:
             shutil.copyfile(BUNDLED_HEAD, copy)
     write_capture(out, footage, torso.fit, torso.parameters, torso.offsets, meshes, report)
+    shutil.rmtree(out / KEPT_FOLDER, ignore_errors=True)
     return result
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Landmarks: their places on the head model, which are reliable, and by camera, as detected and as used."""
+
+    places: SurfacePoints
+    reliable: np.ndarray
+    detected: Mapping[str, CameraLandmarks]
+
+    @cached_property
+    def found(self) -> dict[str, CameraLandmarks]:
+        """With confidence 0 for those that are not reliable; cameras without a face have none at all."""
+        return {
+            name: replace(own, confidence=own.confidence * self.reliable) if own.confidence.any() else own
+            for name, own in self.detected.items()
+        }
+
+
+def _given(head: HeadModel, footage: Footage, folder: Path) -> _Seen:
+    """The landmarks of a folder."""
+    detected = read_landmarks(footage, folder)
+    _check_faces(footage, detected)
+    seen = _Seen(*read_places(folder / PLACES_FILE, len(head.model.faces)), detected)
+    for timestep, camera in footage.views():
+        if isinstance(camera.frames, StoredFrames):
+            camera.image(timestep)  # in order, before helping processes ask for some
+    return seen
+
+
+def _detected(
+    head: HeadModel, head_file: Path | None, footage: Footage, source: dict[str, Any], out: Path, helpers: Helpers,
+    report: Report, show: Show,
+) -> _Seen:  # fmt: skip
+    """The landmarks that the networks find, kept in `out`."""
+    is_new, detector = not out.exists(), FaceNetworks()
+    report("Head model", 0, 1)
+    places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
+    _begin(out, source)
+    write_places(out / LANDMARKS_FOLDER / PLACES_FILE, places, reliable)
+    show(partial(picture_of_first_frame, head, footage, detector, places, reliable), {})
+    try:
+        detected = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, helpers, report)
+        _check_faces(footage, detected)
+    except StgaError:
+        if is_new:  # what it holds is of no use for other footage
+            helpers.end()  # which may be writing frames
+            shutil.rmtree(out)
+        raise
+    return _Seen(places, reliable, detected)
+
+
+def _check_seen(head: HeadModel, seen: _Seen, places_file: Path) -> None:
+    """Raise StgaError for landmarks of another number than on the head, and for places that are no face."""
+    check_count(seen.detected, seen.places)
+    neutral = seen.places.on(head.model.v_template, head.model.faces)
+    if np.ptp(neutral[seen.reliable], axis=0).max() < MIN_FACE_M:
+        raise StgaError(f"{places_file}: face: its landmarks lie in one point of the head model; expected a face")
+
+
+def _with_take(
+    head: HeadModel, footage: Footage, seen: _Seen, report: Report
+) -> tuple[Footage, dict[int, TimestepLandmarks]]:
+    """The footage with the focal length of a camera that says none, and the timesteps that the head is fitted to."""
+    take = _take(head, footage, seen)
+    if not take:
+        raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
+    if footage.focal != "usual":
+        return footage, take
+    report("Focal length", 0, 1)
+    footage = _with_focal(footage, solved_focal(head, seen.places, seen.reliable, take))
+    return footage, _take(head, footage, seen)
+
+
+def _fitted(
+    head: HeadModel, seen: _Seen, take: Mapping[int, TimestepLandmarks], metric: bool, helpers: Helpers, report: Report
+) -> HeadFit:
+    """The fit to the landmarks."""
+    part, done = (head, seen.places, seen.reliable, take, metric), lambda rounds: report("Fit", rounds, ROUNDS)
+    report("Fit", 0, ROUNDS)
+    fit: HeadFit = (
+        helpers.map(fit_head, [part], done)[0] if len(take) < LONG_TAKE else helpers.run(fit_head, part, done)
+    )
+    return fit
+
+
+@dataclass(frozen=True)
+class _HeadPixels:
+    """The pixels of the tracked head in a camera's frame; see `mattes.HeadPixels`."""
+
+    fit: HeadFit
+    parameters: Mapping[int, np.ndarray]
+
+    def __call__(self, timestep: int, camera: FootageCamera) -> np.ndarray:
+        mesh, faces = posed_mesh(self.fit, self.parameters[timestep]), self.fit.head.model.faces
+        return silhouette(mesh, faces, self.fit.to_capture.camera(camera.camera))
 
 
 def by_images(
@@ -237,8 +310,13 @@ def by_images(
     fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
     dense = fit_dense(fit, take, helpers, True, report)
     assert dense is not None
-    regions = {t: own.regions.tolist() for t, own in dense.misfit.items()}
-    return dense.fit, {name: {t: own[row] for t, own in regions.items()} for row, name in enumerate(REGIONS)}
+    misfits = {name: {t: float(own[row]) for t, own in dense.misfit.items()} for row, name in enumerate(REGIONS)}
+    return dense.fit, misfits
+
+
+def _median_px(errors: Mapping[str, Mapping[int, float | tuple[float, float]]]) -> float:
+    """Of `reprojection_errors`, or of the pixels in them."""
+    return float(np.median([np.ravel(error)[0] for own in errors.values() for error in own.values()]))
 
 
 def interpolated(parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]) -> dict[int, np.ndarray]:
@@ -318,14 +396,6 @@ def _state(files: Iterable[Path]) -> str:
     return hashlib.sha256(sizes.encode()).hexdigest()[:16]
 
 
-def _reliable(found: Mapping[str, CameraLandmarks], reliable: np.ndarray) -> dict[str, CameraLandmarks]:
-    """The landmarks with confidence 0 for those that are not reliable; cameras without a face have none at all."""
-    return {
-        name: replace(own, confidence=own.confidence * reliable) if own.confidence.any() else own
-        for name, own in found.items()
-    }
-
-
 def _row(camera: CameraLandmarks, timestep: int) -> int | None:
     """The row of a timestep at which the camera sees a face."""
     rows = np.flatnonzero(camera.timesteps == timestep)
@@ -334,12 +404,11 @@ def _row(camera: CameraLandmarks, timestep: int) -> int | None:
     return int(rows[0])
 
 
-def _take(
-    footage: Footage, found: Mapping[str, CameraLandmarks], reliable: np.ndarray, neutral: np.ndarray
-) -> dict[int, TimestepLandmarks]:
-    """The timesteps that the head is fitted to; neutral (N, 3): the landmarks on the neutral head."""
-    everything = {timestep: _at(footage, found, timestep, len(neutral)) for timestep in footage.timesteps}
-    return {timestep: own for timestep, own in everything.items() if determines_pose(own, reliable, neutral)}
+def _take(head: HeadModel, footage: Footage, seen: _Seen) -> dict[int, TimestepLandmarks]:
+    """The timesteps that the head is fitted to."""
+    neutral = seen.places.on(head.model.v_template, head.model.faces)
+    everything = {timestep: _at(footage, seen.found, timestep, len(neutral)) for timestep in footage.timesteps}
+    return {timestep: own for timestep, own in everything.items() if determines_pose(own, seen.reliable, neutral)}
 
 
 def _with_focal(footage: Footage, pixels: float | None) -> Footage:

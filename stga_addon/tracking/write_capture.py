@@ -89,11 +89,13 @@ def _entry(out: Path, timestep: int, source: FootageCamera, number: int, camera:
         "file_path": name,
         **camera_entry(camera),
     }
-    mask = source.mask(timestep)
+    path = mask_name(timestep, number)
+    mask = None if source.mattes.get(timestep) == out / path else source.mask(timestep)
     if mask is not None:
-        entry["fg_mask_path"] = mask_name(timestep, number)
-        with replacing(out / entry["fg_mask_path"]) as partial:
+        with replacing(out / path) as partial:
             Image.fromarray(mask).save(partial, format="PNG")
+    if mask is not None or timestep in source.mattes:
+        entry["fg_mask_path"] = path
     return entry
 
 

@@ -187,19 +187,29 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
 
 
 @pytest.mark.slow
-def test_result_does_not_depend_on_how_many_processes_help(monkeypatch):
-    """Catches parts that are put together in another order, and what one part leaves behind for the next."""
+def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeypatch):
+    """Catches parts that are put together in another order, what one part leaves behind for the next, and an
+    interrupted take that begins anew or ends otherwise."""
     monkeypatch.setattr(dense, "PART_TIMESTEPS", 3)
     monkeypatch.setattr(dense, "TEXTURE_PART_TIMESTEPS", 3)
     take = scene(np.radians([-40, 40]), openings=OPENINGS[:6], size=(115, 150))
     first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
     alone = fit_dense(first, take.take, Helpers(1))
-    with Helpers(2) as helpers:
+
+    def interrupt(stage, done, total):
+        if done == total - 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_dense(first, take.take, Helpers(1, tmp_path), report=interrupt)
+    assert len(list(tmp_path.iterdir())) == 1
+    with Helpers(2, tmp_path) as helpers:
         together = fit_dense(first, take.take, helpers)
+    assert len(list(tmp_path.iterdir())) == 2
     for timestep, parameters in alone.fit.parameters.items():
         np.testing.assert_array_equal(together.fit.parameters[timestep], parameters)
         np.testing.assert_array_equal(together.landmarks[timestep].points, alone.landmarks[timestep].points)
-        assert together.misfit[timestep].all == alone.misfit[timestep].all
+        np.testing.assert_array_equal(together.misfit[timestep], alone.misfit[timestep])
 
 
 @pytest.mark.slow

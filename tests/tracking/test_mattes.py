@@ -11,6 +11,7 @@ from stga_addon.errors import StgaError
 from stga_addon.tracking import mattes
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.mattes import with_mattes
+from stga_addon.worker.helpers import Helpers
 
 from .scenes import HEIGHT, WIDTH, write_image, write_video
 
@@ -60,7 +61,7 @@ def silent(stage, done, total):
 def test_made_once_and_kept(tmp_path, halves):
     """Catches mattes that an interrupted tracking makes again, and those of another head that are kept."""
     footage = take(tmp_path)
-    found, warnings = with_mattes(footage, head, tmp_path / "out", {"head": "a"}, silent)
+    found, warnings = with_mattes(footage, head, tmp_path / "out", {"head": "a"}, Helpers(1), silent)
     assert (halves.asked, warnings) == (3, ())
     files = sorted(path.name for path in (tmp_path / "out/fg_masks").iterdir())
     assert files == ["00000_00.png", "00001_00.png", "00002_00.png"]
@@ -68,9 +69,9 @@ def test_made_once_and_kept(tmp_path, halves):
     assert mask[:, : WIDTH // 2 - 2].min() == 255
     assert mask[:, WIDTH // 2 + 2 :].max() == 0
     (tmp_path / "out/fg_masks/00001_00.png").unlink()
-    with_mattes(footage, head, tmp_path / "out", {"head": "a"}, silent)
+    with_mattes(footage, head, tmp_path / "out", {"head": "a"}, Helpers(1), silent)
     assert halves.asked == 4
-    with_mattes(footage, head, tmp_path / "out", {"head": "b"}, silent)
+    with_mattes(footage, head, tmp_path / "out", {"head": "b"}, Helpers(1), silent)
     assert halves.asked == 7
 
 
@@ -79,7 +80,7 @@ def test_masks_of_the_footage_stay(tmp_path, halves):
     for number in range(3):
         write_image(tmp_path / f"footage/masks/left/{number:04d}.png", 90)
     footage = take(tmp_path)
-    found, _ = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    found, _ = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
     assert halves.asked == 0
     assert not (tmp_path / "out/fg_masks").exists()
     assert found.cameras[0].mask(0).max() == 90
@@ -90,7 +91,7 @@ def test_frames_after_the_first_that_lack_a_mask(tmp_path, halves):
     for number in (0, 2):
         write_image(tmp_path / f"footage/masks/left/{number:04d}.png", 90)
     footage = take(tmp_path, 4)
-    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
     assert [int(found.cameras[0].mask(timestep).max()) for timestep in range(4)] == [90, 255, 90, 255]
     assert (halves.asked, warnings) == (2, ())
 
@@ -102,7 +103,7 @@ def test_clean_plate_of_a_camera(tmp_path, halves):
     Image.new("RGB", (WIDTH, HEIGHT), (220, 220, 220)).save(tmp_path / "footage/plates/left.png")
     footage = take(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["left"]
-    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
     assert (halves.asked, warnings) == (0, ())
     assert found.cameras[0].mask(2)[:, : WIDTH // 2 - 2].min() == 255
     assert found.cameras[0].mask(2)[:, WIDTH // 2 + 2 :].max() == 0
@@ -112,7 +113,7 @@ def test_a_plate_of_another_size(tmp_path):
     """Catches a plate of another size that ends in OpenCV's error."""
     write_image(tmp_path / "footage/plates/left.png", size=(7, 5))
     with pytest.raises(StgaError, match=r"left\.png: the image has 7 x 5 pixels"):
-        with_mattes(take(tmp_path), head, tmp_path / "out", {}, silent)
+        with_mattes(take(tmp_path), head, tmp_path / "out", {}, Helpers(1), silent)
 
 
 def test_a_folder_of_mattes(tmp_path):
@@ -170,5 +171,5 @@ def test_undistorted_mattes_are_not_undistorted_again(tmp_path, halves):
     def refuse(mask):
         raise AssertionError("resampled")
 
-    found, _ = with_mattes(footage, head, tmp_path / "out", {}, silent)
+    found, _ = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
     assert replace(found.cameras[0], undistortion=refuse).mask(0) is not None

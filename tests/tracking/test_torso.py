@@ -35,9 +35,10 @@ from stga_addon.tracking.torso_motion import (
     read_torso_motion,
     read_torso_points,
 )
-from stga_addon.tracking.torso_take import NECK, ROOT, PosedTorso, TorsoPose, TorsoTake, with_root
+from stga_addon.tracking.torso_take import NECK, ROOT, BothWays, PosedTorso, TorsoPose, TorsoTake, with_root
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import posed_mesh
+from stga_addon.worker.helpers import Helpers
 
 from .recording import write_footage
 from .test_fit import places_on
@@ -150,7 +151,7 @@ def torso_angles(fit, parameters, offsets):
 def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, motions):
     """Catches shoulders that ride on the head, and a head that is moved to turn them."""
     fit, parameters, footage = take(head, heads * SWING_DEG, torsos * SWING_DEG)
-    followed = follow_torso(fit, parameters, footage, quiet)
+    followed = follow_torso(fit, parameters, footage, Helpers(1), quiet)
     found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso.motion in motions
     wrong = torso_angles(fit, found, offsets) - torsos * SWING_DEG
@@ -173,7 +174,7 @@ def test_shoulders_that_are_lifted_are_followed(head, lifted):
     """Catches a torso that is only turned, of which patterned cloth is off by pixels, offsets that FLAME's joints undo,
     a head that is moved with them, and points that are as deep as the neck instead of on the chest."""
     fit, parameters, footage = lifted
-    followed = follow_torso(fit, parameters, footage, quiet)
+    followed = follow_torso(fit, parameters, footage, Helpers(1), quiet)
     found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso.motion == "own"
     assert torso.shift_mm > 5
@@ -223,7 +224,8 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     motion = posed.motion({t: TorsoPose(np.eye(3), LIFT_M[t]) for t in parameters}, rigid=True)
     first, moved = 3, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
     shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
-    bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), quiet)
+    walk = BothWays(Helpers(1), quiet, TIMESTEPS)
+    bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), walk)
     meshes = {}
     for timestep, torso in motion.items():
         values, offset = posed.with_offset(torso, bending.at(timestep))
@@ -244,7 +246,7 @@ def test_a_torso_that_rides_on_the_head_changes_nothing(head):
     """Catches a torso that noise turns: a bust on a turntable, or a studio capture, keeps its parameters bit for
     bit."""
     fit, parameters, footage = take(head, SWING_DEG, SWING_DEG)
-    followed = follow_torso(fit, parameters, footage, quiet)
+    followed = follow_torso(fit, parameters, footage, Helpers(1), quiet)
     found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso.motion == "head"
     assert not offsets
@@ -256,7 +258,7 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
     """Catches shoulders that follow the backdrop."""
     fit, parameters, footage = take(head, [0, 5, 10, 15], [0, 0, 0, 0], (40, 55))
     bare = tuple(replace(own, frames=replace(own.frames, masks=[None] * 4)) for own in footage.cameras)
-    followed = follow_torso(fit, parameters, replace(footage, cameras=bare), quiet)
+    followed = follow_torso(fit, parameters, replace(footage, cameras=bare), Helpers(1), quiet)
     found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso is None
     assert not offsets

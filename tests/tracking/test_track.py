@@ -4,12 +4,14 @@ import os
 import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
@@ -17,16 +19,24 @@ from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
 from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
-from stga_addon.flame.forward import flame_forward
+from stga_addon.flame.forward import RIGID_SIZE, flame_forward
 from stga_addon.flame.teeth import flame_model
+from stga_addon.perform.perform import perform
+from stga_addon.perform.tracking import STAGES
+from stga_addon.requests.values import Track
+from stga_addon.tracking.camera_scale import scale_warnings
 from stga_addon.tracking.correspondence import nearest_points
+from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.folder import PLACES_FILE
+from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera
+from stga_addon.tracking.landmarks import CameraLandmarks, detect_landmarks, landmark_file, read_camera
 from stga_addon.tracking.mesh_image import shaded_image
+from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
+from stga_addon.worker.helpers import Helpers
 
 from .recording import LANDMARKS, SIZE, record, rig, write_footage
 from .scenes import write_video
@@ -131,6 +141,20 @@ def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
     for timestep in (0, 3):
         missed = (capture.mesh(timestep) - unit * world.apply(meshes[timestep]))[head.model.masks["face"]]
         assert np.linalg.norm(missed, axis=1).mean() < 2e-3
+
+
+def test_progress_names_step_and_quality(recorded):
+    """Catches a bar that jumps back, a step that it does not know, and a fit of which nobody hears how good it is."""
+    folder, _ = recorded
+    paths = (folder / "footage", folder / "head.npz", folder / "out")
+    told = []
+    perform(Track(*paths, landmarks=folder / "points"), lambda progress: bool(told.append(progress)), print)
+    shares = [progress.share for progress in told]
+    assert shares == sorted(shares)
+    assert {progress.stage for progress in told} <= {*STAGES, "Tracked"}
+    quality = {progress.stage: progress.figures().get("error_px") for progress in told}
+    assert quality["Opening the footage"] is None
+    assert 0 < quality["Heads"] < 0.5
 
 
 @pytest.mark.parametrize("fps", [None, 60000 / 1001])
@@ -338,6 +362,27 @@ def test_a_resolution_that_changes_is_named(recorded, capsys):
     assert not (folder / "out").exists()
 
 
+@pytest.mark.parametrize(("side_deg", "is_told"), [(68, False), (45, True)])
+def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(head, side_deg, is_told):
+    """Catches a warning on a sound camera that sees the face nearly in profile, where landmarks are of another size by
+    up to 7 % on the path-traced head; and a wrong focal length at the side that is no longer told."""
+    places, used = places_on(head, LANDMARKS), np.ones(LANDMARKS, bool)
+    parameters = {t: np.zeros(head.model.n_expression + RIGID_SIZE) for t in range(3)}
+    shape, world = np.zeros(head.model.n_identity), Similarity(1.0, np.eye(3), np.zeros(3))
+    fit = HeadFit(person(head, shape), shape, parameters, world)
+    at = places.on(head.model.v_template, head.model.faces)
+    cameras, found = [], {}
+    for number, angle in enumerate(np.radians([-30, -10, 10, 30, side_deg])):
+        camera = look_at(at.mean(0) + 0.9 * np.array([np.sin(angle), 0, np.cos(angle)]), at.mean(0), 200, 200, 500.0)
+        pixels, _ = camera.project(at)
+        size = 0.93 if number == 4 else 1.0
+        points = np.stack([pixels.mean(0) + size * (pixels - pixels.mean(0))] * 3)
+        found[f"cam{number}"] = CameraLandmarks(np.arange(3), points, np.ones(points.shape[:2]))
+        cameras.append(FootageCamera(f"cam{number}", camera, None))
+    warnings = scale_warnings(fit, places, used, Footage(Path("footage"), tuple(cameras), (0, 1, 2)), found)
+    assert [text[:40] for text in warnings] == (["camera cam4: shows the head 7.0% smaller"] if is_told else [])
+
+
 def test_footage_without_a_face(recorded, capsys):
     """Catches a crash, or a capture of nothing, where nobody is in the picture."""
     folder, _ = recorded
@@ -369,10 +414,10 @@ def test_detection_resumes_camera_by_camera(recorded):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        detect_landmarks(footage, detector, folder / "found", cancel)
+        detect_landmarks(footage, detector, folder / "found", Helpers(1), cancel)
     assert len(list((folder / "found").iterdir())) == 2
     detector.calls = 0
-    found = detect_landmarks(footage, detector, folder / "found", lambda *_: None)
+    found = detect_landmarks(footage, detector, folder / "found", Helpers(1), lambda *_: None)
     assert detector.calls == 15
     assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
     camera = footage.cameras[0]
@@ -475,8 +520,9 @@ def test_two_faces_are_reported_with_camera_and_frame(recorded):
     """Catches a head that jumps between two people."""
     folder, _ = recorded
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
+    footage, detector = open_footage(folder / "footage"), Counting([two, two + 30])
     with pytest.raises(StgaError, match=r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
-        detect_landmarks(open_footage(folder / "footage"), Counting([two, two + 30]), folder / "found", lambda *_: None)
+        detect_landmarks(footage, detector, folder / "found", Helpers(1), lambda *_: None)
 
 
 def test_pictures_of_a_head_are_tracked(tmp_path, head):
