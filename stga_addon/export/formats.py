@@ -44,7 +44,7 @@ class Content:
         for number, mesh in self.meshes:
             yield number, to_world(self.avatar.splats, self.avatar.frames(mesh))
         if number is None:
-            raise StgaError(f"{path}: there is no posed mesh to export")
+            raise StgaError(f"{path}: there is no posed mesh")
 
     def first_frame(self, path: Path) -> Splats:
         """The splats in world space on the first mesh. Raises StgaError as `frames`."""

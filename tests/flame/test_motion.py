@@ -9,9 +9,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stga_addon.flame.forward import FlameFrame, flame_forward, neutral_frame
 from stga_addon.flame.model import FlameModel
-from stga_addon.flame.motion import PARTS, ROTATIONS, retimed, strengthened, transferred_motion
 from stga_addon.flame.quaternions import continuous, from_axis_angle, slerp, to_axis_angle
-from stga_addon.flame.sequence import FlameSequence, sequence_mesh
+from stga_addon.flame.sequence import (
+    PARTS,
+    ROTATIONS,
+    FlameSequence,
+    retimed,
+    sequence_mesh,
+    strengthened,
+    transferred_motion,
+)
 
 from .conftest import random_frame
 

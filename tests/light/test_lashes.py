@@ -6,8 +6,7 @@ import numpy as np
 import trimesh
 
 from light.scenes import blocked
-from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.light import AvatarLight
+from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import uniform

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from light.scenes import lit_avatar
+from stga_addon.avatar.splats import sh_color
 from stga_addon.capture.color import srgb_to_linear
 from stga_addon.errors import StgaError
 from stga_addon.light import relight
-from stga_addon.light.harmonics import rotated, sh_color, uniform
+from stga_addon.light.harmonics import rotated, uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Light, Lighting
 

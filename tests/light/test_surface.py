@@ -21,7 +21,8 @@ def test_splats_are_at_the_nearest_point_of_the_mesh():
     avatar = replace(avatar, splats=splats, faces=ball)
     frames = avatar.frames(avatar.neutral)
     points = frames.origin + frames.scale[:, None] * np.einsum("nij,nj->ni", frames.rotation, xyz)
-    corners, weights = surface_points(avatar)
+    face, weights = surface_points(avatar)
+    corners = ball[face]
     found = np.einsum("nk,nkc->nc", weights, avatar.neutral[corners])
     mesh = trimesh.Trimesh(avatar.neutral, ball, process=False)
     _, least, _ = trimesh.proximity.closest_point_naive(mesh, points)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.avatar.offsets.strain_position import RATE_SHARE
+from stga_addon.avatar.offsets import RATE_SHARE
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz

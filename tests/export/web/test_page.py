@@ -20,9 +20,8 @@ from export.web.browser import Browser
 from stga_addon.avatar.file import Avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.data_file import baked_rig, data_file
 from stga_addon.export.web.page import page
-from stga_addon.export.web.rig import baked_rig
 from stga_addon.render.render import render_avatar, to_uint8
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.settings import make_settings
@@ -199,7 +198,7 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
     "cut at the data": (lambda page: cut(page, 'id="data">'), "This page holds no avatar data."),
     "cut in the data": (lambda page: cut(page, 'id="data">', 40_000), "The avatar data is damaged."),
     "light without its arrays": (
-        lambda page: with_header(page, "light", value={"damping": 0.5}),
+        lambda page: with_header(page, "light", value={"damping": 0.5, "recorded": [1] * 27, "typical": [1] * 3}),
         "The avatar data is damaged: light_transfer is missing or malformed.",
     ),
     "cut to odd base64": (lambda page: cut(page, 'id="data">', 40_001), "The avatar data is damaged."),

@@ -15,9 +15,8 @@ from avatar.conftest import random_splats
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.strain import color_range
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.data_file import baked_rig, data_file
 from stga_addon.export.web.page import PLAYER
-from stga_addon.export.web.rig import baked_rig
 
 from .conftest import make_head
 

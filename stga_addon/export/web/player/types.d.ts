@@ -50,8 +50,8 @@ export interface Header {
   sliders: Slider[];
   /** Controls that move expressions, jaw and eyes together: one counts up to the weight of another only. */
   shapes?: { names: string[]; opens: string; limited: string };
-  /** How much albedo is drawn to its mean, 0 to 1; where the light of the capture is known. */
-  light?: { damping: number };
+  /** Where it is known, the light of the capture (27 harmonics); how much albedo is drawn to its mean, 0 to 1, and that. */
+  light?: { damping: number; recorded: number[]; typical: number[] };
   views: View[];
 }
 
@@ -85,7 +85,10 @@ export interface Arrays {
   light_occlusion?: DataArray;
   light_irradiance?: DataArray;
   light_roughness?: DataArray;
-  /** Coefficients of signals (signals.js). */
+  light_face?: DataArray;
+  light_lash_face?: DataArray;
+  light_lash_corners?: DataArray;
+  /** Coefficients of signals (face_frames.js). */
   [offset: string]: DataArray | undefined;
 }
 
@@ -115,7 +118,7 @@ export interface Lighting {
   /** A built-in environment, turned about the upward axis by `turn` radians. */
   environment?: string;
   turn?: number;
-  /** Nine spherical harmonics of radiance, red, green, blue of each (harmonics.js). */
+  /** Nine spherical harmonics of radiance, red, green, blue of each (light.js). */
   harmonics?: number[];
   /** Throws shadows; takes the place of the environment's sun. */
   sun?: Sun;
