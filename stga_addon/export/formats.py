@@ -170,11 +170,6 @@ def check_suffix(path: Path, format: str) -> None:
         raise StgaError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
 
 
-def range_bytes(avatar: Avatar, format: str, frames: int) -> int:
-    """Size of the files that a range of frames takes in a format of the source "range"."""
-    return FORMATS[format].size(avatar, frames)
-
-
 def check_free_space(path: Path, size: int) -> None:
     """Raise StgaError where the disk that `path` is to be written to has less than `size` bytes free."""
     folder = next(parent for parent in path.absolute().parents if parent.exists())

@@ -90,26 +90,7 @@ def read_ply(path: Path) -> Splats:
     Properties may stand in any order; those that are not the layout's are ignored.
     Raises StgaError naming the file and the property that is missing, not finite or truncated.
     """
-    return splats_from_columns(path, read_vertices(path))
-
-
-def splat_columns(splats: Splats) -> np.ndarray:
-    """(N, 62) float32 in the order of PROPERTIES."""
-    count = len(splats)
-    columns = np.zeros((count, len(PROPERTIES)), "<f4")
-    columns[:, 0:3] = splats.xyz
-    columns[:, 6:9] = splats.sh[:, 0]
-    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
-    rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
-    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
-    columns[:, 54] = splats.opacity
-    columns[:, 55:58] = splats.log_scale
-    columns[:, 58:62] = splats.rotation
-    return columns
-
-
-def splats_from_columns(path: Path, vertices: np.ndarray) -> Splats:
-    """Splats (face 0) from the structured array of `read_vertices`. Raises StgaError as `read_ply`."""
+    vertices = read_vertices(path)
     rest = sum(1 for name in vertices.dtype.names or () if name.startswith("f_rest_"))
     if rest not in [3 * (size**2 - 1) for size in range(1, MAX_SH_DEGREE + 2)]:
         raise StgaError(f"{path}: has {rest} f_rest properties, expected 0, 9, 24 or 45")
@@ -127,6 +108,21 @@ def splats_from_columns(path: Path, vertices: np.ndarray) -> Splats:
         face=np.zeros(count, np.int32),
         unbound=np.zeros(count, bool),
     )
+
+
+def splat_columns(splats: Splats) -> np.ndarray:
+    """(N, 62) float32 in the order of PROPERTIES."""
+    count = len(splats)
+    columns = np.zeros((count, len(PROPERTIES)), "<f4")
+    columns[:, 0:3] = splats.xyz
+    columns[:, 6:9] = splats.sh[:, 0]
+    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
+    rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
+    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
+    columns[:, 54] = splats.opacity
+    columns[:, 55:58] = splats.log_scale
+    columns[:, 58:62] = splats.rotation
+    return columns
 
 
 def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -110,13 +110,6 @@ def test_malformed_frames(
         read_frame(path, tiny_flame) and read_identity(path, tiny_flame)
 
 
-def test_truncated_frame(tmp_path: Path, tiny_flame: FlameModel) -> None:
-    path = _write(tmp_path / "cut.npz", _arrays(5, tiny_flame))
-    path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(StgaError, match=r"cut\.npz"):
-        read_frame(path, tiny_flame)
-
-
 def _sequence(model: FlameModel) -> FlameSequence:
     rng = np.random.default_rng(6)
     frames = {3: random_frame(30, 4), 7: random_frame(70, 4)}

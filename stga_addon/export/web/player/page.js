@@ -8,7 +8,7 @@
 
 import { DataError } from './data.js';
 import { ENVIRONMENTS } from './light.js';
-import { StgaAvatar } from './stga-avatar.js';
+import { StgaAvatar, hexOf } from './stga-avatar.js';
 import { scaled } from './vector.js';
 
 const PAD_ANGLE = 2.6; // radians from the camera's own direction at the rim of the pad: the light comes from behind
@@ -38,30 +38,27 @@ export class LightControls {
     this.color = /** @type {HTMLInputElement} */ (section.querySelector('input[type="color"]'));
     this.dragged = /** @type {HTMLElement} */ (section.querySelector('#light-dragged'));
     section.hidden = false;
-    this.addKinds();
+    const environments = Object.entries(ENVIRONMENTS).map(([name, { label }]) => [name, label]);
+    for (const [name, label] of [['recorded', 'As recorded'], [DRAGGED, 'A light to drag'], ...environments]) {
+      this.select.add(new Option(label, name));
+    }
+    this.select.addEventListener('change', () => {
+      this.kind = this.select.value;
+      this.showKind();
+      this.apply();
+    });
     this.rows = Object.entries(RANGES).map(([name, range]) => this.addRange(section, name, range));
     this.color.addEventListener('input', () => this.apply());
     for (const name of ['pointerdown', 'pointermove']) {
       this.pad.addEventListener(name, (event) => this.drag(/** @type {PointerEvent} */ (event)));
     }
     avatar.addEventListener('camerachange', () => this.showDirection());
-    avatar.addEventListener('lightchange', () => this.followAvatar());
+    avatar.addEventListener('lightchange', () => {
+      const sun = avatar.lighting?.sun;
+      if (sun && this.kind === DRAGGED) this.toward = sun.toward; // it may have been dragged over the head
+      this.showDirection();
+    });
     this.showKind();
-  }
-
-  addKinds() {
-    const environments = Object.entries(ENVIRONMENTS).map(([name, { label }]) => [name, label]);
-    for (const [name, label] of [['recorded', 'As recorded'], [DRAGGED, 'A light to drag'], ...environments]) {
-      this.select.add(new Option(label, name));
-    }
-    this.select.addEventListener('change', () => this.choose(this.select.value));
-  }
-
-  /** @param {Kind} kind */
-  choose(kind) {
-    this.kind = kind;
-    this.showKind();
-    this.apply();
   }
 
   /**
@@ -70,22 +67,17 @@ export class LightControls {
    * @param {typeof RANGES['turn']} range
    */
   addRange(section, name, { label, kinds, low, high, value, format }) {
-    const row = document.createElement('label');
-    row.className = 'range';
-    row.innerHTML = '<span></span><output></output><input type="range" step="any">';
-    const [text, output, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([...row.children]);
-    text.textContent = label;
-    [input.min, input.max, input.value, input.name] = [String(low), String(high), String(value), name];
+    const [row, output, input] = sliderRow(section, 'range', label, low, high);
+    [input.value, input.name] = [String(value), name];
     const show = () => {
       output.textContent = format(Number(input.value));
-      input.style.setProperty('--done', `${(100 * (Number(input.value) - low)) / (high - low)}%`);
+      fillTrack(input);
     };
     input.addEventListener('input', () => {
       show();
       this.apply();
     });
     show();
-    section.append(row);
     return { name, row, input, kinds };
   }
 
@@ -110,13 +102,6 @@ export class LightControls {
     if (this.kind !== DRAGGED) return { environment: this.kind, turn: (Math.PI / 180) * value.turn, exposure };
     const color = scaled(linearColor(this.color.value), strength);
     return { even: [even, even, even], sun: { toward: this.toward, color }, exposure };
-  }
-
-  /** The light may have been dragged over the head. */
-  followAvatar() {
-    const sun = this.avatar.lighting?.sun;
-    if (sun && this.kind === DRAGGED) this.toward = sun.toward;
-    this.showDirection();
   }
 
   /** @param {PointerEvent} event */
@@ -202,20 +187,12 @@ function signed(value) {
  * @property {number} high
  * @property {() => number} read what plays
  * @property {(value: number | null) => void} write null: as recorded
- * @property {(value: number) => string} format
+ * @property {(value: number) => string} [format]
  */
 
 const SLIDERS_SHOWN = 8;
-const SHAPES_FIRST = [
-  'browInnerUp',
-  'mouthPucker',
-  'mouthSmileRight',
-  'mouthSmileLeft',
-  'eyeBlinkRight',
-  'eyeBlinkLeft',
-  'mouthClose',
-  'jawOpen',
-]; // the last comes first
+const SHAPES_FIRST = // the last comes first
+  'browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight eyeBlinkLeft mouthClose jawOpen'.split(' ');
 const FACTS_INTERVAL_MS = 500;
 const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
 const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
@@ -355,13 +332,7 @@ const swatches = new Map(); // button → color; null: the theme's
 
 function applyBackground() {
   const dark = document.documentElement.dataset.theme === 'dark';
-  const trained = `#${info()
-    .background.map((part) =>
-      Math.round(255 * part)
-        .toString(16)
-        .padStart(2, '0'),
-    )
-    .join('')}`;
+  const trained = hexOf(info().background);
   avatar.background = background ?? (dark ? DARK_BACKGROUND : trained);
   for (const [swatch, color] of swatches) setPressed(swatch, color === background);
 }
@@ -376,11 +347,8 @@ function addBackgrounds() {
     swatch.addEventListener('click', () => chooseBackground(color || null));
     row.append(swatch);
   }
-  const custom = Object.assign(document.createElement('input'), {
-    type: 'color',
-    className: 'swatch',
-    title: 'Any color',
-  });
+  const custom = document.createElement('input');
+  Object.assign(custom, { type: 'color', className: 'swatch', title: 'Any color' });
   custom.addEventListener('input', () => chooseBackground(custom.value));
   row.append(custom);
   applyBackground();
@@ -406,16 +374,30 @@ function toggleTheme() {
 
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
-/** @type {(parent: HTMLElement, options: SliderOptions) => HTMLLabelElement} */
-function addSlider(parent, { id, label, low, high, read, write, format }) {
-  const row = document.createElement('label');
-  row.className = 'slider';
-  row.dataset.name = id;
-  row.innerHTML = '<span></span><button class="value" title="Release"></button><input type="range" step="any">';
-  const [name, value] = [element('span', HTMLElement, row), element('button', HTMLElement, row)];
-  const input = element('input', HTMLInputElement, row);
+/**
+ * A row with a name, an `output` or a button that shows the value, and the slider itself.
+ * @param {HTMLElement} parent
+ * @param {'slider' | 'range'} kind the first has the button
+ * @param {string} label
+ * @param {number} low
+ * @param {number} high
+ * @returns {[HTMLLabelElement, HTMLElement, HTMLInputElement]}
+ */
+function sliderRow(parent, kind, label, low, high) {
+  const row = Object.assign(document.createElement('label'), { className: kind });
+  const shown = kind === 'slider' ? '<button class="value" title="Release"></button>' : '<output></output>';
+  row.innerHTML = `<span></span>${shown}<input type="range" step="any">`;
+  const [name, value, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([...row.children]);
   name.textContent = label;
   [input.min, input.max] = [String(low), String(high)];
+  parent.append(row);
+  return [row, value, input];
+}
+
+/** @type {(parent: HTMLElement, options: SliderOptions) => HTMLLabelElement} */
+function addSlider(parent, { id, label, low, high, read, write, format = fixed }) {
+  const [row, value, input] = sliderRow(parent, 'slider', label, low, high);
+  row.dataset.name = id;
   let pinned = false;
   const pin = (/** @type {boolean} */ whether) => {
     pinned = whether;
@@ -439,7 +421,6 @@ function addSlider(parent, { id, label, low, high, read, write, format }) {
     write(null);
   });
   sliders.push({ update, release: () => pin(false) });
-  parent.append(row);
   update();
   return row;
 }
@@ -464,7 +445,6 @@ function addExpressions() {
       high: reach,
       read: () => avatar.getExpression(name),
       write: (value) => avatar.setExpression(name, value),
-      format: (value) => value.toFixed(2),
     }),
   );
   section.hidden = !rows.length;
@@ -500,7 +480,6 @@ function addFaceShapes() {
       high: 1,
       read: () => avatar.getShape(name),
       write: (value) => avatar.setShape(name, value),
-      format: (value) => value.toFixed(2),
     }),
   );
   showFirst(rows, byId('more-shapes'));

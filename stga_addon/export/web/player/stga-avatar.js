@@ -235,11 +235,7 @@ export class StgaAvatar extends HTMLElement {
   /** "#rrggbb" or "transparent". */
   get background() {
     const [red, green, blue, alpha] = this.#player?.background ?? [1, 1, 1, 1];
-    const hex = (/** @type {number} */ part) =>
-      Math.round(255 * part)
-        .toString(16)
-        .padStart(2, '0');
-    return alpha ? `#${hex(red)}${hex(green)}${hex(blue)}` : 'transparent';
+    return alpha ? hexOf([red, green, blue]) : 'transparent';
   }
 
   set background(value) {
@@ -429,6 +425,17 @@ export class StgaAvatar extends HTMLElement {
     this.#canvas.height = height;
     if (this.#player) this.#player.draw(); // at once: setting its size has cleared the canvas
   }
+}
+
+/** @param {number[]} color red, green, blue from 0 to 1 */
+export function hexOf(color) {
+  return `#${color
+    .map((part) =>
+      Math.round(255 * part)
+        .toString(16)
+        .padStart(2, '0'),
+    )
+    .join('')}`;
 }
 
 /** @param {string} address */

@@ -14,15 +14,6 @@ export interface DataArray {
   values: Values;
 }
 
-/** Entry of an array in the header of a data file (docs/formats.md), before it is checked. */
-export interface Entry {
-  type: unknown;
-  shape: number[];
-  planes: number;
-  low: number;
-  step: number;
-}
-
 export interface View {
   name: string;
   size: [number, number];
@@ -55,42 +46,13 @@ export interface Header {
   views: View[];
 }
 
-/** Arrays of a data file, checked. */
-export interface Arrays {
-  xyz: DataArray;
-  rotation: DataArray;
-  rotation_largest: DataArray;
-  log_scale: DataArray;
-  opacity: DataArray;
-  color: DataArray;
-  faces: DataArray;
-  neutral: DataArray;
-  splats_per_face: DataArray;
-  base: DataArray;
-  basis: DataArray;
-  correctives: DataArray;
-  weights: DataArray;
-  joint_rest: DataArray;
-  joint_basis: DataArray;
-  coefficients: DataArray;
-  pose: DataArray;
-  translation: DataArray;
-  selection?: DataArray;
-  sh?: DataArray;
-  strain_color?: DataArray;
-  strain_range?: DataArray;
-  shape_linear?: DataArray;
-  shape_products?: DataArray;
-  light_transfer?: DataArray;
-  light_occlusion?: DataArray;
-  light_irradiance?: DataArray;
-  light_roughness?: DataArray;
-  light_face?: DataArray;
-  light_lash_face?: DataArray;
-  light_lash_corners?: DataArray;
-  /** Coefficients of signals (face_frames.js). */
-  [offset: string]: DataArray | undefined;
-}
+type NeededArrays =
+  | ('xyz' | 'rotation' | 'rotation_largest' | 'log_scale' | 'opacity' | 'color' | 'splats_per_face')
+  | ('faces' | 'neutral' | 'base' | 'basis' | 'correctives' | 'weights' | 'joint_rest' | 'joint_basis')
+  | ('coefficients' | 'pose' | 'translation');
+
+/** Arrays of a data file, checked; what others there are, `checkData` (data.js) lists. */
+export type Arrays = Record<NeededArrays, DataArray> & { [name: string]: DataArray | undefined };
 
 export interface Data {
   header: Header;
