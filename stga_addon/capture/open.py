@@ -71,7 +71,10 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
             f"principal point convention {shorten(principal_point)} is not one of {', '.join(PRINCIPAL_POINTS)}"
         )
     if folder.suffix.lower() == ".npz" and isfile(folder):
-        return open_flame_motion(folder.resolve(), flame)
+        path = folder.resolve()
+        # A file that names its expressions is of the bundled head, and needs no model file.
+        model_file = BUNDLED_HEAD if EXPRESSION_NAMES in read_npz(path) else _model_file(path, flame)
+        return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not isdir(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
     root = folder.resolve()
@@ -96,8 +99,9 @@ def _open_layout(
     if (root / CANONICAL_NAME).is_file() or any(frame.flame for frame in frames):
         return open_flame_capture(root, transforms, views, flame)
     if any(frame.mesh for frame in frames):
-        return open_mesh_capture(root, transforms, views)
-    if is_release(root):
+        files = tracked_files(frames, "mesh")
+        return _mesh_capture(root, "mesh", files, transforms.canonical_mesh, views, transforms.regions)
+    if any((root / "meshes").glob("mesh_*.json")):
         return open_release(root, views)
     if not transforms.splits and mesh_files(root):
         return open_mesh_folder(root)
@@ -167,15 +171,6 @@ NEUTRAL_NAMES = ("neutral", "canonical")
 REGIONS_NAME = "regions.json"
 
 
-def open_mesh_capture(root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]]) -> Capture:
-    """Capture of layout "mesh": `mesh_path` per frame, `canonical_mesh_path` and `regions_path` at the top level.
-
-    Only the canonical mesh is read now, the others when they are needed. Raises StgaError.
-    """
-    files = tracked_files(transforms.frames, "mesh")
-    return _mesh_capture(root, "mesh", files, transforms.canonical_mesh, views, transforms.regions)
-
-
 def open_mesh_folder(root: Path) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep.
 
@@ -197,11 +192,6 @@ def open_mesh_folder(root: Path) -> Capture:
 def mesh_files(folder: Path) -> list[Path]:
     """The meshes directly in a folder, by name."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES and path.is_file())
-
-
-def rigid_free(mesh: Callable[[int], np.ndarray], neutral: np.ndarray) -> Callable[[int, str], np.ndarray]:
-    """`Capture.expression_mesh` for meshes without parameters, which ignores the choice of zero pose."""
-    return lambda timestep, zero_pose: without_head_motion(mesh(timestep), neutral)
 
 
 def _mesh_capture(
@@ -234,14 +224,9 @@ def _mesh_capture(
         timesteps=tuple(files),
         regions=regions,
         mesh=mesh,
-        expression_mesh=rigid_free(mesh, neutral),
+        expression_mesh=lambda timestep, zero_pose: without_head_motion(mesh(timestep), neutral),
         warnings=tuple(warnings),
     )
-
-
-def is_release(root: Path) -> bool:
-    """Whether the folder holds `meshes/mesh_*.json`."""
-    return next((root / "meshes").glob("mesh_*.json"), None) is not None
 
 
 def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
@@ -315,15 +300,6 @@ def open_flame_capture(
         model, shape, static_offset, tuple(files), lambda timestep: read_frame(file_of(files, timestep), model)
     )
     return sequence_capture(root, sequence, model_file, views)
-
-
-def open_flame_motion(path: Path, model_file: Path | None) -> Capture:
-    """A motion file (`flame.sequence.read_motion`) as a capture of layout "flame" without views.
-
-    A file that names its expressions is of the bundled head, and needs no model file. Raises StgaError.
-    """
-    model_file = BUNDLED_HEAD if EXPRESSION_NAMES in read_npz(path) else _model_file(path, model_file)
-    return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
 
 
 def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:

@@ -213,12 +213,19 @@ function surfaceTexels(arrays, frames) {
       const corners = Array.from(faces.values.subarray(from, from + 3));
       const [a, b, c] = corners.map((vertex) => neutral.values.subarray(3 * vertex, 3 * vertex + 3));
       const weights = nearestWeights(a, b, c, placed(frames, own, xyz.values, splat));
-      const mean = (/** @type {ArrayLike<number>} */ of, size = 3, k = 0) =>
-        corners.reduce((sum, vertex, corner) => sum + weights[corner] * of[size * vertex + k], 0);
-      const normal = unit([mean(normals, 3, 0), mean(normals, 3, 1), mean(normals, 3, 2)]);
-      const arrived = least.map((value, k) => Math.max(value, mean(irradiance, 3, k)));
-      const texels = [...normal, mean(roughness, 1), ...arrived, mean(occlusion, 1), ...corners, 0, ...weights, 0];
-      values.set(texels, 4 * SURFACE_TEXELS * splat);
+      const to = 4 * SURFACE_TEXELS * splat;
+      for (let k = 0; k < 3; k++) {
+        const [vertex, weight] = [corners[k], weights[k]];
+        for (let channel = 0; channel < 3; channel++) {
+          values[to + channel] += weight * normals[3 * vertex + channel];
+          values[to + 4 + channel] += weight * irradiance[3 * vertex + channel];
+        }
+        values[to + 3] += weight * roughness[vertex];
+        values[to + 7] += weight * occlusion[vertex];
+        values[to + 8 + k] = vertex;
+        values[to + 12 + k] = weight;
+      }
+      for (let k = 0; k < 3; k++) values[to + 4 + k] = Math.max(values[to + 4 + k], least[k]);
     }
   }
   return values;

@@ -246,7 +246,8 @@ void main() {
   vec4 face = texelFetch(uFaces, texel(triangle * ${FACE_TEXELS} + 3), 0);
   ${tailColor(harmonics, strains, 'point - uEye', 'byView', 'byStrain')}
   vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + byStrain, recorded = color + byView;
-  ${harmonics ? harmonicsSum(harmonics, '-surface', 'color', VIEW_MEANS) : ''}
+  vec3 inward = -surface.xyz / max(length(surface.xyz), 1e-12);
+  ${harmonics ? harmonicsSum(harmonics, 'inward', 'color', VIEW_MEANS) : ''}
   vec3 lit = lit_color(vec4(color, surface.a), old.rgb, arriving, highlight, recorded, uTypical, uKept);
   result = vec4(linear_to_srgb(uFactor * lit), 1.0);
 }`;
