@@ -44,20 +44,15 @@ export class Motion {
     const share = Math.min(Math.max(recorded - first, 0), 1);
     blend(this.recorded.coefficients.values, first, second, share, this.coefficients);
     blend(this.recorded.translation.values, first, second, share, this.translation);
-    this.turn(first, second, share);
-    if (this.shapes.active) this.shapes.apply(frame, this.coefficients, this.pose);
-    replacePinned(this.coefficients, this.pinnedCoefficients);
-    replacePinned(this.pose, this.pinnedPose);
-  }
-
-  /** @type {(first: number, second: number, share: number) => void} */
-  turn(first, second, share) {
     const [pose, size] = [this.recorded.pose.values, this.pose.length];
     for (let at = 0; at < size; at += 3) {
       const before = pose.subarray(first * size + at, first * size + at + 3);
       const after = pose.subarray(second * size + at, second * size + at + 3);
       this.pose.set(share > 0 ? slerpAxisAngle(before, after, share) : before, at);
     }
+    if (this.shapes.active) this.shapes.apply(frame, this.coefficients, this.pose);
+    replacePinned(this.coefficients, this.pinnedCoefficients);
+    replacePinned(this.pose, this.pinnedPose);
   }
 
   release() {
@@ -112,15 +107,12 @@ export class Rig {
     addShapes(this.shaped, this.basis, coefficients);
     addShapes(this.joints, this.jointBasis, coefficients);
     for (let j = 0; j < this.parents.length; j++) matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
-    if (this.correctives.length) addShapes(this.shaped, this.correctives, this.poseFeatures());
+    // Correctives follow the entries of the rotations of joints 1… minus identity.
+    const features = this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
+    if (this.correctives.length) addShapes(this.shaped, this.correctives, features);
     this.chain();
     this.skinVertices(translation);
     return this.vertices;
-  }
-
-  /** The entries of the rotations of joints 1… minus identity. */
-  poseFeatures() {
-    return this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
   }
 
   /** Rotation and offset of each joint in the world, from the root outwards. */

@@ -11,6 +11,9 @@ import { ENVIRONMENTS } from './light.js';
 import { StgaAvatar, hexOf } from './stga-avatar.js';
 import { scaled } from './vector.js';
 
+const fixed = (/** @type {number} */ value) => value.toFixed(2);
+const degrees = (/** @type {number} */ value) => `${Math.round(value)}°`;
+const signed = (/** @type {number} */ value) => `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
 const PAD_ANGLE = 2.6; // radians from the camera's own direction at the rim of the pad: the light comes from behind
 const DRAGGED = 'dragged';
 /** Label, kinds that have it ("*": all environments), range, first value and format of each slider. */
@@ -164,21 +167,6 @@ function linearColor(hex) {
   return [part(1), part(3), part(5)];
 }
 
-/** @param {number} value */
-function fixed(value) {
-  return value.toFixed(2);
-}
-
-/** @param {number} value */
-function degrees(value) {
-  return `${Math.round(value)}°`;
-}
-
-/** @param {number} value */
-function signed(value) {
-  return `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
-}
-
 /**
  * @typedef {object} SliderOptions
  * @property {string} id
@@ -225,15 +213,8 @@ function element(selector, kind, parent = document) {
   return found;
 }
 
-/** @param {string} id */
-function byId(id) {
-  return element(`#${id}`, HTMLElement);
-}
-
-/** @param {string} id */
-function inputOf(id) {
-  return element(`#${id}`, HTMLInputElement);
-}
+const byId = (/** @type {string} */ id) => element(`#${id}`, HTMLElement);
+const inputOf = (/** @type {string} */ id) => element(`#${id}`, HTMLInputElement);
 
 /** The loaded file's header. */
 function info() {
@@ -523,7 +504,7 @@ function addPose() {
       high,
       read: () => avatar.getPose(joints[0])[axis],
       write: (value) => joints.forEach((joint) => avatar.setPose(joint, replaced(joint, axis, value))),
-      format: (value) => `${Math.round((180 / Math.PI) * value)}°`,
+      format: (value) => degrees((180 / Math.PI) * value),
     });
   }
   byId('pose').hidden = !known.length;
