@@ -20,8 +20,7 @@ from ..stga_addon.driving.performance import EXCHANGEABLE, parts_kept
 from ..stga_addon.driving.read_performance import is_performance, read_performance
 from ..stga_addon.driving.transfer import TrainedRange, trained_range
 from ..stga_addon.errors import StgaError
-from ..stga_addon.flame.motion import PARTS, retimed
-from ..stga_addon.flame.sequence import FlameSequence
+from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
 from ..stga_addon.scene.rig.live_pose import WEIGHT_RANGE

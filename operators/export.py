@@ -12,7 +12,7 @@ from bpy_extras.io_utils import ExportHelper
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.driving.head_map import page_controls
 from ..stga_addon.errors import StgaError
-from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar, range_bytes
+from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar
 from ..stga_addon.format import format_bytes
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.display.splat_object import check_head
@@ -139,7 +139,7 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
             motion = None if self.motion_only else exact_motion(head, frames, self._warn)
             playback = replace(playback, controls=page_controls(motion))
         if format.source == "range":
-            check_free_space(path, range_bytes(avatar, self.format, len(frames)))
+            check_free_space(path, FORMATS[self.format].size(avatar, len(frames)))
         elif format.source == "motion":
             motion = sample_motion(head, flame_of(capture_of(head), head.name), frames, self._warn)
         fps = frames_per_second(context.scene)
@@ -179,8 +179,8 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
 
 @lru_cache(maxsize=8)
 def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
-    """`range_bytes` of an avatar file last modified at this time. Raises StgaError where it cannot be read."""
-    return range_bytes(read_avatar(avatar), format, frames)
+    """`Format.size` of an avatar file last modified at this time. Raises StgaError where it cannot be read."""
+    return FORMATS[format].size(read_avatar(avatar), frames)
 
 
 def _frames(context: Any) -> range:

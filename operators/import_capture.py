@@ -5,9 +5,8 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.capture.flame_capture import OWN_MODELS
 from ..stga_addon.capture.model import Capture
-from ..stga_addon.capture.open import open_capture
+from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags

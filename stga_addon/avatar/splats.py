@@ -1,8 +1,11 @@
 """3D Gaussians as plain arrays: shapes, units and activations, which every file format of this package shares."""
 
+import ast
+import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -104,3 +107,42 @@ def joined(parts: Sequence[Splats]) -> Splats:
 def no_strain_color(count: int) -> np.ndarray:
     """An empty `strain_color` for `count` splats."""
     return np.zeros((count, 0, 3), np.float32)
+
+
+def harmonics(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    """The 16 real spherical harmonics up to degree 3 of unit directions, in order and with the signs of `Splats.sh`.
+
+    Shaders have the same lines, from `harmonics_text`.
+    """
+    xx, yy, zz = x * x, y * y, z * z
+    return (
+        0.28209479177387814,
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2.0 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3.0 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4.0 * zz - xx - yy),
+        0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        -0.4570457994644658 * x * (4.0 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3.0 * yy),
+    )
+
+
+def harmonics_text() -> list[str]:
+    """What `harmonics` returns as expressions of x, y, z, xx, yy and zz, in GLSL and JavaScript as well as Python."""
+    returned = next(node for node in ast.walk(ast.parse(inspect.getsource(harmonics))) if isinstance(node, ast.Return))
+    assert isinstance(returned.value, ast.Tuple)
+    return [ast.unparse(term) for term in returned.value.elts]
+
+
+def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(N, 3) sRGB, not clipped, of splats' coefficients (N, K, 3) seen in unit directions (N, 3) from the eye."""
+    terms = harmonics(*direction.T)[1 : sh.shape[1]]
+    return np.asarray(0.5 + SH_C0 * sh[:, 0] + sum(term[:, None] * sh[:, k] for k, term in enumerate(terms, 1)))

@@ -73,9 +73,12 @@ def read_mask(view: View) -> np.ndarray | None:
 
     None where there is neither. Raises StgaError as `read_image` does.
     """
-    if view.mask is not None:
-        return _gray(_decode(view.mask, view, "mask"))
-    return _transparency(_decode(view.image, view, "image"))
+    if view.mask is None:
+        return _transparency(_decode(view.image, view, "image"))
+    pixels = _decode(view.mask, view, "mask")
+    # A mask drawn in color is gray in all channels; one drawn in transparency only is its alpha.
+    alpha = _transparency(pixels)
+    return pixels if pixels.ndim == 2 else pixels[..., 0] if alpha is None else alpha
 
 
 def read_view(
@@ -150,7 +153,9 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
         with Image.open(path, formats=FORMATS) as image:
             stored, size = image.size, _displayed_size(image)
             if expected in (stored, size) and is_image_size(*expected):  # before any pixel is unpacked
-                return _as_uint8(_converted(image, path, upright=size == expected, colors=kind == "image"))
+                convert = _conversion(image, path) if kind == "image" else None
+                turned = ImageOps.exif_transpose(image) if size == expected and _orientation(image) != 1 else image
+                return _as_uint8(turned if convert is None else convert(turned))
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if size == expected:
@@ -175,13 +180,6 @@ def _orientation(image: Image.Image) -> int:
     except Exception:  # damaged metadata does not concern the pixels
         return 1
     return found if isinstance(found, int) and 1 <= found <= 8 else 1
-
-
-def _converted(image: Image.Image, path: Path, upright: bool, colors: bool) -> Image.Image:
-    """The image with EXIF's orientation applied, where `upright`, and in sRGB, where `colors`."""
-    convert = _conversion(image, path) if colors else None
-    turned = ImageOps.exif_transpose(image) if upright and _orientation(image) != 1 else image
-    return turned if convert is None else convert(turned)
 
 
 def _conversion(image: Image.Image, path: Path) -> Callable[[Image.Image], Image.Image] | None:
@@ -272,14 +270,6 @@ def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
         return np.asarray((band[..., :-1] * alpha + np.array(background, np.uint32) * (255 - alpha) + 127) // 255)
 
     return _in_bands(pixels, 3, blend)
-
-
-def _gray(pixels: np.ndarray) -> np.ndarray:
-    """A mask drawn in color is gray in all channels; one drawn in transparency only is its alpha."""
-    if pixels.ndim == 2:
-        return pixels
-    alpha = _transparency(pixels)
-    return pixels[..., 0] if alpha is None else alpha
 
 
 def _transparency(pixels: np.ndarray) -> np.ndarray | None:

@@ -58,7 +58,10 @@ class ViewLoader:
         self.waited_s = 0.0
         self._scale, self._background, self._prepare, self._mesh = scale, background, prepare, mesh
         self._queue_bytes = queue_bytes
-        self._cache = _Cache(cache_bytes)
+        # The first views of one scale. They come in random order, each once per epoch: one evicted to make room would
+        # be needed sooner than what replaces it, so nothing is evicted until another scale is asked for.
+        self._cache: dict[tuple[Path, Path | None, int, int, float], LoadedView] = {}
+        self._cache_bytes, self._cached_bytes, self._cached_scale = cache_bytes, 0, 1.0
         self._ready: deque[LoadedView] = deque()
         self._ready_bytes = 0
         self._error: BaseException | None = None
@@ -141,35 +144,10 @@ class ViewLoader:
             for array in (kept.image, kept.mask):
                 if array is not None:
                     array.setflags(write=False)
-            self._cache.put(key, kept)
+            if scale != self._cached_scale:
+                self._cache.clear()
+                self._cached_bytes, self._cached_scale = 0, scale
+            if self._cached_bytes + kept.nbytes <= self._cache_bytes:
+                self._cache[key] = kept
+                self._cached_bytes += kept.nbytes
         return kept
-
-
-Key = tuple[Path, Path | None, int, int, float]
-
-
-class _Cache:
-    """The first views of one scale, up to a number of bytes.
-
-    Views come in random order, each once per epoch: an entry evicted to make room would be needed sooner than the one
-    that replaces it, so nothing is evicted until another scale is asked for.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._limit, self._held, self._scale = limit, 0, 1.0
-        self._entries: dict[Key, LoadedView] = {}
-
-    def get(self, key: Key) -> LoadedView | None:
-        return self._entries.get(key)
-
-    def put(self, key: Key, loaded: LoadedView) -> None:
-        if key[-1] != self._scale:
-            self.clear()
-            self._scale = key[-1]
-        if self._held + loaded.nbytes <= self._limit:
-            self._entries[key] = loaded
-            self._held += loaded.nbytes
-
-    def clear(self) -> None:
-        self._entries.clear()
-        self._held = 0

@@ -147,13 +147,10 @@ def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.n
     values = read_json(path)
     if not isinstance(values, dict):
         raise StgaError(f"{path}: expected an object: region name -> list of vertex indices")
-    return {name: faces_within(faces, _indices(path, name, value, vertices)) for name, value in values.items()}
-
-
-def _indices(path: Path, name: str, value: Any, vertices: int) -> np.ndarray:
-    if not isinstance(value, list) or not all(type(index) is int and 0 <= index < vertices for index in value):
-        raise StgaError(f"{path}: {name}: expected a list of vertex indices from 0 to {vertices - 1}")
-    return np.array(value, np.int64)
+    for name, value in values.items():
+        if not isinstance(value, list) or not all(type(index) is int and 0 <= index < vertices for index in value):
+            raise StgaError(f"{path}: {name}: expected a list of vertex indices from 0 to {vertices - 1}")
+    return {name: faces_within(faces, np.array(value, np.int64)) for name, value in values.items()}
 
 
 def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.ndarray, np.ndarray]:
@@ -270,17 +267,15 @@ def _find(capture: Capture, name: str) -> np.ndarray:
         return faces_within(capture.faces, masks[name])
     path = Path(name)
     if path.suffix.lower() == ".npz":
-        return _read_weights(path, len(capture.faces))
+        weights, expected = read_npz(path).get(WEIGHTS), (len(capture.faces),)
+        if weights is None or weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != expected:
+            found = "no such array" if weights is None else f"{weights.dtype} {weights.shape}"
+            raise StgaError(
+                f"{path}: expected '{WEIGHTS}', one number from 0 to 1 per triangle {expected}, found {found}"
+            )
+        return np.asarray(weights >= SELECTED_WEIGHT)
     if path.suffix.lower() == ".json":
         regions = read_regions(path, capture.faces, len(capture.neutral))
         return np.asarray(np.any([np.zeros(len(capture.faces), bool), *regions.values()], axis=0))
     known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
     raise StgaError(f"region '{name}': is neither a region of the capture ({known}) nor an .npz or .json file")
-
-
-def _read_weights(path: Path, faces: int) -> np.ndarray:
-    weights = read_npz(path).get(WEIGHTS)
-    if weights is None or weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != (faces,):
-        found = "no such array" if weights is None else f"{weights.dtype} {weights.shape}"
-        raise StgaError(f"{path}: expected '{WEIGHTS}', one number from 0 to 1 per triangle ({faces},), found {found}")
-    return np.asarray(weights >= SELECTED_WEIGHT)

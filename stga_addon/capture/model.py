@@ -1,12 +1,15 @@
-"""Data model of a capture, independent of its layout on disk, and its summary in a few lines of text."""
+"""Data model of a capture, independent of its layout on disk; its summary in text; several takes as one capture."""
 
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from ..errors import StgaError
 from ..flame.sequence import FlameSequence
 from .camera import Camera
 
@@ -83,12 +86,21 @@ def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
     """(label, value) lines: recording, tracking, warnings. Reads no image."""
     views = [view for split in capture.views.values() for view in split]
     lines = [("folder", str(capture.root)), ("layout", capture.layout)]
-    lines += _recorded(capture, views) if views else [("cameras", "none: can be imported and animated, not trained on")]
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
+    masked = sum(view.mask is not None for view in views)
+    recorded = [
+        ("cameras", format_ranges(sorted({view.camera_index for view in views}))),
+        ("image size", ", ".join(f"{width} x {height}" for width, height in sizes)),
+        ("masks", f"{masked} of {len(views)} views"),
+        ("splits", "; ".join(f"{name} {_split(split)}" for name, split in capture.views.items() if split)),
+    ]
+    lines += recorded if views else [("cameras", "none: can be imported and animated, not trained on")]
+    regions = [f"{name} {int(np.count_nonzero(members))}" for name, members in capture.regions.items()]
     lines += [
         ("timesteps", format_ranges(capture.timesteps)),
         *([("frame rate", f"{capture.fps:g} frames per second")] if capture.fps is not None else []),
         ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
-        ("regions", _regions(capture)),
+        ("regions", ", ".join(regions) + " triangles" if regions else "none"),
     ]
     if capture.given_selection:
         shares = [float(np.mean(selected)) for selected in capture.given_selection.values()]
@@ -109,26 +121,9 @@ def _span(first: int, last: int) -> str:
     return str(first) if first == last else f"{first}–{last}"
 
 
-def _recorded(capture: Capture, views: list[View]) -> list[tuple[str, str]]:
-    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
-    masked = sum(view.mask is not None for view in views)
-    splits = [f"{name} {_split(split)}" for name, split in capture.views.items() if split]
-    return [
-        ("cameras", format_ranges(sorted({view.camera_index for view in views}))),
-        ("image size", ", ".join(f"{width} x {height}" for width, height in sizes)),
-        ("masks", f"{masked} of {len(views)} views"),
-        ("splits", "; ".join(splits)),
-    ]
-
-
 def _split(views: Sequence[View]) -> str:
     cameras = len({view.camera_index for view in views})
     return f"{len(views)} views ({len({view.timestep for view in views})} timesteps, {cameras} cameras)"
-
-
-def _regions(capture: Capture) -> str:
-    counts = [f"{name} {int(np.count_nonzero(members))}" for name, members in capture.regions.items()]
-    return ", ".join(counts) + " triangles" if counts else "none"
 
 
 def _flame(capture: Capture) -> list[tuple[str, str]]:
@@ -139,3 +134,142 @@ def _flame(capture: Capture) -> list[tuple[str, str]]:
     offsets = (("static offset", capture.flame.static_offset), ("dynamic offset", dynamic))
     largest = [(name, None if o is None else 1000 * float(np.linalg.norm(o, axis=1).max())) for name, o in offsets]
     return [(name, "none" if offset is None else f"up to {offset:.1f} mm") for name, offset in largest]
+
+
+MAX_NEUTRAL_DIFFERENCE_M = 1e-4
+"""Largest distance between the neutral meshes of two takes of one head: trackers write rounded shape coefficients."""
+MAX_SCALE_FACTOR = 5.0
+"""Largest ratio of the head's sizes in two takes; another unit than the meter makes it 10 or more."""
+COMPARED = 8
+"""Views, and timesteps, of a take whose scale is looked at."""
+
+RATE_TOLERANCE = 0.01
+"""Relative difference up to which the frame rates of takes are the same."""
+
+
+def join_takes(takes: Sequence[Capture]) -> Capture:
+    """One capture of all takes: the timesteps of each follow those of the take before.
+
+    A timestep of take n becomes `first_timesteps(takes)[n]` + timestep, and the first take keeps its own. Neutral mesh
+    and regions are the first take's. A camera of a later take keeps its index where the first take has the same
+    camera under it, so that exposure is corrected alike. The frame rate is the one of all takes that have one, None
+    where they differ. Raises StgaError where the takes are not of one head.
+    """
+    first = takes[0]
+    if len(takes) == 1:
+        return first
+    for other in takes[1:]:
+        require_same_head(first, other)
+    starts = first_timesteps(takes)
+    views: dict[str, tuple[View, ...]] = {}
+    for take, start in zip(takes, starts, strict=True):
+        free = _first_free_index(take, start, first, views)
+        for split, members in take.views.items():
+            views[split] = (*views.get(split, ()), *_shifted(members, start, first, free))
+    flame = [take.flame for take in takes if take.flame is not None]
+    numbered = list(zip(takes, starts, strict=True))
+    timesteps = tuple(start + timestep for take, start in numbered for timestep in take.timesteps)
+    rates = [take.fps for take in takes if take.fps is not None]
+    return replace(
+        first,
+        views=views,
+        timesteps=timesteps,
+        mesh=_dispatch([take.mesh for take in takes], starts),
+        expression_mesh=_dispatch([take.expression_mesh for take in takes], starts),
+        flame=replace(flame[0], timesteps=timesteps, frame=_dispatch([each.frame for each in flame], starts))
+        if len(flame) == len(takes)
+        else None,
+        given_selection={
+            start + timestep: faces for take, start in numbered for timestep, faces in take.given_selection.items()
+        },
+        warnings=tuple(dict.fromkeys(warning for take in takes for warning in take.warnings)),
+        fps=rates[0] if rates and max(rates) <= (1 + RATE_TOLERANCE) * min(rates) else None,
+    )
+
+
+def first_timesteps(takes: Sequence[Capture]) -> list[int]:
+    """What is added to the timesteps of each take in `join_takes`."""
+    lengths = (max(take.timesteps, default=0) + 1 for take in takes[:-1])
+    return list(accumulate(lengths, initial=0))
+
+
+def require_same_head(first: Capture, other: Capture) -> None:
+    """Raise StgaError where `other` has another mesh, or another neutral shape, than `first`."""
+    if not np.array_equal(first.faces, other.faces):
+        raise StgaError(
+            f"{other.root}: its mesh has other triangles than {first.root}; a take must be of the same head"
+        )
+    distance = float(np.linalg.norm(first.neutral - other.neutral, axis=1).max())
+    if distance > MAX_NEUTRAL_DIFFERENCE_M:
+        raise StgaError(
+            f"{other.root}: its neutral mesh is up to {1000 * distance:.2g} mm from that of {first.root}; "
+            "a take must be of the same head, tracked with the same shape"
+        )
+
+
+def require_same_scale(first: Capture, other: Capture) -> None:
+    """Raise StgaError where `other`, a take of the same head, has meshes or cameras in another unit of length.
+
+    Its tracked meshes must be as large as the neutral one, and the head must take a similar share of the images.
+    """
+    posed = [_extent(other.mesh(timestep)) for timestep in evenly_spread(other.timesteps, COMPARED)]
+    factor = float(np.median(posed)) / _extent(other.neutral)
+    if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
+        raise StgaError(
+            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral mesh; expected meters"
+        )
+    factor = _share_of_images(first) / _share_of_images(other)
+    if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
+        apart = f"{factor:.3g} times smaller" if factor > 1 else f"{1 / factor:.3g} times larger"
+        raise StgaError(
+            f"{other.root}: its head appears {apart} in the images than in those of {first.root}; "
+            "expected cameras and tracking in meters"
+        )
+
+
+def _extent(vertices: np.ndarray) -> float:
+    """Meters along the longest axis."""
+    return float(np.ptp(vertices, axis=0).max())
+
+
+def _share_of_images(take: Capture) -> float:
+    """Size of the head in pixels by that of the image, the median of some training views."""
+    shares = []
+    for view in evenly_spread(take.views["train"], COMPARED):
+        camera, mesh = view.camera, take.mesh(view.timestep)
+        distance = float(np.linalg.norm(mesh.mean(0) - camera.position))
+        shares.append(camera.fl_x * _extent(mesh) / (distance * max(camera.width, camera.height)))
+    return float(np.median(shares))
+
+
+def _first_free_index(take: Capture, start: int, first: Capture, joined: Mapping[str, Sequence[View]]) -> int:
+    """What is added to the indices of a take's own cameras, so that none is that of a camera in `joined`.
+
+    Where possible it counts from the take's start: the identities of runs hold these indices.
+    """
+    taken = {view.camera_index for members in joined.values() for view in members}
+    free = 1 + start + max((view.camera_index for members in first.views.values() for view in members), default=-1)
+    collides = any(free + view.camera_index in taken for members in take.views.values() for view in members)
+    return 1 + max(taken) if collides else free
+
+
+def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
+    """The views at the joined timesteps; `free` is added to indices of cameras that the first take does not have."""
+    cameras = {view.camera_index: view.camera for members in first.views.values() for view in members}
+    shifted = []
+    for view in views:
+        known, camera = cameras.get(view.camera_index), view.camera
+        same = known is not None and np.allclose(known.world_to_camera, camera.world_to_camera, atol=1e-6)
+        index = view.camera_index if start == 0 or same else free + view.camera_index
+        shifted.append(replace(view, timestep=start + view.timestep, camera_index=index))
+    return shifted
+
+
+def _dispatch(functions: Sequence[Callable[..., Item]], starts: Sequence[int]) -> Callable[..., Item]:
+    """timestep of the joined capture -> what the function of its take says about its own timestep."""
+
+    def of(timestep: int, *rest: str) -> Item:
+        take = bisect_right(starts, timestep) - 1
+        return functions[take](timestep - starts[take], *rest)
+
+    return of

@@ -6,15 +6,35 @@ from dataclasses import replace
 from importlib.util import find_spec
 from os.path import isdir, isfile  # which are False, not an error, for a path that is too long
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import read_json, read_npy
+from ..files import read_json, read_npy, read_npz
+from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES, key_regions
+from ..flame.sequence import (
+    FlameSequence,
+    expression_mesh,
+    neutral_mesh,
+    read_frame,
+    read_identity,
+    read_motion,
+    sequence_mesh,
+)
+from ..flame.teeth import flame_model
 from .camera import Camera
-from .flame_capture import CANONICAL_NAME, PARAMETERS, open_flame_capture, open_flame_motion
 from .mesh_geometry import without_head_motion
-from .meshes import MESH_SUFFIXES, checked_mesh, read_mesh, read_regions, tracked_meshes
+from .meshes import (
+    MESH_SUFFIXES,
+    cached_meshes,
+    check_extent,
+    checked_mesh,
+    file_of,
+    read_mesh,
+    read_regions,
+    tracked_meshes,
+)
 from .model import Capture, View, evenly_spread
 from .transforms import (
     DEFAULT_PRINCIPAL_POINT,
@@ -51,7 +71,10 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
             f"principal point convention {shorten(principal_point)} is not one of {', '.join(PRINCIPAL_POINTS)}"
         )
     if folder.suffix.lower() == ".npz" and isfile(folder):
-        return open_flame_motion(folder.resolve(), flame)
+        path = folder.resolve()
+        # A file that names its expressions is of the bundled head, and needs no model file.
+        model_file = BUNDLED_HEAD if EXPRESSION_NAMES in read_npz(path) else _model_file(path, flame)
+        return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not isdir(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
     root = folder.resolve()
@@ -59,18 +82,14 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
     views = {split: tuple(frame.view for frame in frames) for split, frames in transforms.splits.items()}
     _require_files(transforms)
     capture = _open_layout(root, transforms, views, flame)
-    found = (principal_point_warning(transforms.frames, capture.mesh, principal_point), _size_warning(capture))
-    return replace(
-        capture, fps=transforms.fps, warnings=(*capture.warnings, *(warning for warning in found if warning))
-    )
-
-
-def _size_warning(capture: Capture) -> str | None:
-    """Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained."""
+    warnings = list(capture.warnings)
+    if found := principal_point_warning(transforms.frames, capture.mesh, principal_point):
+        warnings.append(found)
+    # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
-    if MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
-        return None
-    return f"{capture.root}: the neutral mesh measures {size:.3g} m; expected a head of {TYPICAL_HEAD_EXTENT_M} m"
+    if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
+        warnings.append(f"{root}: the neutral mesh measures {size:.3g} m; expected a head of {TYPICAL_HEAD_EXTENT_M} m")
+    return replace(capture, fps=transforms.fps, warnings=tuple(warnings))
 
 
 def _open_layout(
@@ -80,8 +99,9 @@ def _open_layout(
     if (root / CANONICAL_NAME).is_file() or any(frame.flame for frame in frames):
         return open_flame_capture(root, transforms, views, flame)
     if any(frame.mesh for frame in frames):
-        return open_mesh_capture(root, transforms, views)
-    if is_release(root):
+        files = tracked_files(frames, "mesh")
+        return _mesh_capture(root, "mesh", files, transforms.canonical_mesh, views, transforms.regions)
+    if any((root / "meshes").glob("mesh_*.json")):
         return open_release(root, views)
     if not transforms.splits and mesh_files(root):
         return open_mesh_folder(root)
@@ -98,20 +118,12 @@ def _require_files(transforms: Transforms) -> None:
     """Raise StgaError for a missing file now rather than an hour into the training."""
     seen: set[Path] = set()
     for frame in transforms.frames:
-        for field, path in _files(frame).items():
+        names = ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
+        for field, path in zip(names, (frame.view.image, frame.view.mask, frame.mesh, frame.flame), strict=True):
             if path is not None and path not in seen:
                 if not isfile(path):
                     raise StgaError(f"{path}: does not exist, but {frame.where} names it as its {field}")
                 seen.add(path)
-
-
-def _files(frame: Frame) -> dict[str, Path | None]:
-    return {
-        "file_path": frame.view.image,
-        "fg_mask_path": frame.view.mask,
-        "mesh_path": frame.mesh,
-        "flame_param_path": frame.flame,
-    }
 
 
 def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str) -> str | None:
@@ -123,12 +135,21 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
     """
     if find_spec("PIL") is None:
         return None
-    apart = [frame for frame in frames if _conventions_differ(frame)]
-    outside = [_shares_outside(frame, mesh) for frame in evenly_spread(apart, MAX_COMPARED_VIEWS)]
-    known = [shares for shares in outside if shares is not None]
-    if not known:
+    from .images import read_mask
+
+    apart = []
+    for frame in frames:
+        cameras = [with_principal_point(frame.view.camera, frame.principal, name) for name in PRINCIPAL_POINTS]
+        if (np.ptp([(camera.cx, camera.cy) for camera in cameras], axis=0) > 0.5).any():
+            apart.append((frame.view, cameras))
+    outside = []
+    for view, cameras in evenly_spread(apart, MAX_COMPARED_VIEWS):
+        if (mask := read_mask(view)) is not None:
+            points = mesh(view.timestep)
+            outside.append([_share_outside(points, camera, mask) for camera in cameras])
+    if not outside:
         return None
-    share = dict(zip(PRINCIPAL_POINTS, np.mean(known, axis=0).tolist(), strict=True))
+    share = dict(zip(PRINCIPAL_POINTS, np.mean(outside, axis=0).tolist(), strict=True))
     best = min(share, key=lambda convention: share[convention])
     if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
         return None
@@ -136,26 +157,6 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
         f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read as {chosen!r}, "
         f"but {share[best]:.1%} with {best!r}: the capture was probably written that way"
     )
-
-
-def _cameras(frame: Frame) -> list[Camera]:
-    return [with_principal_point(frame.view.camera, frame.principal, name) for name in PRINCIPAL_POINTS]
-
-
-def _conventions_differ(frame: Frame) -> bool:
-    points = np.array([(camera.cx, camera.cy) for camera in _cameras(frame)])
-    return bool((np.ptp(points, axis=0) > 0.5).any())
-
-
-def _shares_outside(frame: Frame, mesh: Callable[[int], np.ndarray]) -> list[float] | None:
-    """Share of the vertices outside the mask under each convention, or None without a mask."""
-    from .images import read_mask
-
-    mask = read_mask(frame.view)
-    if mask is None:
-        return None
-    points = mesh(frame.view.timestep)
-    return [_share_outside(points, camera, mask) for camera in _cameras(frame)]
 
 
 def _share_outside(points: np.ndarray, camera: Camera, mask: np.ndarray) -> float:
@@ -170,15 +171,6 @@ NEUTRAL_NAMES = ("neutral", "canonical")
 REGIONS_NAME = "regions.json"
 
 
-def open_mesh_capture(root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]]) -> Capture:
-    """Capture of layout "mesh": `mesh_path` per frame, `canonical_mesh_path` and `regions_path` at the top level.
-
-    Only the canonical mesh is read now, the others when they are needed. Raises StgaError.
-    """
-    files = tracked_files(transforms.frames, "mesh")
-    return _mesh_capture(root, files, transforms.canonical_mesh, transforms.regions, views)
-
-
 def open_mesh_folder(root: Path) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep.
 
@@ -190,8 +182,11 @@ def open_mesh_folder(root: Path) -> Capture:
     tracked = [path for path in meshes if path != canonical]
     if not tracked:
         raise StgaError(f"{root}: holds no tracked mesh besides {canonical}; expected one file per timestep")
+    numbers = [re.search(r"(\d+)$", path.stem, re.ASCII) for path in tracked]
+    numbered = {int(match[1]): path for match, path in zip(numbers, tracked, strict=True) if match}
+    files = dict(sorted(numbered.items())) if len(numbered) == len(tracked) else dict(enumerate(tracked))
     regions = root / REGIONS_NAME
-    return _mesh_capture(root, _by_number(tracked), canonical, regions if regions.is_file() else None, {})
+    return _mesh_capture(root, "mesh", files, canonical, {}, regions if regions.is_file() else None)
 
 
 def mesh_files(folder: Path) -> list[Path]:
@@ -199,53 +194,39 @@ def mesh_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES and path.is_file())
 
 
-def rigid_free(mesh: Callable[[int], np.ndarray], neutral: np.ndarray) -> Callable[[int, str], np.ndarray]:
-    """`Capture.expression_mesh` for meshes without parameters, which ignores the choice of zero pose."""
-    return lambda timestep, zero_pose: without_head_motion(mesh(timestep), neutral)
-
-
 def _mesh_capture(
     root: Path,
+    layout: str,
     files: dict[int, Path],
     canonical: Path | None,
-    regions_file: Path | None,
     views: Mapping[str, tuple[View, ...]],
+    regions_file: Path | None = None,
+    read: Callable[[Path], tuple[np.ndarray, np.ndarray]] = read_mesh,
 ) -> Capture:
     warnings = []
     if canonical is None:
         canonical = files[min(files)]
         warnings.append(f"no canonical mesh is given: {canonical.name}, the first timestep, is the neutral mesh")
-    neutral, faces = read_mesh(canonical)
+    neutral, faces = read(canonical)
     if any(path.suffix.lower() == ".stl" for path in (canonical, *files.values())):
         warnings.append("STL has no shared vertices: of the topology, only the number of triangles can be checked")
     regions = {} if regions_file is None else read_regions(regions_file, faces, len(neutral))
     empty = [name for name, members in regions.items() if not members.any()]
     if empty:
         warnings.append(f"{regions_file}: no triangle lies in {', '.join(empty)}")
-    mesh = tracked_meshes(files, len(neutral), faces, canonical, read_mesh)
+    mesh = tracked_meshes(files, len(neutral), faces, canonical, read)
     return Capture(
         root=root,
-        layout="mesh",
+        layout=layout,
         faces=faces,
         neutral=neutral,
         views=views,
         timesteps=tuple(files),
         regions=regions,
         mesh=mesh,
-        expression_mesh=rigid_free(mesh, neutral),
+        expression_mesh=lambda timestep, zero_pose: without_head_motion(mesh(timestep), neutral),
         warnings=tuple(warnings),
     )
-
-
-def _by_number(paths: list[Path]) -> dict[int, Path]:
-    numbers = [re.search(r"(\d+)$", path.stem, re.ASCII) for path in paths]
-    numbered = {int(match[1]): path for match, path in zip(numbers, paths, strict=True) if match}
-    return dict(sorted(numbered.items())) if len(numbered) == len(paths) else dict(enumerate(paths))
-
-
-def is_release(root: Path) -> bool:
-    """Whether the folder holds `meshes/mesh_*.json`."""
-    return next((root / "meshes").glob("mesh_*.json"), None) is not None
 
 
 def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
@@ -257,22 +238,11 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
     files = {timestep: root / "meshes" / f"mesh_{timestep:04d}.json" for timestep in timesteps}
     if not files:
         raise StgaError(f"{root}: its transforms hold no frame; expected a keyframe for each mesh in {root / 'meshes'}")
-    canonical = files[timesteps[0]]
-    neutral, faces = read_soup(canonical)
-    mesh = tracked_meshes(files, len(neutral), faces, canonical, read_soup)
+    capture = _mesh_capture(root, "release", files, None, views, read=read_soup)
     chosen = {timestep: root / "training_faces" / f"{timestep:04d}.npy" for timestep in timesteps}
-    return Capture(
-        root=root,
-        layout="release",
-        faces=faces,
-        neutral=neutral,
-        views=views,
-        timesteps=tuple(timesteps),
-        regions={},
-        mesh=mesh,
-        expression_mesh=rigid_free(mesh, neutral),
-        given_selection={t: read_face_ids(path, len(faces)) for t, path in chosen.items() if path.is_file()},
-        warnings=(f"the layout has no canonical mesh: {canonical.name}, the first timestep, is the neutral mesh",),
+    faces = len(capture.faces)
+    return replace(
+        capture, given_selection={t: read_face_ids(path, faces) for t, path in chosen.items() if path.is_file()}
     )
 
 
@@ -301,3 +271,99 @@ def read_face_ids(path: Path, faces: int) -> np.ndarray:
     selected = np.zeros(faces, bool)
     selected[ids] = True
     return selected
+
+
+CANONICAL_NAME = "canonical_flame_param.npz"
+PARAMETERS = "flame_param"
+OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
+"""Names of a FLAME model file in the folder of a capture, which is used where none is given."""
+BUNDLED_MODEL = "bundled_head.npz"
+"""Copy of the head model of this package in the folder of a capture that was tracked with it."""
+
+
+def open_flame_capture(
+    root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]], model_file: Path | None
+) -> Capture:
+    """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by timestep.
+
+    A model with FLAME's published 5023 vertices gets teeth, because VHAP and GaussianAvatars use them; a model of any
+    other size is used as it is. Shape and static offset come from the first timestep.
+    Raises StgaError, also where no model file is given, and none lies in the folder (OWN_MODELS): FLAME's license
+    forbids passing it on.
+    """
+    model_file = _model_file(root, model_file)
+    model = flame_model(model_file)
+    files = parameter_files(root, transforms)
+    first = files[min(files)]
+    shape, static_offset = read_identity(first, model)
+    sequence = FlameSequence(
+        model, shape, static_offset, tuple(files), lambda timestep: read_frame(file_of(files, timestep), model)
+    )
+    return sequence_capture(root, sequence, model_file, views)
+
+
+def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
+    """The FLAME capture with another motion of the same person, and the meshes that it makes."""
+    return replace(capture, **_posed(capture.root, sequence))
+
+
+def sequence_capture(
+    root: Path, sequence: FlameSequence, model_file: Path | None, views: Mapping[str, tuple[View, ...]]
+) -> Capture:
+    """The capture of layout "flame" whose meshes a sequence makes; `root` and `model_file` say where it is from."""
+    model = sequence.model
+    regions = key_regions(model)
+    missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): triangles are selected one by one"
+    return Capture(
+        root=root,
+        layout="flame",
+        faces=model.faces,
+        neutral=check_extent(f"{root}: neutral mesh", neutral_mesh(sequence)),
+        views=views,
+        timesteps=sequence.timesteps,
+        regions=regions,
+        flame_file=model_file,
+        warnings=() if regions else (missing,),
+        **_posed(root, sequence),
+    )
+
+
+def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
+    """The fields of a capture that depend on its motion."""
+
+    def mesh(timestep: int) -> np.ndarray:
+        return check_extent(f"{root}: timestep {timestep}", sequence_mesh(sequence, timestep))
+
+    return {
+        "mesh": cached_meshes(mesh, len(sequence.model.v_template)),
+        "expression_mesh": lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
+        "flame": sequence,
+    }
+
+
+def _model_file(root: Path, given: Path | None) -> Path:
+    """The capture's bundled head, else the FLAME model file that is given, else the one in the capture's folder."""
+    if (root / BUNDLED_MODEL).is_file():
+        return root / BUNDLED_MODEL
+    beside = (root / name for name in OWN_MODELS)
+    found = given or next((path for path in beside if path.is_file()), None)
+    if found is None:
+        raise StgaError(
+            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame or in the"
+            f" preferences of the add-on, or put it into the folder as {OWN_MODELS[0]}"
+        )
+    return found
+
+
+def parameter_files(root: Path, transforms: Transforms) -> dict[int, Path]:
+    """timestep -> parameter file, ascending; without any frames, those in `flame_param`. Raises StgaError."""
+    frames = transforms.frames
+    if any(frame.flame for frame in frames):
+        return tracked_files(frames, "flame")
+    if frames:
+        return {t: root / PARAMETERS / f"{t:05d}.npz" for t in sorted({frame.view.timestep for frame in frames})}
+    listed = (root / PARAMETERS).glob("*.npz")
+    files = {int(path.stem): path for path in listed if re.fullmatch(r"\d+", path.stem, re.ASCII)}
+    if not files:
+        raise StgaError(f"{root / PARAMETERS}: holds no parameters; expected one .npz per timestep, such as 00000.npz")
+    return dict(sorted(files.items()))

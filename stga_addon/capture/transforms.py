@@ -97,7 +97,12 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
     Cameras without `camera_index` are numbered alike in all splits. Raises StgaError.
     """
     names = {split: _split_file(split) for split in SPLITS if (folder / _split_file(split)).is_file()}
-    documents = {split: _document(folder / name) for split, name in (names or {"train": "transforms.json"}).items()}
+    documents = {}
+    for split, name in (names or {"train": "transforms.json"}).items():
+        values = read_json(folder / name)
+        if not isinstance(values, dict):
+            raise StgaError(f"{folder / name}: expected a JSON object with the field frames")
+        documents[split] = _Record(folder / name, folder.resolve(), "", values)
     frames = {split: _read_frames(record.path, record.values, principal_point) for split, record in documents.items()}
     rates = [frame_rate(record.path, record.values) for record in documents.values()]
     numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
@@ -209,13 +214,6 @@ def _split_file(split: str) -> str:
     return f"transforms_{split}.json"
 
 
-def _document(path: Path) -> _Record:
-    values = read_json(path)
-    if not isinstance(values, dict):
-        raise StgaError(f"{path}: expected a JSON object with the field frames")
-    return _Record(path, path.parent.resolve(), "", values)
-
-
 def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise StgaError(f"{path}: frames: expected a list with one entry per image")
@@ -251,7 +249,10 @@ def _frame(
     width, height = _image_size(record, shared, image)
     written = _principal(record, shared, "cx", width), _principal(record, shared, "cy", height)
     focal = _focal(record, shared, width, height)
-    matrix = _matrix(record)
+    try:
+        matrix = np.array(record.values["transform_matrix"], np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise StgaError(f"{record.where('transform_matrix')}: expected {MATRIX}") from error
     key_of_camera = matrix.tobytes(), width, height, *focal, *written
     if key_of_camera not in cameras:
         camera = camera_from_gl(_pose(record, matrix), width, height, *focal, *written)
@@ -317,13 +318,6 @@ def _written_focal(record: _Record, shared: _Record, width: int, height: int) ->
             return fl_x, height / 2 / math.tan(source.number("camera_angle_y", low=MIN_ANGLE, high=math.pi) / 2)
         return fl_x, fl_x
     raise StgaError(f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level")
-
-
-def _matrix(record: _Record) -> np.ndarray:
-    try:
-        return np.array(record.values["transform_matrix"], np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise StgaError(f"{record.where('transform_matrix')}: expected {MATRIX}") from error
 
 
 def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:

@@ -11,8 +11,7 @@ from ..errors import StgaError
 from ..export.playback import playback_fps
 from ..flame.forward import FlameFrame
 from ..flame.model import FlameModel
-from ..flame.motion import strengthened, transferred_motion
-from ..flame.sequence import FlameSequence
+from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..flame.teeth import flame_model
 from ..schema import setting
 from .head_map import HeadMap, head_map, person_of

@@ -44,7 +44,7 @@ class Content:
         for number, mesh in self.meshes:
             yield number, to_world(self.avatar.splats, self.avatar.frames(mesh))
         if number is None:
-            raise StgaError(f"{path}: there is no posed mesh to export")
+            raise StgaError(f"{path}: there is no posed mesh")
 
     def first_frame(self, path: Path) -> Splats:
         """The splats in world space on the first mesh. Raises StgaError as `frames`."""
@@ -168,11 +168,6 @@ def check_suffix(path: Path, format: str) -> None:
     suffixes = FORMATS[format].suffixes
     if suffixes and path.suffix.lower() not in suffixes:
         raise StgaError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
-
-
-def range_bytes(avatar: Avatar, format: str, frames: int) -> int:
-    """Size of the files that a range of frames takes in a format of the source "range"."""
-    return FORMATS[format].size(avatar, frames)
 
 
 def check_free_space(path: Path, size: int) -> None:

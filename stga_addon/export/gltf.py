@@ -26,10 +26,17 @@ def write_gltf(path: Path, world: Splats) -> None:
     Source: Khronos, KHR_gaussian_splatting.
     """
     attributes = _attributes(world)
-    views, accessors, offset = [], [], 0
+    views, accessors, offset = [], list[dict[str, Any]](), 0
     for name, array in attributes.items():
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _VERTICES})
-        accessors.append(_accessor(len(views) - 1, name, array))
+        accessor: dict[str, Any] = {"bufferView": len(views) - 1, "count": len(array)}
+        accessor["componentType"] = _COMPONENTS[array.dtype.name]
+        accessor["type"] = _TYPES[array.shape[1] if array.ndim > 1 else 1]
+        if array.dtype == np.uint8:
+            accessor |= {"normalized": True}
+        if name == "POSITION":
+            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        accessors.append(accessor)
         offset += array.nbytes
     splatting = {
         "kernel": "ellipse",
@@ -53,15 +60,23 @@ def write_gltf(path: Path, world: Splats) -> None:
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
     }
-    _write_glb(path, document, list(attributes.values()))
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    with replacing(path) as partial, partial.open("wb") as out:
+        out.write(_MAGIC + struct.pack("<II", _VERSION, 12 + 8 + len(text) + 8 + offset))
+        out.write(struct.pack("<I", len(text)) + _JSON_CHUNK + text)
+        out.write(struct.pack("<I", offset) + _BINARY_CHUNK)
+        for array in attributes.values():
+            out.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
 
 
 def _attributes(world: Splats) -> dict[str, np.ndarray]:
     """Semantic -> values, (N,) or (N, 3 or 4), each row a multiple of four bytes."""
     opacity = world.opacities()
+    fallback = srgb_to_linear(np.clip(0.5 + SH_C0 * world.sh[:, 0], 0, 1))
     attributes = {
         "POSITION": world.xyz,
-        "COLOR_0": _fallback_color(world.sh[:, 0], opacity),
+        "COLOR_0": np.round(np.column_stack([fallback, opacity]) * 255).astype(np.uint8),
         f"{EXTENSION}:ROTATION": world.unit_rotations()[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": world.scales(),
         f"{EXTENSION}:OPACITY": opacity,
@@ -70,35 +85,3 @@ def _attributes(world: Splats) -> dict[str, np.ndarray]:
         for index in range(2 * degree + 1):
             attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"] = world.sh[:, degree**2 + index]
     return {name: np.ascontiguousarray(array) for name, array in attributes.items()}
-
-
-def _fallback_color(base: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-    """(N, 4) uint8: linear red, green, blue of the degree-0 coefficients (N, 3), and the opacity (N,)."""
-    color = np.clip(0.5 + SH_C0 * base, 0, 1)
-    return np.asarray(np.round(np.column_stack([srgb_to_linear(color), opacity]) * 255), np.uint8)
-
-
-def _accessor(view: int, name: str, array: np.ndarray) -> dict[str, Any]:
-    accessor: dict[str, Any] = {
-        "bufferView": view,
-        "componentType": _COMPONENTS[array.dtype.name],
-        "count": len(array),
-        "type": _TYPES[array.shape[1] if array.ndim > 1 else 1],
-    }
-    if array.dtype == np.uint8:
-        accessor["normalized"] = True
-    if name == "POSITION":
-        accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-    return accessor
-
-
-def _write_glb(path: Path, document: dict[str, Any], arrays: list[np.ndarray]) -> None:
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    size = sum(array.nbytes for array in arrays)
-    with replacing(path) as partial, partial.open("wb") as out:
-        out.write(_MAGIC + struct.pack("<II", _VERSION, 12 + 8 + len(text) + 8 + size))
-        out.write(struct.pack("<I", len(text)) + _JSON_CHUNK + text)
-        out.write(struct.pack("<I", size) + _BINARY_CHUNK)
-        for array in arrays:
-            out.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,21 +25,24 @@ PROPERTIES = (
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 _DTYPES = {
-    name: code
-    for code, names in {
-        "i1": ("char", "int8"),
-        "u1": ("uchar", "uint8"),
-        "i2": ("short", "int16"),
-        "u2": ("ushort", "uint16"),
-        "i4": ("int", "int32"),
-        "u4": ("uint", "uint32"),
-        "f4": ("float", "float32"),
-        "f8": ("double", "float64"),
-    }.items()
-    for name in names
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
 }
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-_Elements = dict[str, tuple[int, dict[str, str]]]  # name -> (count, property -> NumPy type)
 
 
 def write_ply(path: Path, world: Splats) -> None:
@@ -87,26 +90,7 @@ def read_ply(path: Path) -> Splats:
     Properties may stand in any order; those that are not the layout's are ignored.
     Raises StgaError naming the file and the property that is missing, not finite or truncated.
     """
-    return splats_from_columns(path, read_vertices(path))
-
-
-def splat_columns(splats: Splats) -> np.ndarray:
-    """(N, 62) float32 in the order of PROPERTIES."""
-    count = len(splats)
-    columns = np.zeros((count, len(PROPERTIES)), "<f4")
-    columns[:, 0:3] = splats.xyz
-    columns[:, 6:9] = splats.sh[:, 0]
-    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
-    rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
-    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
-    columns[:, 54] = splats.opacity
-    columns[:, 55:58] = splats.log_scale
-    columns[:, 58:62] = splats.rotation
-    return columns
-
-
-def splats_from_columns(path: Path, vertices: np.ndarray) -> Splats:
-    """Splats (face 0) from the structured array of `read_vertices`. Raises StgaError as `read_ply`."""
+    vertices = read_vertices(path)
     rest = sum(1 for name in vertices.dtype.names or () if name.startswith("f_rest_"))
     if rest not in [3 * (size**2 - 1) for size in range(1, MAX_SH_DEGREE + 2)]:
         raise StgaError(f"{path}: has {rest} f_rest properties, expected 0, 9, 24 or 45")
@@ -124,6 +108,21 @@ def splats_from_columns(path: Path, vertices: np.ndarray) -> Splats:
         face=np.zeros(count, np.int32),
         unbound=np.zeros(count, bool),
     )
+
+
+def splat_columns(splats: Splats) -> np.ndarray:
+    """(N, 62) float32 in the order of PROPERTIES."""
+    count = len(splats)
+    columns = np.zeros((count, len(PROPERTIES)), "<f4")
+    columns[:, 0:3] = splats.xyz
+    columns[:, 6:9] = splats.sh[:, 0]
+    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
+    rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
+    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
+    columns[:, 54] = splats.opacity
+    columns[:, 55:58] = splats.log_scale
+    columns[:, 58:62] = splats.rotation
+    return columns
 
 
 def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -157,32 +156,37 @@ def read_vertices(path: Path) -> np.ndarray:
     size = file_size(path)
     try:
         with path.open("rb") as file:
-            header = _read_header(path, file)
-            file.seek(header.offset)
-            return _read_ascii(path, file, header, size) if header.ascii else _read_binary(path, file, header, size)
+            is_ascii, offset, skipped, count, dtype = _read_header(path, file)
+            names = dtype.names or ()
+            # An ASCII number takes at least two bytes with its separator.
+            need = 2 * (count * len(names) + skipped) - 1 if is_ascii else count * dtype.itemsize + skipped
+            if size < offset + need:
+                raise StgaError(f"{path}: is truncated: {size} bytes cannot hold {count} vertices")
+            file.seek(offset if is_ascii else offset + skipped)
+            if not is_ascii or not count:
+                return np.fromfile(file, dtype, count)
+            table = np.loadtxt(file, np.float64, skiprows=skipped, max_rows=count, ndmin=2, comments=None)
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
+    if table.shape != (count, len(names)):
+        raise StgaError(f"{path}: has vertices of shape {table.shape}, its header announces {(count, len(names))}")
+    vertices = np.empty(count, dtype)
+    for i, name in enumerate(names):
+        vertices[name] = table[:, i]
+    return vertices
 
 
-@dataclass(frozen=True)
-class _Header:
-    """offset: where the data starts; skipped: bytes (rows if ASCII) of the elements before the vertices."""
-
-    ascii: bool
-    offset: int
-    skipped: int
-    count: int
-    dtype: np.dtype
-
-
-def _read_header(path: Path, file: BinaryIO) -> _Header:
+def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dtype]:
+    """Whether ASCII; where the data starts; bytes (rows if ASCII) before the vertices; their number and type."""
     start = file.read(MAX_HEADER_BYTES)
     end = start.find(b"\nend_header")
     newline = start.find(b"\n", end + 1)
     if not start.startswith(b"ply") or end < 0 or newline < 0:
         raise StgaError(f"{path}: is not a PLY file (no complete header)")
     order = ""
-    elements: _Elements = {}
+    elements: dict[str, tuple[int, dict[str, str]]] = {}
     properties: dict[str, str] = {}
     try:
         for line in start[:end].decode("latin-1").split("\n"):
@@ -202,49 +206,17 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
                     raise ValueError(line)
     except (ValueError, KeyError) as error:
         raise StgaError(f"{path}: PLY header cannot be understood ({error})") from error
-    return _locate_vertices(path, elements, order, newline + 1)
-
-
-def _locate_vertices(path: Path, elements: _Elements, order: str, offset: int) -> _Header:
     is_ascii, skipped = order == "=", 0
-    for name, (count, properties) in elements.items():
-        if count < 0 or not order or not properties:
+    for name, (number, properties) in elements.items():
+        if number < 0 or not order or not properties:
             break
         if "list" in properties.values():
             raise StgaError(f"{path}: PLY element {name!r} has a list property before the vertices end, not supported")
         dtype = np.dtype(list(properties.items()))
         if name == "vertex":
-            return _Header(is_ascii, offset, skipped, count, dtype)
-        skipped += count if is_ascii else count * dtype.itemsize
+            return is_ascii, newline + 1, skipped, number, dtype
+        skipped += number if is_ascii else number * dtype.itemsize
     raise StgaError(f"{path}: PLY header describes no vertices")
-
-
-def _read_binary(path: Path, file: BinaryIO, header: _Header, size: int) -> np.ndarray:
-    need = header.offset + header.skipped + header.count * header.dtype.itemsize
-    if size < need:
-        raise StgaError(f"{path}: is truncated: it has {size} bytes, its header announces {need}")
-    file.seek(header.offset + header.skipped)
-    return np.fromfile(file, header.dtype, header.count)
-
-
-def _read_ascii(path: Path, file: BinaryIO, header: _Header, size: int) -> np.ndarray:
-    names = header.dtype.names or ()
-    # A number takes at least two bytes with its separator: check before allocating the rows.
-    if size < header.offset + 2 * (header.count * len(names) + header.skipped) - 1:
-        raise StgaError(f"{path}: is truncated: {size} bytes cannot hold {header.count} vertices")
-    if not header.count:
-        return np.empty(0, header.dtype)
-    try:
-        table = np.loadtxt(file, np.float64, skiprows=header.skipped, max_rows=header.count, ndmin=2, comments=None)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
-    expected = (header.count, len(names))
-    if table.shape != expected:
-        raise StgaError(f"{path}: has vertices of shape {table.shape}, its header announces {expected}")
-    vertices = np.empty(header.count, header.dtype)
-    for i, name in enumerate(names):
-        vertices[name] = table[:, i]
-    return vertices
 
 
 PLY_NAME = "point_cloud.ply"

@@ -26,11 +26,15 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     from 45 µm in steps of 6 %, rotations 10 bits a component, opacity and color 8 bits; coefficients above degree 0
     are cut at ±1. antialiased as in `Avatar`. Source: Niantic's README and `load-spz.cc`.
     """
-    bits = _fraction_bits(world.xyz)
+    # As many bits of a coordinate behind the point as the largest one leaves.
+    largest = max(float(np.abs(world.xyz).max(initial=0)), 1.0)
+    bits = max(min(MAX_FRACTION_BITS, COORDINATE_BITS - 2 - math.floor(math.log2(largest))), 0)
+    limit = 1 << (COORDINATE_BITS - 1)
+    whole = np.clip(np.round(world.xyz * 2.0**bits), -limit, limit - 1).astype("<i4")
     flags = ANTIALIASED if antialiased else 0
     header = MAGIC + struct.pack("<IIBBBB", VERSION, len(world), world.sh_degree, bits, flags, 0)
     columns = (
-        _fixed_point(world.xyz, bits),
+        whole.view(np.uint8).reshape(-1, 3, 4)[..., :3],  # two's complement, least significant byte first
         _byte(world.opacities() * 255),
         _byte((world.sh[:, 0] * COLOR_SCALE + 0.5) * 255),
         _byte((world.log_scale + 10) * 16),
@@ -44,19 +48,6 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
 
 def _byte(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(np.round(values), 0, 255), np.uint8)
-
-
-def _fraction_bits(xyz: np.ndarray) -> int:
-    """How many bits of a coordinate stand behind the point, so that the largest one still fits."""
-    largest = max(float(np.abs(xyz).max(initial=0)), 1.0)
-    return max(min(MAX_FRACTION_BITS, COORDINATE_BITS - 2 - math.floor(math.log2(largest))), 0)
-
-
-def _fixed_point(xyz: np.ndarray, bits: int) -> np.ndarray:
-    """(N, 3, 3) uint8: 24-bit two's complement, least significant byte first."""
-    limit = 1 << (COORDINATE_BITS - 1)
-    whole = np.clip(np.round(xyz * 2.0**bits), -limit, limit - 1).astype("<i4")
-    return np.asarray(whole.view(np.uint8).reshape(-1, 3, 4)[..., :3])
 
 
 def _smallest_three(rotation: np.ndarray) -> np.ndarray:

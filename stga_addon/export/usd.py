@@ -29,7 +29,15 @@ def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, movi
     the same. A frame is in the file before the next is taken, so memory does not grow with their number.
     Raises StgaError where USD is not installed, or a file cannot be written.
     """
-    usd = _import_usd(path)
+    try:
+        import pxr as usd
+        import pxr.Sdf
+        import pxr.Tf
+        import pxr.Usd
+        import pxr.UsdGeom
+        import pxr.Vt
+    except ImportError as error:
+        raise StgaError(f"{path}: USD files need the package usd-core, which this Python lacks") from error
     with replacing(path) as partial:
         try:
             if path.suffix.lower() == ".usdz":
@@ -46,18 +54,6 @@ def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
     coefficients = 3 * splats.sh.shape[1]
     once, each = (4, 40 + 2 * coefficients) if moving_color else (4 + 4 * coefficients, 40)
     return len(splats) * (once + each * frames)
-
-
-def _import_usd(path: Path) -> Any:
-    try:
-        import pxr.Sdf
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-        import pxr.Vt
-    except ImportError as error:
-        raise StgaError(f"{path}: USD files need the package usd-core, which this Python lacks") from error
-    return pxr
 
 
 def _write_package(

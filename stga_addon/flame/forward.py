@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .model import FlameModel
+from .quaternions import from_axis_angle, to_matrices
 
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
 """The last numbers of a frame's parameters: axis-angles of five joints, and the translation. Expression comes first."""
@@ -57,14 +58,8 @@ def neutral_frame(model: FlameModel) -> FlameFrame:
 
 
 def axis_angle_matrices(axis_angle: np.ndarray) -> np.ndarray:
-    """Rotation matrices (J, 3, 3) of axis-angle vectors (J, 3) in radians (Rodrigues' formula)."""
-    angle = np.linalg.norm(axis_angle, axis=1)
-    cross = np.zeros((len(axis_angle), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = axis_angle
-    cross[:, [1, 2, 0], [2, 0, 1]] = -axis_angle
-    first = np.sinc(angle / np.pi)[:, None, None]  # sin(x) / x
-    second = (np.sinc(angle / (2 * np.pi)) ** 2 / 2)[:, None, None]  # (1 - cos(x)) / x²
-    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
+    """Rotation matrices (J, 3, 3) of axis-angle vectors (J, 3) in radians."""
+    return to_matrices(from_axis_angle(axis_angle))
 
 
 def cross_matrices(vectors: np.ndarray) -> np.ndarray:

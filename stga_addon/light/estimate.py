@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..avatar.light import AvatarLight
+from ..avatar.file import AvatarLight
 from ..capture.color import srgb_to_linear
 from ..capture.images import read_view
 from ..capture.mesh_geometry import connected_parts

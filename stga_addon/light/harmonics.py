@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from ..avatar.splats import SH_C0, harmonics
+
 COUNT = 9
 LAMBERT = np.array([np.pi] + [2 * np.pi / 3] * 3 + [np.pi / 4] * 5)
 """Irradiance of an unoccluded surface is Σ LAMBERT · basis(normal) · radiance (Ramamoorthi and Hanrahan 2001)."""
@@ -12,15 +14,8 @@ GLOSSY = np.array([1.0] + [0.85] * 3 + [0.62] * 5)
 def basis(directions: np.ndarray) -> np.ndarray:
     """(N, 9) of unit vectors (N, 3), orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x² − y²."""
     x, y, z = np.asarray(directions).T
-    return np.stack(
-        [
-            np.full_like(x, 0.28209479177387814),
-            0.4886025119029199 * y, 0.4886025119029199 * z, 0.4886025119029199 * x,
-            1.0925484305920792 * x * y, 1.0925484305920792 * y * z, 0.31539156525252005 * (3 * z * z - 1),
-            1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
-        ],
-        axis=-1,
-    )  # fmt: skip
+    constant, *rest = harmonics(-x, -y, z)[:COUNT]
+    return np.stack([np.full_like(x, constant), *rest], axis=-1)
 
 
 def even_directions(count: int) -> np.ndarray:
@@ -48,22 +43,5 @@ def rotated(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def uniform(radiance: object) -> np.ndarray:
     """(9, 3) of the same radiance (3,) from everywhere."""
     found = np.zeros((COUNT, 3))
-    found[0] = np.asarray(radiance, np.float64) / 0.28209479177387814
+    found[0] = np.asarray(radiance, np.float64) / SH_C0
     return found
-
-
-def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(N, 3) sRGB, not clipped, of splats' coefficients (N, K, 3) seen in unit directions (N, 3) from the eye."""
-    x, y, z = direction.T
-    xx, yy, zz = x * x, y * y, z * z
-    terms = [
-        np.full_like(x, 0.28209479177387814),
-        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    ][: sh.shape[1]]  # fmt: skip
-    return np.asarray(0.5 + sum(term[:, None] * sh[:, k] for k, term in enumerate(terms)))

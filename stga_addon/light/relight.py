@@ -8,11 +8,11 @@ import numpy as np
 
 from ..avatar.embedding import face_frames
 from ..avatar.file import Avatar
-from ..avatar.splats import SH_C0, no_strain_color
+from ..avatar.splats import SH_C0, no_strain_color, sh_color
 from ..capture.color import linear_to_srgb, srgb_to_linear
 from ..capture.mesh_geometry import vertex_normals, weighted_procrustes
 from ..errors import StgaError
-from .harmonics import COUNT, GLOSSY, LAMBERT, basis, even_directions, rotated, sh_color
+from .harmonics import COUNT, GLOSSY, LAMBERT, basis, rotated
 from .lamps import LIFT_M, Lamps, distant_light
 from .surface import Lashes, at_splats, find_lashes, surface_points
 from .transfer import Bounce
@@ -84,8 +84,9 @@ MIN_IRRADIANCE = 0.15
 HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.034, 0.14, 0.1
 """Part of what arrived in the capture that came back as highlights, from skin and from wet eyes, which mirror what is
 in front of them; it is taken from the recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
-VIEW_DIRECTIONS, MIN_VIEW_COSINE = 96, 0.3
-"""Recorded colors are means over as many directions from which a splat's surface is seen."""
+VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
+"""Recorded colors are means over directions from which a splat's surface is seen, at a cosine above 0.3: by degree,
+harmonics over their value straight from the front."""
 
 
 class Relighter:
@@ -99,7 +100,8 @@ class Relighter:
         if avatar.light is None:
             raise StgaError("the avatar does not know the light of its capture; `stga relight RUN` estimates it")
         self.avatar, self.light = avatar, avatar.light
-        self.corners, self.weights = surface_points(avatar)
+        self.face, self.weights = surface_points(avatar)
+        self.corners = np.ascontiguousarray(avatar.faces[self.face])
 
     @cached_property
     def transfer(self) -> np.ndarray:
@@ -128,19 +130,17 @@ class Relighter:
         return self._albedo(self.diffuse_color)
 
     @cached_property
+    def typical_albedo(self) -> np.ndarray:
+        """(3,) to which damping draws albedo; damping keeps it as it is. 1 without."""
+        return np.exp(np.log(self.albedo).mean(0)) if self.light.damping else np.ones(3)
+
+    @cached_property
     def diffuse_color(self) -> np.ndarray:
         """(N, 3) recorded sRGB without what depends on the view: mean over directions from which a splat is seen."""
         sh = self.avatar.splats.sh
-        constant = (0.5 + SH_C0 * sh[:, 0]).astype(np.float32)
-        if sh.shape[1] == 1:
-            return constant
+        means = np.repeat(VIEW_MEANS, (1, 3, 5, 7))[: sh.shape[1], None].astype(np.float32)
         normals = self._at_splats(vertex_normals(self.avatar.neutral.astype(np.float64), self.avatar.faces))
-        total, count = np.zeros_like(constant), np.full((len(constant), 1), 1e-6, np.float32)
-        for direction in even_directions(VIEW_DIRECTIONS):
-            seen = (normals @ direction > MIN_VIEW_COSINE)[:, None]
-            total += np.where(seen, sh_color(sh, np.broadcast_to(-direction, normals.shape)), 0)
-            count += seen
-        return np.where(count > 0.5, total / count, constant)
+        return sh_color(means * sh, -self._unit(normals)).astype(np.float32)
 
     @cached_property
     def recorded_light(self) -> np.ndarray:
@@ -249,8 +249,8 @@ class Relighter:
         albedo = np.pi * np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear) / self.irradiance
         damping = self.light.damping
         if damping:
-            typical = np.exp(np.log(np.maximum(albedo, 1e-4)).mean(0))
-            albedo = np.maximum(albedo, 1e-4) ** (1 - damping) * typical**damping
+            albedo = np.maximum(albedo, 1e-4)
+            albedo = albedo ** (1 - damping) * np.exp(np.log(albedo).mean(0)) ** damping
         return np.asarray(albedo.astype(np.float32))
 
     @property

@@ -15,7 +15,7 @@ MAX_STEPS = 6
 
 
 def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
-    """Where splats are on the neutral mesh: corners (N, 3) of a triangle, and their weights (N, 3).
+    """Where splats are on the neutral mesh: a triangle (N,), and weights (N, 3) of its corners.
 
     From its own triangle on, a splat walks over the edge beyond which it lies, up to MAX_STEPS times; of the triangles
     that it comes by, the one with the nearest point counts, within it up to clamping.
@@ -35,7 +35,7 @@ def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
         nearer = away < distance[walking]
         rows = walking[nearer]
         found[rows], weights[rows], distance[rows] = at[nearer], there[nearer], away[nearer]
-    return np.ascontiguousarray(avatar.faces[found]), weights.astype(np.float32)
+    return found, weights.astype(np.float32)
 
 
 def _beyond_edges(faces: np.ndarray) -> np.ndarray:

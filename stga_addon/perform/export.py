@@ -5,7 +5,7 @@ import numpy as np
 from ..avatar.file import Avatar
 from ..capture.model import Capture
 from ..errors import StgaError
-from ..export.formats import FORMATS, Meshes, check_free_space, export_avatar, range_bytes
+from ..export.formats import FORMATS, Meshes, check_free_space, export_avatar
 from ..export.playback import playback_fps
 from ..format import format_bytes
 from ..light.relight import albedo_avatar
@@ -58,7 +58,7 @@ def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> tup
 
 def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
     """Say how large the file will be. Raises StgaError where the disk has too little free space."""
-    size = range_bytes(avatar, request.file_format, frames)
+    size = FORMATS[request.file_format].size(avatar, frames)
     check_free_space(request.output, size)
     plural = "" if frames == 1 else "s"
     say(f"{frames} frame{plural} of {len(avatar.splats)} splats: about {format_bytes(size)}")

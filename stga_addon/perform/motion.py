@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from ..avatar.file import Avatar
-from ..capture.flame_capture import sequence_capture
 from ..capture.model import Capture
+from ..capture.open import sequence_capture
 from ..driving.open_motion import Motion, open_motion
 from ..driving.transfer import TrainedRange, trained_range
 from ..errors import StgaError

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..avatar.file import read_avatar, write_avatar
-from ..avatar.light import AvatarLight
+from ..avatar.file import AvatarLight, read_avatar, write_avatar
 from ..capture.camera import central_camera
 from ..capture.color import srgb_to_linear
 from ..capture.model import Capture

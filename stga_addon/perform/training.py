@@ -9,9 +9,8 @@ import numpy as np
 
 from ..avatar.file import read_avatar, write_avatar
 from ..capture.meshes import SELECTED_WEIGHT, find_region
-from ..capture.model import Capture
+from ..capture.model import Capture, first_timesteps, join_takes, require_same_head, require_same_scale
 from ..capture.open import open_capture
-from ..capture.takes import first_timesteps, join_takes, require_same_head, require_same_scale
 from ..errors import StgaError
 from ..export.ply import write_ply
 from ..format import format_table

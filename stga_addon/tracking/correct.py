@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.flame_capture import PARAMETERS
 from ..capture.model import Capture
-from ..capture.open import open_capture
+from ..capture.open import PARAMETERS, open_capture
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.forward import RIGID_SIZE

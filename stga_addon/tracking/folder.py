@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ..capture.flame_capture import CANONICAL_NAME
+from ..capture.open import CANONICAL_NAME
 
 REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER, PLACES_FILE, MATTES_FILE = (
     "tracking.json",

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.flame_capture import BUNDLED_MODEL
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
+from ..capture.open import BUNDLED_MODEL
 from ..errors import StgaError
 from ..files import read_json, replacing, write_json
 from ..flame.forward import RIGID_SIZE

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from ..capture.camera import Camera
-from ..capture.flame_capture import CANONICAL_NAME, PARAMETERS
+from ..capture.open import CANONICAL_NAME, PARAMETERS
 from ..capture.transforms import camera_entry
 from ..files import replacing, write_json, write_npz
 from ..flame.forward import flame_forward, frame_of

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ..avatar.embedding import CONVENTIONS
-from ..avatar.offsets.table import OFFSETS
+from ..avatar.offsets import OFFSETS
 from ..avatar.splats import ADDED, MAX_SH_DEGREE
 from ..errors import StgaError
 from ..schema import MAX_COUNT, complaint, setting, validate

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from capture.factory import write_flame_capture
 
-from stga_addon.capture.flame_capture import OWN_MODELS
+from stga_addon.capture.open import OWN_MODELS
 from stga_addon.development.package import build_zip, fetch_wheels
 from stga_addon.errors import StgaError
 from stga_addon.worker.training_python import missing_packages

@@ -12,8 +12,7 @@ pytest.importorskip("numba")
 from mathutils import Matrix  # noqa: E402
 
 from stga_addon.avatar.embedding import WORLD, FaceFrames, to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar  # noqa: E402
-from stga_addon.avatar.light import AvatarLight  # noqa: E402
+from stga_addon.avatar.file import Avatar, AvatarLight  # noqa: E402
 from stga_addon.avatar.splats import SH_C0  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import DeviceError, StgaError  # noqa: E402

@@ -10,8 +10,7 @@ bpy = pytest.importorskip("bpy")
 
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.flame.forward import flame_forward  # noqa: E402
-from stga_addon.flame.motion import PARTS, retimed  # noqa: E402
-from stga_addon.flame.sequence import FlameSequence, sequence_mesh  # noqa: E402
+from stga_addon.flame.sequence import PARTS, FlameSequence, retimed, sequence_mesh  # noqa: E402  # noqa: E402
 from stga_addon.scene import compat  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.compat import SLOTTED_ACTIONS  # noqa: E402

@@ -1,6 +1,7 @@
 """Tracked meshes: the readers, constant topology, regions and the rigid fit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stga_addon.capture.mesh_geometry import weighted_procrustes, without_head_motion
-from stga_addon.capture.meshes import CACHE_BYTES, cached_meshes, read_mesh, read_regions, tracked_meshes
+from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.mesh_geometry import rasterize, weighted_procrustes, without_head_motion
+from stga_addon.capture.meshes import CACHE_BYTES, cached_meshes, find_region, read_mesh, read_regions, tracked_meshes
+from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.files import write_npz
 
 from . import factory
 
@@ -210,3 +214,81 @@ def test_pure_head_motion_vanishes() -> None:
     moved = neutral @ rotation.T + [1, 2, 3]
     np.testing.assert_allclose(without_head_motion(moved, neutral), neutral, atol=1e-9)
     np.testing.assert_allclose(without_head_motion(neutral, neutral), neutral, atol=1e-12)
+
+
+def test_names_and_files(toy: Capture, tmp_path: Path) -> None:
+    """Catches a region of other triangles than those painted."""
+    np.testing.assert_array_equal(find_region(toy, "mouth"), toy.regions["mouth"])
+    weights = np.linspace(0, 1, len(toy.faces))
+    write_npz(tmp_path / "painted.npz", {"weights": weights})
+    np.testing.assert_array_equal(find_region(toy, str(tmp_path / "painted.npz")), weights >= 0.5)
+    triangle = toy.faces[7]
+    (tmp_path / "regions.json").write_text(json.dumps({"one": triangle.tolist()}))
+    found = find_region(toy, str(tmp_path / "regions.json"))
+    assert found[7]
+    np.testing.assert_array_equal(found, np.isin(toy.faces, triangle).all(1))
+
+
+@pytest.mark.parametrize(
+    ("weights", "sentence"),
+    [
+        (np.ones(3, np.float32), r"expected 'weights', one number from 0 to 1 per triangle .* found float32 \(3,\)"),
+        (np.ones(3, np.int64), "found int64"),
+        (None, "found no such array"),
+    ],
+)
+def test_files_that_do_not_fit(toy: Capture, tmp_path: Path, weights: np.ndarray | None, sentence: str) -> None:
+    """Catches weights of another mesh taken for this one's."""
+    path = tmp_path / "painted.npz"
+    np.savez(path, **({"other": np.ones(2)} if weights is None else {"weights": weights}))
+    with pytest.raises(StgaError, match=sentence):
+        find_region(toy, str(path))
+
+
+def test_an_empty_region_is_refused(toy: Capture, tmp_path: Path) -> None:
+    """Catches a refinement that would train nothing and say so nowhere."""
+    write_npz(tmp_path / "nothing.npz", {"weights": np.zeros(len(toy.faces))})
+    with pytest.raises(StgaError, match="holds no triangle"):
+        find_region(toy, str(tmp_path / "nothing.npz"))
+
+
+def by_equations(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Like `rasterize`: the barycentric coordinates of each pixel center in each triangle, solved for."""
+    flat, depth = camera.project(vertices)
+    y, x = np.mgrid[: camera.height, : camera.width]
+    centers = np.stack([x.ravel() + 0.5, y.ravel() + 0.5, np.ones(x.size)])
+    systems = np.concatenate([flat[faces], np.ones((len(faces), 3, 1))], 2).transpose(0, 2, 1)
+    inside = np.linalg.solve(systems, np.broadcast_to(centers, (len(faces), *centers.shape))).transpose(2, 0, 1)
+    closeness = np.where((inside >= 0).all(2), (inside / depth[faces]).sum(2), 0)
+    nearest = closeness.argmax(1)
+    shown = closeness.max(1) > 0
+    shape = camera.height, camera.width
+    weights = np.where(shown[:, None], inside[np.arange(len(nearest)), nearest], 0)
+    return np.where(shown, nearest, -1).reshape(shape), weights.reshape(*shape, 3)
+
+
+def test_every_pixel_shows_the_nearest_triangle():
+    """Catches a triangle that is farther, a gap between neighbors, lines cut off at the image's edge, and barycentric
+    coordinates of another corner; triangles are from a tenth of a pixel to larger than the image."""
+    rng = np.random.default_rng(0)
+    camera = replace(look_at((0.2, 0.1, 2.0), (0, 0, 0), 37, 29, 40.0), cx=17.0, cy=15.5)
+    sizes = np.repeat([0.005, 0.05, 0.3, 3.0], [150, 60, 30, 8])
+    corners = rng.uniform(-0.7, 0.7, (len(sizes), 1, 3)) + sizes[:, None, None] * rng.normal(size=(len(sizes), 3, 3))
+    vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(sizes)).reshape(-1, 3)
+    in_front = (camera.project(vertices)[1][faces] > 0.05).all(1)
+    triangle, weights = rasterize(vertices, faces[in_front], camera)
+    expected, expected_weights = by_equations(vertices, faces[in_front], camera)
+    assert (expected >= 0).mean() > 0.4
+    np.testing.assert_array_equal(triangle, expected)
+    np.testing.assert_allclose(weights, expected_weights, atol=1e-7)
+
+
+def test_a_closed_mesh_has_no_holes():
+    """Catches pixels between two triangles whose centers lie on the common edge to within rounding."""
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    for turn in np.linspace(0, 1, 7):
+        camera = look_at((3 * np.sin(turn), 0, 3 * np.cos(turn)), (0, 0, 0), 64, 64, 64.0)
+        shown = rasterize(mesh.vertices, mesh.faces, camera)[0] >= 0
+        y, x = np.mgrid[:64, :64] + 0.5 - 32
+        assert shown[np.hypot(x, y) < 22].all()
+        assert not shown[np.hypot(x, y) > 23].any()

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stga_addon.capture.model import Capture
-from stga_addon.capture.takes import first_timesteps, join_takes
+from stga_addon.capture.model import Capture, first_timesteps, join_takes
 from stga_addon.errors import StgaError
 
 

@@ -1,4 +1,4 @@
-"""Exports every format to a disk that is full; run by test_full_disk.py.
+"""Exports every format to a disk that is full; run by test_formats.py.
 
 `full_disk_driver.py DISK` prints, for each format and share of the room that it needs, its message and what it left.
 DISK must be a small mount that nobody else sees.

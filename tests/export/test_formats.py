@@ -1,12 +1,24 @@
 """Export by format: which files are written, from which meshes."""
 
+import errno
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from capture import factory
+from robustness.test_disks import PRIVATE, can_mount
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar
+from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
+from stga_addon.export.playback import DEFAULT_FPS, playback_fps
 from stga_addon.export.ply import read_ply
 
 
@@ -97,3 +109,44 @@ def test_other_suffixes_are_refused(format, avatar, tmp_path):
     with pytest.raises(StgaError, match=r"a\.gltf: expected a name that ends in \."):
         export_avatar(tmp_path / "a.gltf", avatar, format, [(0, avatar.neutral)])
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("timesteps", "fps", "in_a_row", "at_their_numbers"),
+    [
+        (range(5), 60.0, 60.0, 60.0),
+        (range(1, 30, 3), 60.0, 20.0, 60.0),
+        ([0, 1, 2, 3, 9, 10, 11], 50.0, 50.0, 50.0),
+        ([7], 60.0, 60.0, 60.0),
+        (range(1, 30, 3), None, DEFAULT_FPS, DEFAULT_FPS),
+    ],
+)
+def test_rate_of_a_capture(tmp_path: Path, timesteps, fps, in_a_row, at_their_numbers) -> None:
+    """Catches every third frame of a recording played three times too fast, or too slowly where frames are numbered."""
+    capture = replace(open_capture(factory.write_mesh_capture(tmp_path / "ball")), timesteps=tuple(timesteps), fps=fps)
+    assert playback_fps(capture) == pytest.approx(in_a_row)
+    assert playback_fps(capture, numbered=True) == pytest.approx(at_their_numbers)
+    assert playback_fps(capture, 12.5) == playback_fps(None, 12.5, numbered=True) == 12.5
+    assert np.isclose(playback_fps(None), DEFAULT_FPS)
+
+
+SMALL_DISK = 'mount -t tmpfs -o size=24m small "$1" && exec "$2" "$3" "$1"'
+
+
+@pytest.mark.slow
+def test_every_format_on_a_full_disk(tmp_path: Path) -> None:
+    """Catches a format whose message leaves out the file or the cause, and files or folders left by half an export."""
+    if not can_mount():
+        pytest.skip("private mounts (unshare -rm) are not available")
+    driver = str(Path(__file__).with_name("full_disk_driver.py"))
+    command = [*PRIVATE, "sh", "-c", SMALL_DISK, "sh", str(tmp_path), sys.executable, driver]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
+    assert done.returncode == 0, done.stderr
+    results = json.loads(done.stdout)
+    assert {result["format"] for result in results} == set(FORMATS)
+    for result in results:
+        assert result["message"].startswith(str(tmp_path / "new/")), result
+        assert f"cannot be written ({os.strerror(errno.ENOSPC)})" in result["message"], result
+        assert result["left"] == [], result
+    assert "Traceback" not in done.stderr

@@ -14,7 +14,7 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
-from stga_addon.export.formats import export_avatar, range_bytes
+from stga_addon.export.formats import FORMATS, export_avatar
 
 FPS = 30.0
 
@@ -113,7 +113,7 @@ def test_size_is_known_before(avatar, tmp_path, color):
     avatar = replace(avatar, splats=avatar.splats.rows(many))
     avatar = avatar if color == "constant" else strained(avatar)
     export_avatar(tmp_path / "a.usdc", avatar, "usd", moved(avatar, (0, 1, 2, 3)))
-    assert range_bytes(avatar, "usd", 4) == pytest.approx((tmp_path / "a.usdc").stat().st_size, rel=0.02)
+    assert FORMATS["usd"].size(avatar, 4) == pytest.approx((tmp_path / "a.usdc").stat().st_size, rel=0.02)
 
 
 def test_nothing_is_left_of_an_export_that_ends_early(avatar, tmp_path):

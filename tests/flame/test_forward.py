@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.flame.forward import FlameFrame, flame_forward, frame_of, neutral_frame, parameters_gradient
 from stga_addon.flame.model import FlameModel, read_flame
+from stga_addon.flame.quaternions import to_matrices
 
 from .conftest import random_arrays, random_frame
 from .torch_flame import axis_angle_matrices, flame_tensors
@@ -138,3 +139,11 @@ def test_the_gradient_is_autograds(tiny_flame: FlameModel, frame: FlameFrame) ->
     )  # fmt: skip
     (expected,) = torch.autograd.grad((vertices * torch.tensor(outer)).sum(), values)
     np.testing.assert_allclose(parameters_gradient(person, frame, outer), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_matrices_are_those_of_scipy():
+    """Catches a transposed matrix, another order of components, and lengths that scale what is rotated."""
+    quaternions = np.random.default_rng(0).normal(size=(4, 5, 4))
+    expected = Rotation.from_quat(np.roll(quaternions, -1, axis=-1).reshape(-1, 4)).as_matrix()
+    np.testing.assert_allclose(to_matrices(quaternions).reshape(-1, 3, 3), expected, atol=1e-12)
+    np.testing.assert_array_equal(to_matrices(np.zeros(4)), np.eye(3))

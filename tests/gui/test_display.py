@@ -18,8 +18,7 @@ pytest.importorskip("bpy")
 from blender.test_gpu_renderer import avatar, check_shadow_map, psnr_db
 from PIL import Image
 
-from stga_addon.avatar.file import write_avatar
-from stga_addon.avatar.light import AvatarLight
+from stga_addon.avatar.file import AvatarLight, write_avatar
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
 from stga_addon.light.harmonics import uniform

@@ -3,8 +3,7 @@
 import numpy as np
 import trimesh
 
-from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.light import AvatarLight
+from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.color import linear_to_srgb
 from stga_addon.light.harmonics import uniform

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from light.scenes import blocked
-from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.light import AvatarLight
+from light.scenes import blocked, lit_avatar
+from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
+from stga_addon.light.surface import surface_points
 from stga_addon.light.transfer import transfer_of
 from stga_addon.light.values import Light, Lighting
 from stga_addon.scene.gpu.relit_packing import relit_scene
@@ -114,3 +114,28 @@ def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
     dry = replace(avatar.light, roughness=np.zeros_like(avatar.light.roughness))
     relighters["no eyes"] = Relighter(replace(avatar, light=dry))
     assert {name: len(each.lashes.face) for name, each in relighters.items()} == dict.fromkeys(relighters, 0)
+
+
+def test_splats_are_at_the_nearest_point_of_the_mesh():
+    """Catches splats that stay in a triangle that they have left, walk away from themselves, or are lit on the wrong
+    corner's side; and a walk that leaves the mesh at its border."""
+    avatar = lit_avatar()
+    rng = np.random.default_rng(0)
+    ball = avatar.faces[np.linalg.norm(avatar.neutral[avatar.faces].mean(1), axis=1) < 0.101]
+    ball = ball[avatar.neutral[ball].mean(1)[:, 2] > -0.07]  # with a border
+    xyz = (rng.normal(0, 1, (len(ball), 3)) * [1.0, 1.0, 0.1]).astype(np.float32)
+    splats = replace(avatar.splats.rows(np.arange(len(ball))), xyz=xyz, face=np.arange(len(ball), dtype=np.int32))
+    avatar = replace(avatar, splats=splats, faces=ball)
+    frames = avatar.frames(avatar.neutral)
+    points = frames.origin + frames.scale[:, None] * np.einsum("nij,nj->ni", frames.rotation, xyz)
+    face, weights = surface_points(avatar)
+    corners = ball[face]
+    found = np.einsum("nk,nkc->nc", weights, avatar.neutral[corners])
+    mesh = trimesh.Trimesh(avatar.neutral, ball, process=False)
+    _, least, _ = trimesh.proximity.closest_point_naive(mesh, points)
+    away = np.linalg.norm(found - points, axis=1)
+    own = np.linalg.norm(avatar.neutral[ball].mean(1) - points, axis=1)
+    assert (corners != ball).any(1).mean() > 0.5
+    assert (away < 1.2 * least + 1e-4).mean() > 0.95
+    assert (away <= own + 1e-9).all()
+    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)

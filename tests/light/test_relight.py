@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from light.scenes import lit_avatar
+from stga_addon.avatar.splats import sh_color
 from stga_addon.capture.color import srgb_to_linear
 from stga_addon.errors import StgaError
 from stga_addon.light import relight
-from stga_addon.light.harmonics import rotated, sh_color, uniform
+from stga_addon.light.harmonics import even_directions, rotated, uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Light, Lighting
 
@@ -113,6 +114,20 @@ def test_color_that_depends_on_the_view_is_no_albedo():
     assert seen_straight.mean() > 0.05
     assert np.std(mean) < 0.3 * seen_straight.mean()
     assert (mean < seen_straight).all()
+
+
+def test_recorded_color_is_a_mean_over_the_directions_that_see_a_splat():
+    """Catches a factor of a degree, or a direction, that is not that of the mean: against sampled directions."""
+    avatar = lit_avatar(ALBEDO, degree=3)
+    sh = np.random.default_rng(0).normal(0, 0.1, avatar.splats.sh.shape).astype(np.float32)
+    relighter = Relighter(replace(avatar, splats=replace(avatar.splats, sh=sh)))
+    rotation = avatar.frames(avatar.neutral).rotation[avatar.splats.face]
+    normals = np.einsum("nij,nj->ni", rotation, relighter.normal)[:40]
+    directions = even_directions(4000)
+    for normal, coefficients, found in zip(normals, sh, relighter.diffuse_color, strict=False):
+        seen = directions[directions @ normal > 0.3]
+        colors = sh_color(np.broadcast_to(coefficients, (len(seen), *coefficients.shape)), -seen)
+        np.testing.assert_allclose(found, colors.mean(0), atol=1e-3)
 
 
 def test_an_avatar_without_light_says_so():

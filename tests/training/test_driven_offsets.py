@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.avatar.offsets.strain_position import RATE_SHARE
+from stga_addon.avatar.offsets import STRAIN_POSITION
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
@@ -77,7 +77,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
             ends.append(loss(changed))
         slope = (ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
-    rate = RATE_SHARE * trainer.settings.rates.xyz
+    rate = STRAIN_POSITION.rate_share * trainer.settings.rates.xyz
     moved = (stepped - before)[strongest]
     np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.05)  # Adam's first step is as long as the rate
     assert (np.sign(moved) == -np.sign(gradient[strongest])).all()
@@ -112,7 +112,7 @@ def test_the_step_is_adam_in_float64() -> None:
             first[f] = 0.9 * first[f] + 0.1 * g
             second[f] = 0.999 * second[f] + 0.001 * g**2
             m, v = first[f] / (1 - 0.9 ** steps[f]), second[f] / (1 - 0.999 ** steps[f])
-            value[f] -= RATE_SHARE * rate * m / (np.sqrt(v) + epsilon)
+            value[f] -= STRAIN_POSITION.rate_share * rate * m / (np.sqrt(v) + epsilon)
             average[f] += max(ema_share, 4 / (steps[f] + 3)) * (value[f] - average[f])
     np.testing.assert_array_equal(state.steps, steps)
     assert steps.min() == 0

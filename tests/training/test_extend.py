@@ -16,9 +16,8 @@ from PIL import Image
 from stga_addon.avatar.file import read_avatar
 from stga_addon.avatar.strain import COLOR_RANGE
 from stga_addon.capture.meshes import read_mesh
-from stga_addon.capture.model import Capture
+from stga_addon.capture.model import Capture, require_same_scale
 from stga_addon.capture.open import open_capture
-from stga_addon.capture.takes import require_same_scale
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz

@@ -1,8 +1,8 @@
-"""Web data files: an avatar, what moves it and its cameras, quantized, in their container (docs/formats.md)."""
+"""Web data files: an avatar, a linear rig that moves it, and cameras, quantized, in a container (docs/formats.md)."""
 
 import gzip
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,15 +10,17 @@ import numpy as np
 
 from ...avatar.embedding import face_frames
 from ...avatar.file import Avatar
-from ...avatar.light import AvatarLight
 from ...avatar.splats import Splats
-from ...capture.camera import Camera
-from ...flame.quaternions import normalized
-from ..playback import Playback, ShapeControls
-from .rig import WebRig
+from ...capture.mesh_geometry import weighted_procrustes
+from ...flame.forward import joint_positions
+from ...flame.model import JOINTS
+from ...flame.quaternions import from_matrices, normalized, to_axis_angle
+from ...flame.sequence import FlameSequence, with_identity
+from ...light.relight import Relighter
+from ..playback import Playback
 
 MAGIC = b"STGA"
-FORMAT, VERSION = "stga-web", 1
+FORMAT, VERSION = "stga-web", 2
 MAX_PLANES = 4
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
@@ -81,6 +83,117 @@ def _planes(integers: np.ndarray) -> tuple[int, int, bytes]:
     return count, low, b"".join(((above >> 8 * plane) & 255).astype(np.uint8).tobytes() for plane in range(count))
 
 
+BAKE_TOLERANCE_M = 5e-6
+"""Largest distance of a vertex of a baked mesh from the mesh that was baked."""
+
+
+@dataclass(frozen=True)
+class WebRig:
+    """Blend shapes, skeleton and motion: V vertices, R blend shapes, J joints, T frames; meters and radians.
+
+    base         (V, 3) vertices before blend shapes
+    basis        (R, V, 3); the first `expressions` are sliders, which have the
+                 `expression_names` or, without any, numbers
+    correctives  (9·(J − 1), V, 3), factors: the entries of the rotations of joints 1… minus identity
+    joints       (J, 3); they move with the blend shapes by joint_basis (R, J, 3)
+    parents      of the joints, -1 for the root
+    weights      (V, J) of linear blend skinning
+    coefficients (T, R); pose (T, J, 3) axis-angle; translation (T, 3), added last
+    """
+
+    base: np.ndarray
+    basis: np.ndarray
+    correctives: np.ndarray
+    joints: np.ndarray
+    joint_basis: np.ndarray
+    joint_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    weights: np.ndarray
+    coefficients: np.ndarray
+    pose: np.ndarray
+    translation: np.ndarray
+    expressions: int
+    expression_names: tuple[str, ...] = ()
+
+
+def flame_rig(sequence: FlameSequence) -> WebRig:
+    """The FLAME model of a sequence with the person's identity baked in; dynamic offsets become blend shapes."""
+    person = with_identity(sequence)
+    model = person.model
+    frames = [person.frame(timestep) for timestep in person.timesteps]
+    expressions = np.moveaxis(model.shapedirs, 2, 0)
+    coefficients = np.stack([frame.expr for frame in frames])
+    offsets = [frame.dynamic_offset for frame in frames]
+    if any(offset is not None for offset in offsets):
+        zero = np.zeros_like(model.v_template)
+        shapes, factors = principal_shapes(np.stack([zero if offset is None else offset for offset in offsets]))
+        expressions = np.concatenate([expressions, shapes])
+        coefficients = np.concatenate([coefficients, factors], axis=1)
+    return WebRig(
+        base=model.v_template,
+        basis=expressions,
+        correctives=np.moveaxis(model.posedirs, 2, 0),
+        joints=joint_positions(model, model.v_template),
+        joint_basis=np.einsum("jv,rvc->rjc", model.j_regressor, expressions),
+        joint_names=JOINTS,
+        parents=tuple(model.parents.tolist()),
+        weights=model.weights,
+        coefficients=coefficients,
+        pose=np.stack([frame.pose for frame in frames]),
+        translation=np.stack([frame.translation for frame in frames]),
+        expressions=model.n_expression,
+        expression_names=model.expression_names,
+    )
+
+
+def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
+    """Posed meshes (V, 3) as one rigid motion and the principal components of what is left: a rig without sliders.
+
+    Raises ValueError where there is none.
+    """
+    if not len(meshes):
+        raise ValueError("there is no posed mesh")
+    stack = np.asarray(meshes, np.float64)
+    weights, translations = np.ones(stack.shape[1]), stack.mean(1)
+    rotations = np.stack([weighted_procrustes(stack[0], mesh, weights)[0] for mesh in stack])
+    aligned = np.einsum("tba,tvb->tva", rotations, stack - translations[:, None])
+    base = aligned.mean(0)
+    basis, coefficients = principal_shapes(aligned - base)
+    vertices = len(base)
+    return WebRig(
+        base=base,
+        basis=basis,
+        correctives=np.zeros((0, vertices, 3)),
+        joints=np.zeros((1, 3)),
+        joint_basis=np.zeros((len(basis), 1, 3)),
+        joint_names=("root",),
+        parents=(-1,),
+        weights=np.ones((vertices, 1)),
+        coefficients=coefficients,
+        pose=to_axis_angle(from_matrices(rotations))[:, None],
+        translation=translations,
+        expressions=0,
+    )
+
+
+def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes (R, V, 3) and coefficients (T, R) in −1…1 whose products are offsets (T, V, 3) to BAKE_TOLERANCE_M."""
+    frames, vertices = offsets.shape[:2]
+    flat = offsets.reshape(frames, -1)
+    _, directions = np.linalg.eigh(flat @ flat.T)
+    directions = directions[:, ::-1]  # largest first
+    shapes, rest = [], flat.copy()
+    for column in directions.T:
+        if not frames or np.linalg.norm(rest.reshape(frames, vertices, 3), axis=2).max() <= BAKE_TOLERANCE_M:
+            break
+        shapes.append(column @ flat)
+        rest -= np.outer(column, shapes[-1])
+    coefficients = directions[:, : len(shapes)]
+    largest = np.abs(coefficients).max(0) if shapes else np.ones(0)
+    basis = np.array(shapes).reshape(-1, vertices, 3) * largest[:, None, None]
+    return basis, coefficients / largest
+
+
 Arrays = dict[str, np.ndarray | FixedPoint]
 
 # Steps of fixed-point values: half of one is the largest error. Together they leave a picture of large
@@ -97,7 +210,7 @@ STRAIN_COLOR_STEP = 0.008
 STRAIN_RANGE_STEP = 0.002
 """Of the ends of a triangle's range, where strain is clipped: positions that follow it by 2 mm a unit err by 2 µm."""
 OFFSET_STEPS_M = {"strain_position": POSITION_STEP_M / 16}
-"""Driven offset that the player has a signal for (`player/signals.js`) -> step of its coefficients.
+"""Driven offset that the player has a signal for (`player/face_frames.js`) -> step of its coefficients.
 
 Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a splat by 0.75 µm
 along an axis at most, where half of POSITION_STEP_M is 2 µm."""
@@ -121,11 +234,19 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
 
     Raises ValueError where a value is not finite, or a driven offset is not in OFFSET_STEPS_M.
     """
-    order = np.argsort(avatar.splats.face, kind="stable")
+    relighter = None if avatar.light is None else Relighter(avatar)
+    surface = avatar.splats.face if relighter is None else relighter.face
+    order = np.lexsort((surface, avatar.splats.face))  # equal triangles side by side, which gzip likes
     splats = avatar.splats.rows(order)
-    unit = _local_unit(avatar)
-    arrays = _splat_arrays(splats, unit) | _driven_arrays(avatar, unit) | _mesh_arrays(avatar, splats)
-    arrays |= _rig_arrays(rig) | _light_arrays(avatar.light)
+    frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
+    unit = float(frames.scale.max(initial=1e-6))  # meters of a unit of the splats' local frames, where it is largest
+    arrays = _splat_arrays(splats, unit) | _driven_arrays(avatar, unit)
+    arrays |= {
+        "faces": avatar.faces,
+        "neutral": FixedPoint(avatar.neutral, VERTEX_STEP_M),
+        "splats_per_face": np.bincount(splats.face, minlength=len(avatar.faces)),
+    }
+    arrays |= _rig_arrays(rig) | _light_arrays(relighter, order, unit)
     controls = playback.controls if rig.expressions else None
     if controls is not None:
         arrays["shape_linear"] = controls.linear.astype(np.float32)
@@ -134,10 +255,10 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
     if exact:
         arrays = {name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a for name, a in arrays.items()}
-    return pack(_header(avatar, rig, playback), arrays)
+    return pack(_header(avatar, rig, playback, relighter), arrays)
 
 
-def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
+def _header(avatar: Avatar, rig: WebRig, playback: Playback, relighter: Relighter | None) -> dict[str, Any]:
     controls = playback.controls if rig.expressions else None
     return {
         "title": playback.title,
@@ -150,9 +271,22 @@ def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
         "parents": list(rig.parents),
         # Where expressions are ARKit's shapes, those are their sliders.
         "sliders": [] if controls is not None and rig.expression_names else _sliders(rig),
-        **_shapes(controls),
-        **({} if avatar.light is None else {"light": {"damping": avatar.light.damping}}),
-        "views": [_view(name, camera) for name, camera in playback.views.items()],
+        **(
+            {}
+            if controls is None
+            else {"shapes": {"names": list(controls.names), "opens": controls.opens, "limited": controls.limited}}
+        ),
+        **({} if relighter is None else {"light": _light(relighter)}),
+        "views": [
+            {
+                "name": name,
+                "size": [camera.width, camera.height],
+                "focal": [camera.fl_x, camera.fl_y],
+                "center": [camera.cx, camera.cy],
+                "world_to_camera": camera.world_to_camera.ravel().tolist(),
+            }
+            for name, camera in playback.views.items()
+        ],
     }
 
 
@@ -163,28 +297,6 @@ def _sliders(rig: WebRig) -> list[dict[str, Any]]:
     reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
     order = np.argsort(-used.std(0), kind="stable") if len(used) else np.arange(rig.expressions)
     return [{"name": names[k], "component": k, "reach": round(float(reach[k]), 2)} for k in order.tolist()]
-
-
-def _shapes(controls: ShapeControls | None) -> dict[str, Any]:
-    if controls is None:
-        return {}
-    return {"shapes": {"names": list(controls.names), "opens": controls.opens, "limited": controls.limited}}
-
-
-def _view(name: str, camera: Camera) -> dict[str, Any]:
-    return {
-        "name": name,
-        "size": [camera.width, camera.height],
-        "focal": [camera.fl_x, camera.fl_y],
-        "center": [camera.cx, camera.cy],
-        "world_to_camera": camera.world_to_camera.ravel().tolist(),
-    }
-
-
-def _local_unit(avatar: Avatar) -> float:
-    """Meters of a unit of the splats' local frames, where it is largest."""
-    scale = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention).scale
-    return float(scale.max(initial=1e-6))
 
 
 def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
@@ -227,25 +339,27 @@ def _driven_arrays(avatar: Avatar, local_unit: float) -> Arrays:
     return arrays
 
 
-def _light_arrays(light: AvatarLight | None) -> Arrays:
-    """How the vertices receive light, and what the capture's light gave them: from that and the recorded colors, the
-    player finds out the albedo of the splats."""
-    if light is None:
+def _light(relighter: Relighter) -> dict[str, Any]:
+    """What is one for the whole head: how much albedo is drawn to its mean, that, and the light of the capture."""
+    recorded = relighter.recorded_light.ravel().tolist()
+    return {"damping": relighter.light.damping, "typical": relighter.typical_albedo.tolist(), "recorded": recorded}
+
+
+def _light_arrays(relighter: Relighter | None, order: np.ndarray, local_unit: float) -> Arrays:
+    """How the vertices receive light, what the capture's light gave them, on which triangles the splats lie, and
+    lashes."""
+    if relighter is None:
         return {}
+    light, lashes, faces = relighter.light, relighter.lashes, len(relighter.avatar.faces)
     largest = float(light.irradiance.max(initial=1e-6))
     return {
         "light_transfer": FixedPoint(light.transfer, TRANSFER_STEP),
         "light_occlusion": FixedPoint(light.occlusion, SHARE_STEP),
         "light_irradiance": FixedPoint(light.irradiance, largest / IRRADIANCE_STEPS),
         "light_roughness": FixedPoint(light.roughness, SHARE_STEP),
-    }
-
-
-def _mesh_arrays(avatar: Avatar, splats: Splats) -> Arrays:
-    return {
-        "faces": avatar.faces,
-        "neutral": FixedPoint(avatar.neutral, VERTEX_STEP_M),
-        "splats_per_face": np.bincount(splats.face, minlength=len(avatar.faces)),
+        "light_face": ((relighter.face - relighter.avatar.splats.face) % faces)[order],  # of most splats 0: their own
+        "light_lash_face": lashes.face,
+        "light_lash_corners": FixedPoint(lashes.corners.reshape(-1, 12), POSITION_STEP_M / local_unit),
     }
 
 

@@ -3,26 +3,25 @@
 import base64
 import html
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from ...avatar.file import Avatar
+from ...avatar.splats import harmonics_text
 from ...errors import StgaError
 from ...files import replacing_together
 from ...flame.sequence import FlameSequence
 from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
+from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS
 from ..playback import Playback
-from .data_file import data_file
-from .rig import WebRig, baked_rig, flame_rig
+from .data_file import baked_rig, data_file, flame_rig
 
 PLAYER = Path(__file__).parent / "player"
-ELEMENT = "stga-avatar.js"
-"""Module of the custom element."""
-PAGE_MODULES = "light_controls.js", "page.js"
-"""Those of the page around it."""
+ELEMENT, PAGE = "stga-avatar.js", "page.js"
+"""Modules of the custom element, and of the page around it."""
 IMPORT = re.compile(r"^import\b[^;]*?'\./([\w-]+\.js)';\n", re.MULTILINE)
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
 TYPES = re.compile(
@@ -35,9 +34,8 @@ TYPES = re.compile(
 @cache
 def element_script() -> str:
     """The custom element as one module: the player's files without their imports and exports, under their licence."""
-    sources = [EXPORT.sub("", _source(name)) for name in modules()]
     licence = (PLAYER / "LICENSE").read_text(encoding="utf-8")
-    return "/*!\n" + licence + "*/\n" + "\n".join(sources)
+    return "/*!\n" + licence + "*/\n" + "\n".join(map(_source, modules()))
 
 
 @cache
@@ -48,8 +46,12 @@ def modules(name: str = ELEMENT) -> tuple[str, ...]:
 
 
 def _source(name: str) -> str:
-    """A module without its imports and types."""
-    return TYPES.sub("", IMPORT.sub("", (PLAYER / name).read_text(encoding="utf-8")))
+    """A module without its imports, exports and types, and with the GLSL that it shares with Blender's shaders."""
+    source = (PLAYER / name).read_text(encoding="utf-8")
+    for comment in (IMPORT, EXPORT, TYPES):
+        source = comment.sub("", source)
+    source = source.replace("{{harmonics}}", "; ".join(harmonics_text()[1:]))
+    return source.replace("{{shading}}", SHADING_DEFINES + SHADING_FUNCTIONS)
 
 
 def page(title: str, notice: str, data: bytes) -> str:
@@ -59,13 +61,12 @@ def page(title: str, notice: str, data: bytes) -> str:
         "title": html.escape(title),
         "notice": html.escape(notice),
         "style": (PLAYER / "page.css").read_text(encoding="utf-8"),
-        "script": "\n".join((element_script(), *map(_source, PAGE_MODULES))),
+        "script": f"{element_script()}\n{_source(PAGE)}",
         "data": base64.b64encode(data).decode("ascii"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
 
 
-SCRIPT_NAME = "stga-avatar.js"
 BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
 """About what a splat, and a coefficient of its color, takes in a page: compressed, then written as text."""
 BUNDLED_NOTICE = (
@@ -94,15 +95,20 @@ def write_web(
               (V, 3) meters are baked, of which there is one at least
     Raises StgaError where there is no pose, or a file cannot be written.
     """
-    rig = _rig(path, None if playback.motion_only else sequence, meshes)
     try:
+        rig = baked_rig(list(meshes)) if playback.motion_only or sequence is None else flame_rig(sequence)
         data = data_file(avatar, rig, playback)
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
-    if path.suffix.lower() == ".stga":
-        return _write({path: data, path.with_name(SCRIPT_NAME): element_script().encode("utf-8")})
     notice = flame_notice(avatar, sequence, playback.motion_only)
-    return _write({path: page(playback.title, notice, data).encode("utf-8")})
+    contents = {path: page(playback.title, notice, data).encode("utf-8")}
+    if path.suffix.lower() == ".stga":
+        contents = {path: data, path.with_name(ELEMENT): element_script().encode("utf-8")}
+    with replacing_together() as new_file:
+        for file, content in contents.items():
+            with new_file(file) as partial:
+                partial.write_bytes(content)
+    return list(contents)
 
 
 def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bool) -> str:
@@ -122,21 +128,3 @@ def web_bytes(avatar: Avatar) -> int:
     """About the size of a page of the avatar."""
     colors = avatar.splats.sh[0].size + avatar.splats.strain_color[0].size if len(avatar.splats) else 0
     return round((BYTES_PER_SPLAT + BYTES_PER_COEFFICIENT * colors) * len(avatar.splats))
-
-
-def _rig(path: Path, sequence: FlameSequence | None, meshes: Iterable[np.ndarray]) -> WebRig:
-    if sequence is not None:
-        return flame_rig(sequence)
-    posed = list(meshes)
-    if not posed:
-        raise StgaError(f"{path}: there is no posed mesh to export")
-    return baked_rig(posed)
-
-
-def _write(contents: Mapping[Path, bytes]) -> list[Path]:
-    """Write the files, all or none."""
-    with replacing_together() as new_file:
-        for path, data in contents.items():
-            with new_file(path) as partial:
-                partial.write_bytes(data)
-    return list(contents)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, StrainBasis
 from .device import Device, Kernel, Recording
 from .layout import list_words

@@ -8,9 +8,8 @@ from uuid import uuid4
 import numpy as np
 
 from ...avatar.embedding import face_areas
-from ...avatar.file import Avatar
-from ...avatar.light import AvatarLight
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.file import Avatar, AvatarLight
+from ...avatar.offsets import OFFSETS
 from ...avatar.splats import SH_C0, Splats
 from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 from ...capture.color import srgb_to_linear

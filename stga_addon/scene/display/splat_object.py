@@ -6,8 +6,7 @@ from uuid import uuid4
 import bpy
 import numpy as np
 
-from ...avatar.file import Avatar
-from ...avatar.light import AvatarLight
+from ...avatar.file import Avatar, AvatarLight
 from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ...avatar.light import AvatarLight
+from ...avatar.file import AvatarLight
 from ..arrays import flat_floats, read_values
 
 PROPERTY = "stga_light"

@@ -91,16 +91,9 @@ def _fill(block: np.ndarray, relit: Relit, kept: Kept, first: int, count: int) -
     block[0, 0] = lighting.mix if lighting.mode == "mix" else 1
     block[0, 1:] = 2**lighting.exposure / np.asarray(lighting.white)
     block[1] = max(lighting.roughness, 0.05), lighting.specular, first, count
-    block[2, 3], block[3, :3] = relighter.light.damping, _typical_albedo(relighter)
+    block[2, 3], block[3, :3] = relighter.light.damping, relighter.typical_albedo
     block[4:13, :3] = GLOSSY[:, None] * lighting.world
     block[13] = *kept.gain, kept.share
-
-
-@lru_cache(maxsize=8)
-def _typical_albedo(relighter: Relighter) -> np.ndarray:
-    if not relighter.light.damping:
-        return np.ones(3)
-    return np.asarray(np.exp(np.log(np.maximum(relighter.albedo, 1e-4)).mean(0)))
 
 
 def _lights(relit: Relit, maps: list[ShadowView], map_rows: list[np.ndarray]) -> np.ndarray:

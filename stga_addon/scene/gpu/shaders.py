@@ -18,11 +18,14 @@ pass draws the rectangles. In between are textures as wide, in the order of draw
     shades   color in sRGB, opacity
 """
 
+import math
 from typing import Any
 
 import gpu
 from gpu.types import GPUShaderCreateInfo, GPUStageInterfaceInfo
 
+from ...avatar.splats import harmonics_text
+from ...light.shading import SRGB_FUNCTIONS
 from ..compat import allow_depth_write
 from ..layers import FROZEN_COLOR_SRGB
 from .packing import CLIP_PLANES, LAYER_TEXELS, VIEW_TEXELS
@@ -52,38 +55,22 @@ _TEXEL_FUNCTION = """
 ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
 """
 
+_TERMS = "\n".join(
+    f"  if (degree >= {math.isqrt(k)}) {{ color += {term} * texelFetch(colors, at(first + {k}), 0).rgb; }}"
+    for k, term in enumerate(harmonics_text())
+)
+_HARMONICS = f"""
+vec3 spherical_harmonics(int first, int degree, vec3 d)
+{{
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  vec3 color = vec3(0.5);
+{_TERMS}
+  return color;
+}}
+"""
+
 _PROJECTION_FRAGMENT = """
 const float LOW_PASS_PX2 = 0.3;
-
-vec3 spherical_harmonics(int first, int degree, vec3 d)
-{
-  vec3 color = vec3(0.5) + 0.28209479177387814 * texelFetch(colors, at(first), 0).rgb;
-  if (degree > 0) {
-    vec3 b = 0.4886025119029199 * vec3(-d.y, d.z, -d.x);
-    color += b.x * texelFetch(colors, at(first + 1), 0).rgb + b.y * texelFetch(colors, at(first + 2), 0).rgb
-           + b.z * texelFetch(colors, at(first + 3), 0).rgb;
-  }
-  float xx = d.x * d.x, yy = d.y * d.y, zz = d.z * d.z;
-  if (degree > 1) {
-    float m = 1.0925484305920792;
-    color += m * d.x * d.y * texelFetch(colors, at(first + 4), 0).rgb
-           - m * d.y * d.z * texelFetch(colors, at(first + 5), 0).rgb
-           + 0.31539156525252005 * (2.0 * zz - xx - yy) * texelFetch(colors, at(first + 6), 0).rgb
-           - m * d.x * d.z * texelFetch(colors, at(first + 7), 0).rgb
-           + 0.5 * m * (xx - yy) * texelFetch(colors, at(first + 8), 0).rgb;
-  }
-  if (degree > 2) {
-    float outer = 0.5900435899266435, inner = 0.4570457994644658;
-    color += -outer * d.y * (3.0 * xx - yy) * texelFetch(colors, at(first + 9), 0).rgb
-           + 2.890611442640554 * d.x * d.y * d.z * texelFetch(colors, at(first + 10), 0).rgb
-           - inner * d.y * (4.0 * zz - xx - yy) * texelFetch(colors, at(first + 11), 0).rgb
-           + 0.3731763325901154 * d.z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * texelFetch(colors, at(first + 12), 0).rgb
-           - inner * d.x * (4.0 * zz - xx - yy) * texelFetch(colors, at(first + 13), 0).rgb
-           + 1.445305721320277 * d.z * (xx - yy) * texelFetch(colors, at(first + 14), 0).rgb
-           - outer * d.x * (xx - 3.0 * yy) * texelFetch(colors, at(first + 15), 0).rgb;
-  }
-  return color;
-}
 
 void main()
 {
@@ -196,12 +183,6 @@ void main()
 """
 
 _COMPOSITE_FRAGMENT = """
-vec3 to_linear(vec3 srgb)
-{
-  vec3 curve = pow((max(srgb, vec3(0.04045)) + 0.055) / 1.055, vec3(2.4));
-  return mix(curve, srgb / 12.92, vec3(lessThanEqual(srgb, vec3(0.04045))));
-}
-
 bool is_near_bone(vec2 pixel)
 {
   for (int bone = 0; bone < int(part.y); bone++) {
@@ -226,15 +207,16 @@ void main()
   float z = distances.r / max(distances.g, 1e-9);
   gl_FragDepth = clamp(0.5 + 0.5 * (to_depth.x + to_depth.y * z) / (to_depth.z + to_depth.w * z), 0.0, 1.0);
   if (part.x > 1.5) {
-    color_final = vec4(splats.a * to_linear(behind.rgb), 0.0);
+    color_final = vec4(splats.a * srgb_to_linear(behind.rgb), 0.0);
     return;
   }
   if (behind.a < 0.5) {
-    color_final = vec4(to_linear(splats.rgb / splats.a) * splats.a, splats.a);
+    color_final = vec4(srgb_to_linear(splats.rgb / splats.a) * splats.a, splats.a);
     return;
   }
   /* Splats are blended in sRGB, the viewport blends linear: exact where `behind` is what lies behind. */
-  vec3 goal = to_linear(clamp(splats.rgb + (1.0 - splats.a) * behind.rgb, 0.0, 1.0)), back = to_linear(behind.rgb);
+  vec3 goal = srgb_to_linear(clamp(splats.rgb + (1.0 - splats.a) * behind.rgb, 0.0, 1.0));
+  vec3 back = srgb_to_linear(behind.rgb);
   vec3 most = min(vec3(1.0 - splats.a), goal / max(back, vec3(1e-6)));
   float through = min(most.r, min(most.g, most.b));
   color_final = vec4(goal - through * back, 1.0 - through);
@@ -257,7 +239,7 @@ def projection_shader(relit: bool = False) -> Any:
     for name in ("faces", "count"):
         info.push_constant("INT", name)
     info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(_TEXEL_FUNCTION + (RELIT_FUNCTIONS if relit else "") + _PROJECTION_FRAGMENT)
+    info.fragment_source(_TEXEL_FUNCTION + _HARMONICS + (RELIT_FUNCTIONS if relit else "") + _PROJECTION_FRAGMENT)
     return gpu.shader.create_from_info(info)
 
 
@@ -299,5 +281,5 @@ def composite_shader() -> Any:
     for name in ("corner_px", "to_depth", "behind", "part"):
         info.push_constant("VEC4", name)
     info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(_COMPOSITE_FRAGMENT)
+    info.fragment_source(SRGB_FUNCTIONS + _COMPOSITE_FRAGMENT)
     return gpu.shader.create_from_info(info)

@@ -9,9 +9,8 @@ import numpy as np
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, joint_positions
 from ...flame.model import JOINTS
-from ...flame.motion import PARTS
 from ...flame.quaternions import continuous, from_axis_angle
-from ...flame.sequence import FlameSequence
+from ...flame.sequence import PARTS, FlameSequence
 from ..animation import write_curve, write_triangle_curves
 from ..compat import action_curves, copy_action, push_down_action
 from ..objects import Warn, log_warning

@@ -10,9 +10,8 @@ import numpy as np
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
-from ...flame.motion import PARTS
 from ...flame.quaternions import to_axis_angle
-from ...flame.sequence import FlameSequence
+from ...flame.sequence import PARTS, FlameSequence
 from ..arrays import evaluated_vertices, read_values
 from ..compat import push_down_action
 from ..objects import Warn, log_warning

@@ -10,37 +10,19 @@ import numpy as np
 from ...capture.images import read_mask
 from ...capture.model import View
 from ...errors import StgaError
-from .model import Footage, FootageCamera, Frames
+from .model import DerivedFrames, Footage, FootageCamera
 from .sources import Sources, find_sources, frame_number
 from .video import VideoFrames
 
 
 @dataclass(frozen=True)
-class MaskedFrames:
+class MaskedFrames(DerivedFrames):
     """Frames with other masks. `masks`: timestep -> view of the mask."""
 
-    frames: Frames
     masks: Mapping[int, View]
-
-    @property
-    def timesteps(self) -> tuple[int, ...]:
-        return self.frames.timesteps
-
-    def image(self, timestep: int) -> np.ndarray:
-        return self.frames.image(timestep)
 
     def mask(self, timestep: int) -> np.ndarray | None:
         return read_mask(self.masks[timestep])
-
-    def source(self, timestep: int) -> str:
-        return self.frames.source(timestep)
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        return self.frames.files
-
-    def file(self, timestep: int) -> Path | None:
-        return self.frames.file(timestep)
 
 
 def with_masks(footage: Footage, recorded: Sources, folder: Path) -> Footage:

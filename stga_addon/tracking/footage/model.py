@@ -38,6 +38,33 @@ class Frames(Protocol):
 
 
 @dataclass(frozen=True)
+class DerivedFrames:
+    """`frames`, of which a subclass changes something."""
+
+    frames: Frames
+
+    @property
+    def timesteps(self) -> tuple[int, ...]:
+        return self.frames.timesteps
+
+    def image(self, timestep: int) -> np.ndarray:
+        return self.frames.image(timestep)
+
+    def mask(self, timestep: int) -> np.ndarray | None:
+        return self.frames.mask(timestep)
+
+    def source(self, timestep: int) -> str:
+        return self.frames.source(timestep)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return self.frames.files
+
+    def file(self, timestep: int) -> Path | None:
+        return self.frames.file(timestep)
+
+
+@dataclass(frozen=True)
 class FootageCamera:
     """A calibrated camera and its frames, as an ideal pinhole sees them.
 

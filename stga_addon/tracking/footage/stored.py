@@ -9,19 +9,14 @@ import numpy as np
 from ...capture.images import read_image
 from ...capture.model import View
 from ...files import replacing
-from .model import Footage, FootageCamera, Frames
+from .model import DerivedFrames, Footage, FootageCamera
 
 
 @dataclass(frozen=True)
-class StoredFrames:
-    """`frames` as recorded; `views`: timestep -> the image file that a frame is kept in from its first use."""
+class StoredFrames(DerivedFrames):
+    """Frames as recorded; `views`: timestep -> the image file that a frame is kept in from its first use."""
 
-    frames: Frames
     views: Mapping[int, View]
-
-    @property
-    def timesteps(self) -> tuple[int, ...]:
-        return self.frames.timesteps
 
     def image(self, timestep: int) -> np.ndarray:
         view = self.views[timestep]
@@ -33,16 +28,6 @@ class StoredFrames:
         with replacing(view.image) as partial:
             partial.write_bytes(cv2.imencode(".png", pixels[..., ::-1])[1].tobytes())
         return pixels
-
-    def mask(self, timestep: int) -> np.ndarray | None:
-        return self.frames.mask(timestep)
-
-    def source(self, timestep: int) -> str:
-        return self.frames.source(timestep)
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        return self.frames.files
 
     def file(self, timestep: int) -> Path | None:
         path = self.views[timestep].image

@@ -5,7 +5,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...capture.model import Capture
 from ...errors import StgaError
 from ..effect_catalog import EFFECTS, Effect

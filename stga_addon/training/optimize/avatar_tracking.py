@@ -13,10 +13,10 @@ from time import perf_counter
 import numpy as np
 
 from ...avatar.file import Avatar
-from ...capture.flame_capture import with_sequence
 from ...capture.images import read_view
 from ...capture.mesh_geometry import vertex_normals
 from ...capture.model import Capture, View, evenly_spread
+from ...capture.open import with_sequence
 from ...errors import StgaError
 from ...flame.forward import RIGID_SIZE, TRANSLATION_SIZE, FlameFrame, flame_forward, frame_of, parameters_gradient
 from ...flame.sequence import FlameSequence, sequence_mesh, with_identity

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, frame_backward
-from ...avatar.offsets.offset import offset_of
+from ...avatar.offsets import offset_of
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters

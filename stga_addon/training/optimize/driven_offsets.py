@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
 from .adam import BETA1, BETA2
 from .state import OffsetState

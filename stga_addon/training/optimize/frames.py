@@ -8,8 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
-from ...avatar.offsets.offset import moved_frames
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS, moved_frames
 from ...avatar.strain import color_range, strain_basis
 from ...capture.model import Capture
 from ..settings import TrainingSettings

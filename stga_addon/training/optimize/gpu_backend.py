@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.cpu.layout import Parameters

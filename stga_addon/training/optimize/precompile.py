@@ -6,7 +6,7 @@ import time
 import numpy as np
 
 from ...avatar.embedding import WORLD
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...raster.cpu import USES_BUNDLED_KERNELS

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...avatar.splats import ADDED, Splats
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import AdamTables

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...avatar.file import check_array
-from ...avatar.offsets.table import OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...avatar.splats import ARRAYS
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz

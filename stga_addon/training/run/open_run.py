@@ -3,9 +3,8 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ...capture.model import Capture
+from ...capture.model import Capture, join_takes
 from ...capture.open import open_capture
-from ...capture.takes import join_takes
 from ...errors import StgaError
 from ...render.device import GPU, adapter_names, choose_device
 from .folder import Run, Take, has_run, read_run

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.flame_capture import with_sequence
 from ...capture.model import Capture
+from ...capture.open import with_sequence
 from ...errors import StgaError
 from ...files import read_npz, write_npz
 from ...flame.forward import FlameFrame, frame_of

@@ -14,9 +14,8 @@ from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.export.playback import Playback, ShapeControls
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.data_file import WebRig, data_file, flame_rig
 from stga_addon.export.web.page import page
-from stga_addon.export.web.rig import WebRig, flame_rig
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh
 

@@ -4,8 +4,8 @@ import { pathToFileURL } from 'node:url';
 
 const [folder, file] = process.argv.slice(2);
 const load = (name) => import(pathToFileURL(`${folder}/${name}`));
-const [{ readData }, { Motion }, { Rig }, { FaceFrames, FACE_FLOATS }, { DepthSort }] = await Promise.all(
-  ['data.js', 'motion.js', 'rig.js', 'face_frames.js', 'depth_sort.js'].map(load),
+const [{ readData }, { Motion, Rig }, { FaceFrames, FACE_FLOATS }, { DepthSort }] = await Promise.all(
+  ['data.js', 'motion.js', 'face_frames.js', 'renderer.js'].map(load),
 );
 try {
   const data = await readData(new Uint8Array(await readFile(file)));

@@ -9,9 +9,8 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.export.playback import Playback
 from stga_addon.export.web import data_file
-from stga_addon.export.web.data_file import FixedPoint, pack
-from stga_addon.export.web.page import PAGE_MODULES, PLAYER, SCRIPT_NAME, element_script, modules, write_web
-from stga_addon.export.web.rig import BAKE_TOLERANCE_M, baked_rig
+from stga_addon.export.web.data_file import BAKE_TOLERANCE_M, FixedPoint, baked_rig, pack
+from stga_addon.export.web.page import ELEMENT, PAGE, PLAYER, element_script, modules, write_web
 
 from .conftest import make_head
 from .web_data import read_web_data, splats_of
@@ -100,7 +99,7 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert header["sliders"] == []
     assert arrays["weights"].shape[1] == 1
-    assert (tmp_path / SCRIPT_NAME).read_text(encoding="utf-8") == element_script()
+    assert (tmp_path / ELEMENT).read_text(encoding="utf-8") == element_script()
     write_web(tmp_path / "b.html", head.avatar, Playback(), sequence=head.sequence)
     assert "derived from a FLAME model" in (tmp_path / "b.html").read_text(encoding="utf-8")
 
@@ -123,14 +122,14 @@ def test_pages_of_flame_meshes_name_flames_licence(head, tmp_path):
 
 def test_no_data_without_its_player(head, tmp_path):
     """Catches a data file left behind by an export that fails at the player beside it."""
-    (tmp_path / SCRIPT_NAME).mkdir()
-    with pytest.raises(StgaError, match=SCRIPT_NAME):
+    (tmp_path / ELEMENT).mkdir()
+    with pytest.raises(StgaError, match=ELEMENT):
         write_web(tmp_path / "a.stga", head.avatar, Playback(), list(head.meshes))
     assert not (tmp_path / "a.stga").exists()
 
 
 def test_every_module_is_in_the_page():
     """Catches a module of the player that is not joined into the page, or an import that is left in it."""
-    assert {path.name for path in PLAYER.glob("*.js")} == {*modules(), *PAGE_MODULES}
+    assert {path.name for path in PLAYER.glob("*.js")} == {*modules(), PAGE}
     assert "\nimport " not in element_script()
     assert "MIT" in element_script()[:100]

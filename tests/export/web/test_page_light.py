@@ -7,8 +7,7 @@ import pytest
 
 from export.web.browser import Browser
 from stga_addon.avatar.embedding import face_frames
-from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.light import AvatarLight
+from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import Splats
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
@@ -35,7 +34,7 @@ COLORS = """(() => {
   gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
   gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-  return Array.from(values.subarray(0, 4 * lightPass.surface.count));
+  return Array.from(values.subarray(0, 4 * lightPass.count));
 })()"""
 
 
@@ -104,8 +103,8 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     if alike:
         world, sun_light = head.avatar.light.radiance * np.array([1.2, 1.0, 0.8]), {**SUN, "color": [0.6, 0.45, 0.3]}
     set_lighting(browser, str({"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5}))
-    order = np.argsort(head.avatar.splats.face, kind="stable")
     relighter = Relighter(head.avatar)
+    order = np.lexsort((relighter.face, head.avatar.splats.face))
     assert len(relighter.lashes.face) == LASHES
     sun = Light("sun", sun_light["color"], direction=-np.array(SUN["toward"]))
     share = relighter.distant_in_head(head.meshes[0], Lighting(world, (sun,)))[1].share

@@ -19,7 +19,7 @@ from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
 from stga_addon.driving.performance import Performance
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.page import SCRIPT_NAME, write_web
+from stga_addon.export.web.page import ELEMENT, write_web
 from stga_addon.flame.forward import FlameFrame, flame_forward
 
 from .conftest import Head, show
@@ -274,7 +274,7 @@ def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
     assert (found["height"], found["loop"], found["background"]) == (480, True, "#202020")
     assert found["expression"] == pytest.approx(0.8)
     assert found["jaw"] == pytest.approx(0.2)
-    assert browser.requests == [f"{server}/{name}" for name in ("index.html", SCRIPT_NAME, "anna.stga")]
+    assert browser.requests == [f"{server}/{name}" for name in ("index.html", ELEMENT, "anna.stga")]
     assert browser.errors == []
 
 

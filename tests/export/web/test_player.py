@@ -3,6 +3,7 @@
 import functools
 import gzip
 import json
+import operator
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,8 @@ from avatar.conftest import random_splats
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.strain import color_range
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.data_file import data_file
+from stga_addon.export.web.data_file import baked_rig, data_file
 from stga_addon.export.web.page import PLAYER
-from stga_addon.export.web.rig import baked_rig
 
 from .conftest import make_head
 
@@ -124,26 +124,57 @@ def test_order_is_back_to_front(head, tmp_path):
     assert np.diff(depth).max() <= 2 * np.ptp(depth) / 65535
 
 
+def with_header(raw: bytes, *keys: str | int, value: Any) -> bytes:
+    """An inflated data file with one value of its header replaced."""
+    length = int.from_bytes(raw[8:12], "little")
+    header = json.loads(raw[12 : 12 + length])
+    *outer, last = keys
+    functools.reduce(operator.getitem, outer, header)[last] = value
+    text = json.dumps(header).replace("Infinity", "1e999").encode()
+    return raw[:8] + len(text).to_bytes(4, "little") + text + raw[12 + length :]
+
+
+LIGHT = {"damping": 0.5, "recorded": [1] * 27, "typical": [1] * 3}
+
+
 def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
     """Catches a player that hangs, or draws garbage, on a file that was cut off, altered or made by a later version."""
     whole, packed = head.data(), functools.partial(gzip.compress, compresslevel=1)
     raw = gzip.decompress(whole)
-    length = int.from_bytes(raw[8:12], "little")
-    header = raw[12 : 12 + length]
     altered = [
-        whole[: len(whole) // 2],
-        b"PK" + whole,
-        packed(raw[:-5]),
-        packed(raw[:4] + b"\x09" + raw[5:]),
-        packed(raw[:12] + header.replace(b'"fps": 2.0', b'"fps": -20') + raw[12 + length :]),
-        packed(raw[:12] + header.replace(b'"planes": 1', b'"planes": 9', 1) + raw[12 + length :]),
-        packed(raw[:12] + header.replace(b'"parents": [-1', b'"parents": [77', 1) + raw[12 + length :]),
-        packed(raw[:8] + b"\xff\xff\xff\x7f" + raw[12:]),
+        (whole[: len(whole) // 2], "is damaged."),
+        (b"PK" + whole, "not an avatar data file."),
+        (packed(raw[:-5]), "is cut off."),
+        (packed(raw[:4] + b"\x09" + raw[5:]), "format version 9"),
+        (packed(raw[:8] + b"\xff\xff\xff\x7f" + raw[12:]), "is cut off."),
+        *(
+            (packed(with_header(raw, *keys, value=value)), f"damaged: {field} is missing or malformed.")
+            for field, keys, value in [
+                ("sliders", ("sliders", 0, "component"), 0.5),
+                ("sliders", ("sliders", 0, "component"), 10**6),
+                ("sliders", ("sliders", 0, "reach"), float("inf")),
+                ("sliders", ("sliders", 0), None),
+                ("joints", ("joints", 0), None),
+                ("views", ("views", 0, "size"), [0.5, 120]),
+                ("views", ("views", 0, "size"), [1e300, 120]),
+                ("views", ("views", 0, "focal"), "12"),
+                ("parents", ("parents", 1), 0.5),
+                ("parents", ("parents", 0), 77),
+                ("fps", ("fps",), 1e300),
+                ("fps", ("fps",), -20),
+                ("fps", ("fps",), True),
+                ("title", ("title",), 5),
+                ("light", ("light",), {**LIGHT, "damping": 2}),
+                ("light_transfer", ("light",), LIGHT),
+                ("xyz.planes", ("arrays", "xyz", "planes"), 9),
+            ]
+        ),
     ]
-    for data in altered:
+    for data, sentence in altered:
         error = evaluated(data, tmp_path).get("error", "")
-        assert error.startswith("DataError: "), error
-        assert error.endswith("."), error
+        assert error.startswith("DataError: ")
+        assert sentence in error
+        assert error.endswith(".")
 
 
 def test_an_avatar_without_motion_plays(head, tmp_path):

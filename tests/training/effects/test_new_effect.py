@@ -9,8 +9,7 @@ import pytest
 from stga_addon.avatar.embedding import FaceFrames, face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.offsets.offset import DrivenOffset
-from stga_addon.avatar.offsets.table import OFFSETS
+from stga_addon.avatar.offsets import OFFSETS, DrivenOffset
 from stga_addon.avatar.strain import StrainBasis
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError

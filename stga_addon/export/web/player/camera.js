@@ -1,7 +1,11 @@
 // @ts-check
-// Pinhole cameras (OpenCV axes: x right, y down, z ahead) and the ways to move one around a point.
+// Pinhole cameras (OpenCV axes: x right, y down, z ahead), and how mouse, pen and touch move one around a point.
 
-/** @import { Camera, Vector, View } from './types.js' */
+/**
+ * @import { Player } from './player.js'
+ * @import { Camera, Vector, View } from './types.js'
+ * @typedef {[number, number]} Point pixels of the page
+ */
 
 import { box, crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
@@ -10,8 +14,7 @@ const MIN_DISTANCE_M = 0.02;
 
 /**
  * A view of the data file as a camera: { size, focal, center } in pixels, matrix (16): world to camera, row-major.
- * @param {View} view
- * @returns {Camera}
+ * @type {(view: View) => Camera}
  */
 export function cameraOfView(view) {
   const { size, focal, center } = view;
@@ -20,10 +23,7 @@ export function cameraOfView(view) {
 
 /**
  * The same camera for a canvas of another size, with the whole of its picture in the middle.
- * @param {Camera} camera
- * @param {number} width
- * @param {number} height
- * @returns {Camera}
+ * @type {(camera: Camera, width: number, height: number) => Camera}
  */
 export function fitted(camera, width, height) {
   const scale = Math.min(width / camera.size[0], height / camera.size[1]);
@@ -40,9 +40,7 @@ export function fitted(camera, width, height) {
 
 /**
  * A camera in front (+z, y up) of the points (3·V) for data without views.
- * @param {ArrayLike<number>} points
- * @param {Vector} up
- * @returns {Camera}
+ * @type {(points: ArrayLike<number>, up: Vector) => Camera}
  */
 export function frontCamera(points, up) {
   const [middle, radius] = bounds(points);
@@ -59,8 +57,7 @@ export function frontCamera(points, up) {
 
 /**
  * Middle of the bounding box of points (3·V), and half its diagonal.
- * @param {ArrayLike<number>} points
- * @returns {[Vector, number]}
+ * @type {(points: ArrayLike<number>) => [Vector, number]}
  */
 export function bounds(points) {
   const [low, high] = box(points);
@@ -70,12 +67,7 @@ export function bounds(points) {
 
 /**
  * Turn a camera around the point `pivot`: by `yaw` about `up` and by `pitch` about its own x axis (radians).
- * @param {Camera} camera
- * @param {Vector} pivot
- * @param {Vector} up
- * @param {number} yaw
- * @param {number} pitch
- * @returns {Camera}
+ * @type {(camera: Camera, pivot: Vector, up: Vector, yaw: number, pitch: number) => Camera}
  */
 export function orbited(camera, pivot, up, yaw, pitch) {
   const axis = unit(up);
@@ -87,11 +79,7 @@ export function orbited(camera, pivot, up, yaw, pitch) {
 
 /**
  * Shift a camera's picture by pixels; returns the camera and the point to orbit about, shifted with the view.
- * @param {Camera} camera
- * @param {Vector} pivot
- * @param {number} dx
- * @param {number} dy
- * @returns {[Camera, Vector]}
+ * @type {(camera: Camera, pivot: Vector, dx: number, dy: number) => [Camera, Vector]}
  */
 export function panned(camera, pivot, dx, dy) {
   const depth = inCamera(camera.matrix, pivot)[2];
@@ -105,10 +93,7 @@ export function panned(camera, pivot, dx, dy) {
 
 /**
  * Move a camera to `factor` times its distance from `pivot`.
- * @param {Camera} camera
- * @param {Vector} pivot
- * @param {number} factor
- * @returns {Camera}
+ * @type {(camera: Camera, pivot: Vector, factor: number) => Camera}
  */
 export function dollied(camera, pivot, factor) {
   const q = inCamera(camera.matrix, pivot);
@@ -120,11 +105,7 @@ export function dollied(camera, pivot, factor) {
 
 /**
  * A direction turned with what faces the camera: `yaw` moves that to the right, `pitch` down (radians).
- * @param {Camera} camera
- * @param {Vector} direction
- * @param {number} yaw
- * @param {number} pitch
- * @returns {Vector}
+ * @type {(camera: Camera, direction: Vector, yaw: number, pitch: number) => Vector}
  */
 export function turnedAsSeen(camera, direction, yaw, pitch) {
   return rotatedAbout(rotatedAbout(direction, row(camera.matrix, 1), -yaw), row(camera.matrix, 0), pitch);
@@ -132,11 +113,7 @@ export function turnedAsSeen(camera, direction, yaw, pitch) {
 
 /**
  * Rotate about a world axis through `pivot`, which stays where it is in the picture.
- * @param {Camera} camera
- * @param {Vector} pivot
- * @param {Vector} axis
- * @param {number} angle
- * @returns {Camera}
+ * @type {(camera: Camera, pivot: Vector, axis: Vector, angle: number) => Camera}
  */
 function turned(camera, pivot, axis, angle) {
   const before = inCamera(camera.matrix, pivot);
@@ -149,12 +126,7 @@ function turned(camera, pivot, axis, angle) {
   return { ...camera, matrix };
 }
 
-/**
- * @param {Vector} v
- * @param {Vector} axis
- * @param {number} angle
- * @returns {Vector}
- */
+/** @type {(v: Vector, axis: Vector, angle: number) => Vector} */
 function rotatedAbout(v, axis, angle) {
   const [cosine, sine] = [Math.cos(angle), Math.sin(angle)];
   const side = crossed(axis, v);
@@ -163,21 +135,86 @@ function rotatedAbout(v, axis, angle) {
   return [part(0), part(1), part(2)];
 }
 
-/**
- * @param {Float64Array} matrix
- * @param {number} k
- * @returns {Vector}
- */
+/** @type {(matrix: Float64Array, k: number) => Vector} */
 function row(matrix, k) {
   return [matrix[4 * k], matrix[4 * k + 1], matrix[4 * k + 2]];
 }
 
-/**
- * @param {Float64Array} matrix
- * @param {Vector} point
- * @returns {Vector}
- */
+/** @type {(matrix: Float64Array, point: Vector) => Vector} */
 function inCamera(matrix, point) {
   const part = (/** @type {number} */ k) => dotProduct(row(matrix, k), point) + matrix[4 * k + 3];
   return [part(0), part(1), part(2)];
+}
+
+const ORBIT_PER_PIXEL = 0.008; // radians
+const ZOOM_PER_WHEEL_PIXEL = 0.0012;
+const WHEEL_LINE_PX = 16;
+const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
+
+/**
+ * Let pointers on `element` move the camera of the player that `player()` gives, and with Alt its sun; `changed()` after
+ * each move of the camera, `lit()` after each of the sun. Of two fingers, the middle pans and the distance zooms.
+ * @param {HTMLElement} element
+ * @param {() => Player | null} player
+ * @param {() => void} changed
+ * @param {() => void} lit
+ */
+export function addControls(element, player, changed, lit) {
+  /** @type {Map<number, Point>} */
+  const pointers = new Map();
+  element.addEventListener('contextmenu', (event) => event.preventDefault());
+  element.addEventListener('pointerdown', (event) => {
+    element.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  });
+  for (const name of /** @type {const} */ (['pointerup', 'pointercancel'])) {
+    element.addEventListener(name, (event) => pointers.delete(event.pointerId));
+  }
+  element.addEventListener('pointermove', (event) => {
+    const shown = player();
+    if (!pointers.has(event.pointerId) || !shown) return;
+    const before = [...pointers.values()];
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    const after = [...pointers.values()];
+    const { camera, data, lighting, pivot } = shown;
+    const [dx, dy] = middle(after).map((place, axis) => place - middle(before)[axis]);
+    if (event.altKey && after.length === 1 && lighting?.sun) {
+      const toward = turnedAsSeen(camera, lighting.sun.toward, dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL);
+      shown.lighting = { ...lighting, sun: { ...lighting.sun, toward } };
+      lit();
+      return;
+    }
+    if (after.length === 1 && !event.shiftKey && event.buttons <= 1) {
+      shown.camera = orbited(camera, pivot, data.header.up, -dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL);
+    } else {
+      const scale = Math.max(camera.size[0] / element.clientWidth, camera.size[1] / element.clientHeight);
+      [shown.camera, shown.pivot] = panned(camera, pivot, dx * scale, dy * scale);
+    }
+    if (after.length > 1) shown.camera = dollied(shown.camera, shown.pivot, distance(before) / distance(after));
+    changed();
+  });
+  element.addEventListener(
+    'wheel',
+    (event) => {
+      const shown = player();
+      if (!shown) return;
+      event.preventDefault();
+      const pixels = event.deltaY * (event.deltaMode === 1 ? WHEEL_LINE_PX : 1);
+      const limited = Math.max(-MAX_WHEEL_PX, Math.min(MAX_WHEEL_PX, pixels));
+      shown.camera = dollied(shown.camera, shown.pivot, Math.exp(limited * ZOOM_PER_WHEEL_PIXEL));
+      changed();
+    },
+    { passive: false },
+  );
+}
+
+/** @param {Point[]} points one or two */
+function middle(points) {
+  const [a, b] = [points[0], points[1] ?? points[0]];
+  return [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
+}
+
+/** @param {Point[]} points two, or more */
+function distance([a, b]) {
+  return Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));
 }

@@ -1,21 +1,20 @@
 // @ts-check
 // Reading of web data files: container, arrays, and checks of everything that the player relies on.
 
-/** @import { Data, DataArray, Values } from './types.js' */
+/** @import { Data, DataArray } from './types.js' */
 
-import { SIGNALS } from './signals.js';
+import { SIGNALS } from './face_frames.js';
 
 export class DataError extends Error {}
 
-const VERSION = 1;
+const VERSION = 2;
 const MAX_BYTES = 1 << 30;
 const MAX_VIEW_SIZE = 1 << 16; // pixels
 const CHANNELS = 3;
 
 /**
  * Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
- * @param {Uint8Array<ArrayBuffer>} bytes
- * @returns {Promise<Data>}
+ * @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Data>}
  */
 export async function readData(bytes) {
   if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) throw new DataError('This is not an avatar data file.');
@@ -34,10 +33,7 @@ export async function readData(bytes) {
   return /** @type {any} */ ({ header, arrays });
 }
 
-/**
- * @param {Uint8Array<ArrayBuffer>} bytes
- * @returns {Promise<Uint8Array>}
- */
+/** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Uint8Array>} */
 async function inflate(bytes) {
   const chunks = [];
   let size = 0;
@@ -60,10 +56,7 @@ async function inflate(bytes) {
   return raw;
 }
 
-/**
- * @param {Uint8Array} bytes
- * @returns {any}
- */
+/** @type {(bytes: Uint8Array) => any} */
 function parseHeader(bytes) {
   try {
     const header = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(bytes));
@@ -74,16 +67,13 @@ function parseHeader(bytes) {
   throw new DataError('The header of the avatar data is damaged.');
 }
 
-/**
- * @param {any} header
- * @param {Uint8Array} payload
- */
+/** @type {(header: any, payload: Uint8Array) => Record<string, DataArray>} */
 function readArrays(header, payload) {
   /** @type {Record<string, DataArray>} */
   const arrays = {};
   let at = 0;
-  for (const [name, entry] of Object.entries(object(header.arrays, 'arrays'))) {
-    const shape = list(object(entry, name).shape, `${name}.shape`);
+  for (const [name, entry] of Object.entries(header.arrays ?? {})) {
+    const shape = list(entry?.shape, `${name}.shape`);
     require(shape.every((size) => Number.isSafeInteger(size) && size >= 0), `${name}.shape`);
     const count = shape.reduce((product, size) => product * size, 1);
     const planes = entry.type === 'float32' ? 4 : entry.planes;
@@ -96,13 +86,7 @@ function readArrays(header, payload) {
   return arrays;
 }
 
-/**
- * @param {string} name
- * @param {any} entry
- * @param {Uint8Array} block
- * @param {number} count
- * @returns {Float32Array | Int32Array}
- */
+/** @type {(name: string, entry: any, block: Uint8Array, count: number) => Float32Array | Int32Array} */
 function decoded(name, entry, block, count) {
   if (entry.type === 'float32') return new Float32Array(block.slice().buffer);
   const step = entry.type === 'fixed' ? entry.step : 1;
@@ -123,8 +107,7 @@ function decoded(name, entry, block, count) {
 
 /**
  * Throw a DataError unless header and arrays fit each other and hold usable values.
- * @param {any} header
- * @param {Record<string, DataArray>} arrays
+ * @type {(header: any, arrays: Record<string, DataArray>) => void}
  */
 function checkData(header, arrays) {
   const splats = size(arrays, 'xyz', 0);
@@ -168,31 +151,37 @@ function checkData(header, arrays) {
     Object.assign(shapesOf, { shape_linear: [controls, moved + 9], shape_products: [controls, moved] });
   }
   if (header.light) {
-    const shapesOfLight = {
-      transfer: [vertices, 9],
-      occlusion: [vertices],
-      irradiance: [vertices, 3],
-      roughness: [vertices],
-    };
-    for (const [name, shape] of Object.entries(shapesOfLight)) shapesOf[`light_${name}`] = shape;
-    require(header.light.damping >= 0 && header.light.damping <= 1, 'light');
+    const { damping, recorded, typical } = header.light;
+    require(damping >= 0 && damping <= 1 && numbers(recorded, 27) && numbers(typical, 3), 'light');
+    const lashes = arrays.light_lash_face?.shape[0] ?? 0;
+    Object.assign(shapesOf, {
+      light_transfer: [vertices, 9],
+      light_occlusion: [vertices],
+      light_irradiance: [vertices, 3],
+      light_roughness: [vertices],
+      light_face: [splats],
+      light_lash_face: [lashes],
+      light_lash_corners: [lashes, 12],
+    });
   }
   if (arrays.sh) shapesOf.sh = [splats, arrays.sh.shape[1]];
-  for (const [name, shape] of Object.entries(shapesOf)) checkArray(arrays, name, shape);
+  for (const [name, expected] of Object.entries(shapesOf)) {
+    const { shape, values } = arrays[name] ?? { shape: [], values: [] };
+    require(shape.join() === expected.join(), name);
+    require(!(values instanceof Float32Array) || values.every(Number.isFinite), name);
+  }
   require(!arrays.sh || [9, 24, 45].includes(arrays.sh.shape[1]), 'sh');
-  checkRange(arrays.faces.values, vertices, 'faces');
-  checkRange(arrays.rotation_largest.values, 4, 'rotation_largest');
-  checkRange(arrays.splats_per_face.values, splats + 1, 'splats_per_face');
+  const limits = { faces: vertices, rotation_largest: 4, splats_per_face: splats + 1 };
+  if (header.light) Object.assign(limits, { light_face: faces, light_lash_face: faces });
+  for (const [name, past] of Object.entries(limits)) {
+    require(arrays[name].values.every((value) => isIndex(value, past)), name);
+  }
   require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) === splats, 'splats_per_face');
   require(list(header.parents, 'parents').every((parent, joint) => parent === -1 || isIndex(parent, joint)), 'parents');
   checkHeader(header, joints, shapes);
 }
 
-/**
- * @param {any} header
- * @param {number} joints
- * @param {number} shapes
- */
+/** @type {(header: any, joints: number, shapes: number) => void} */
 function checkHeader(header, joints, shapes) {
   require(header.convention === 'stga' || header.convention === 'gaussian_avatars', 'convention');
   require(typeof header.antialiased === 'boolean', 'antialiased');
@@ -222,78 +211,29 @@ function checkHeader(header, joints, shapes) {
   }
 }
 
-/**
- * @param {Record<string, DataArray>} arrays
- * @param {string} name
- * @param {number[]} shape
- */
-function checkArray(arrays, name, shape) {
-  const array = arrays[name];
-  require(array &&
-    array.shape.length === shape.length &&
-    shape.every((size, axis) => size === array.shape[axis]), name);
-  if (array.values instanceof Float32Array) require(array.values.every(Number.isFinite), name);
-}
-
-/**
- * @param {Values} values
- * @param {number} past
- * @param {string} name
- */
-function checkRange(values, past, name) {
-  require(values.every((value) => isIndex(value, past)), name);
-}
-
-/**
- * @param {any} value
- * @param {number} past
- */
+/** @type {(value: any, past: number) => boolean} */
 function isIndex(value, past) {
   return Number.isInteger(value) && value >= 0 && value < past;
 }
 
-/**
- * @param {Record<string, DataArray>} arrays
- * @param {string} name
- * @param {number} axis
- */
+/** @type {(arrays: Record<string, DataArray>, name: string, axis: number) => number} */
 function size(arrays, name, axis) {
   require(arrays[name] && arrays[name].shape.length > axis, name);
   return arrays[name].shape[axis];
 }
 
-/**
- * @param {unknown} value
- * @param {number} count
- */
+/** @type {(value: unknown, count: number) => boolean} */
 function numbers(value, count) {
   return Array.isArray(value) && value.length === count && value.every(Number.isFinite);
 }
 
-/**
- * @param {any} value
- * @param {string} name
- * @returns {any[]}
- */
+/** @type {(value: any, name: string) => any[]} */
 function list(value, name) {
   require(Array.isArray(value), name);
   return value;
 }
 
-/**
- * @param {any} value
- * @param {string} name
- * @returns {any}
- */
-function object(value, name) {
-  require(value !== null && typeof value === 'object', name);
-  return value;
-}
-
-/**
- * @param {unknown} holds
- * @param {string} field
- */
+/** @type {(holds: unknown, field: string) => void} */
 function require(holds, field) {
   if (!holds) throw new DataError(`The avatar data is damaged: ${field} is missing or malformed.`);
 }

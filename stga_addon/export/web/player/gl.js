@@ -12,12 +12,7 @@ export function paddedLength(texels) {
   return 4 * TEXTURE_WIDTH * Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
 }
 
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {string} vertex
- * @param {string} fragment
- * @returns {Program}
- */
+/** @type {(gl: WebGL2RenderingContext, vertex: string, fragment: string) => Program} */
 export function program(gl, vertex, fragment) {
   const made = gl.createProgram();
   /** @type {[number, string][]} */
@@ -49,11 +44,7 @@ export function program(gl, vertex, fragment) {
   return { program: made, uniforms };
 }
 
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {number} format
- * @param {Float32Array} values
- */
+/** @type {(gl: WebGL2RenderingContext, format: number, values: Float32Array) => WebGLTexture} */
 export function floatTexture(gl, format, values) {
   const height = values.length / (4 * TEXTURE_WIDTH);
   if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
@@ -65,6 +56,17 @@ export function floatTexture(gl, format, values) {
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXTURE_WIDTH, height, 0, gl.RGBA, gl.FLOAT, values);
   return made;
+}
+
+/**
+ * Replace all of a texture of `floatTexture`.
+ * @type {(gl: WebGL2RenderingContext, texture: WebGLTexture, values: Float32Array) => void}
+ */
+export function updateTexture(gl, texture, values) {
+  gl.activeTexture(gl.TEXTURE0);
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  const rows = values.length / (4 * TEXTURE_WIDTH);
+  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RGBA, gl.FLOAT, values);
 }
 
 /**
@@ -84,9 +86,10 @@ export function bindTexture(gl, unit, bound, uniform) {
  * @param {number} format
  * @param {number} width
  * @param {number} height
+ * @param {number} [attachment]
  * @returns {Target}
  */
-export function makeTarget(gl, format, width, height) {
+export function makeTarget(gl, format, width, height, attachment = gl.COLOR_ATTACHMENT0) {
   const made = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0);
   gl.bindTexture(gl.TEXTURE_2D, made);
@@ -95,14 +98,11 @@ export function makeTarget(gl, format, width, height) {
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   const framebuffer = gl.createFramebuffer();
   gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, attachment, gl.TEXTURE_2D, made, 0);
   return { texture: made, framebuffer, format, width, height };
 }
 
-/**
- * @param {WebGL2RenderingContext} gl
- * @param {Target} target
- */
+/** @type {(gl: WebGL2RenderingContext, target: Target) => void} */
 export function deleteTarget(gl, target) {
   gl.deleteFramebuffer(target.framebuffer);
   gl.deleteTexture(target.texture);

@@ -1,31 +1,30 @@
 // @ts-check
 // Colors of the splats under the light of a scene: a texel a splat, computed again where pose, light or eye have changed.
+// What depends on the avatar alone is in the data file (STGA for Blender's light/surface.py and light/relight.py).
 
-/** @import { Data, LitBy, Program, Target, Values } from './types.js' */
+/** @import { Arrays, Data, LitBy, Program, Target, Values, Vector } from './types.js' */
 
-import { Bounce } from './bounce.js';
 import { bounds } from './camera.js';
-import { bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength, program } from './gl.js';
-import { HARMONICS, addPoint, rotatedLight } from './harmonics.js';
-import { Lashes } from './lashes.js';
+import { FaceFrames } from './face_frames.js';
+import { bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength, program, updateTexture } from './gl.js';
+import { Bounce, HARMONICS, addPoint, keptColors, received, rigidRotation, rotatedLight } from './light.js';
 import {
   LIFT_M,
-  LIGHT_VERTEX_SHADER,
   MAP_SIZE,
+  OVER_VERTEX_SHADER,
   SHADOW_FRAGMENT_SHADER,
   SHADOW_VERTEX_SHADER,
   SURFACE_TEXELS,
+  TEXTURE_WIDTH,
   VERTEX_TEXELS,
   lightFragmentShader,
-} from './light_shaders.js';
-import { keptColors, recordedLight } from './likeness.js';
-import { TEXTURE_WIDTH } from './shaders.js';
-import { Surface, received, rigidRotation, vertexNormals } from './surface.js';
-import { crossed, scaled, unit } from './vector.js';
+} from './shaders.js';
+import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
 /** Of each harmonic in the mean radiance around the direction that skin mirrors (light/harmonics.py, GLOSSY). */
 const GLOSSY = [1, 0.85, 0.85, 0.85, 0.62, 0.62, 0.62, 0.62, 0.62];
 const MIN_RIGID = 1e-3; // weight of covered vertices where the turn of the head is found
+const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
 
 export class LightPass {
   /**
@@ -35,55 +34,61 @@ export class LightPass {
    */
   constructor(gl, data) {
     this.gl = gl;
-    const { arrays } = data;
+    const { arrays, header } = data;
+    const { convention } = header;
+    const light = (/** @type {string} */ name) => /** @type {Values} */ (arrays[`light_${name}`]?.values);
     this.faces = arrays.faces.values;
     this.neutral = arrays.neutral.values;
-    this.transfer = /** @type {Values} */ (arrays.light_transfer?.values);
-    const occlusion = /** @type {Values} */ (arrays.light_occlusion?.values);
-    this.rigid = Float64Array.from(occlusion, (share) => share + MIN_RIGID);
-    this.surface = new Surface(data);
-    this.bounce = new Bounce(this.neutral, this.faces, this.surface.areas, occlusion);
-    this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(this.surface));
-    this.lashes = new Lashes(data, this.surface);
-    const points = this.neutral.length / 3 + 4 * this.lashes.count;
-    this.vertexValues = new Float32Array(paddedLength(points * VERTEX_TEXELS));
+    this.transfer = light('transfer');
+    this.rigid = Float64Array.from(light('occlusion'), (share) => share + MIN_RIGID);
+    this.count = arrays.xyz.shape[0];
+    const frames = new FaceFrames({ faces: arrays.faces, neutral: arrays.neutral }, convention);
+    frames.placeFrames(Float64Array.from(this.neutral));
+    this.bounce = new Bounce(this.neutral, this.faces, frames.neutralArea, light('occlusion'));
+    this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames.world));
+    this.lashCorners = light('lash_corners');
+    this.lashes = light('lash_face').length;
+    this.lashFrames = new FaceFrames({ faces: lashFaces(arrays), neutral: arrays.neutral }, convention);
+    const vertices = this.neutral.length / 3;
+    this.vertexValues = new Float32Array(paddedLength((vertices + 4 * this.lashes) * VERTEX_TEXELS));
     this.vertexTexture = floatTexture(gl, gl.RGBA32F, this.vertexValues);
-    const corners = this.lashes.faces.map((corner) => this.neutral.length / 3 + corner);
-    this.casters = Uint32Array.from([...this.faces, ...corners]);
-    this.shadows = makeShadowMap(gl, this.casters);
-    this.colors = makeTarget(gl, gl.RGBA32F, TEXTURE_WIDTH, Math.ceil(this.surface.count / TEXTURE_WIDTH) || 1);
+    const cards = Array.from({ length: 6 * this.lashes }, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 0, 2, 3][k % 6]);
+    this.casters = Uint32Array.from([...this.faces, ...cards.map((corner) => vertices + corner)]);
+    this.shadows = makeTarget(gl, gl.DEPTH_COMPONENT32F, MAP_SIZE, MAP_SIZE, gl.DEPTH_ATTACHMENT);
+    this.vertexArray = gl.createVertexArray();
+    this.indexBuffer = gl.createBuffer();
+    gl.bindVertexArray(this.vertexArray);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.indexBuffer);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.casters, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    this.colors = makeTarget(gl, gl.RGBA32F, TEXTURE_WIDTH, Math.ceil(this.count / TEXTURE_WIDTH) || 1);
     const harmonics = arrays.sh ? arrays.sh.shape[1] / 3 : 0;
-    this.program = program(gl, LIGHT_VERTEX_SHADER, lightFragmentShader(harmonics, arrays.strain_color ? 3 : 0));
+    this.program = program(gl, OVER_VERTEX_SHADER, lightFragmentShader(harmonics, arrays.strain_color ? 3 : 0));
     this.shadowProgram = program(gl, SHADOW_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER);
+    const { damping, recorded, typical } = header.light ?? { damping: 0, recorded: [], typical: [1, 1, 1] };
+    this.recorded = recorded;
+    this.typical = [...typical, damping];
     /** @type {LitBy | null} */
     this.light = null;
-    this.recorded = recordedLight(this.transfer, this.bounce, /** @type {Values} */ (arrays.light_irradiance?.values));
-    this.kept = { share: 0, gain: [0, 0, 0] };
+    this.kept = [0, 0, 0, 0]; // gain of red, green and blue, share
     this.view = sunView(this.neutral, [0, 1, 0]);
   }
 
   /**
    * Follow the posed vertices (3·V) and the light.
-   * @param {Float64Array} vertices
-   * @param {LitBy} light
+   * @type {(vertices: Float64Array, light: LitBy) => void}
    */
   update(vertices, light) {
     const { gl } = this;
     this.light = light;
     this.packVertices(vertices, light);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.vertexTexture);
-    const rows = this.vertexValues.length / (4 * TEXTURE_WIDTH);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RGBA, gl.FLOAT, this.vertexValues);
+    updateTexture(gl, this.vertexTexture, this.vertexValues);
     if (!light.sun) return;
     this.view = sunView(vertices, light.sun.toward);
     this.drawShadows();
   }
 
-  /**
-   * @param {Float64Array} vertices
-   * @param {LitBy} light
-   */
+  /** @type {(vertices: Float64Array, light: LitBy) => void} */
   packVertices(vertices, { world, sun }) {
     const normals = vertexNormals(this.faces, vertices);
     const rotation = rigidRotation(vertices, this.neutral, this.rigid);
@@ -101,9 +106,9 @@ export class LightPass {
       }
     }
     if (!sun) return;
-    const lashes = this.lashes.place(vertices); // after the vertices, with nothing but their positions
-    for (let from = 0, to = (vertices.length / 3) * 4 * VERTEX_TEXELS; from < lashes.length; from += 3) {
-      this.vertexValues.set(lashes.subarray(from, from + 3), to);
+    this.lashFrames.placeFrames(vertices);
+    for (let corner = 0, to = (vertices.length / 3) * 4 * VERTEX_TEXELS; corner < 4 * this.lashes; corner++) {
+      this.vertexValues.set(placed(this.lashFrames.world, corner >> 2, this.lashCorners, corner), to);
       to += 4 * VERTEX_TEXELS;
     }
   }
@@ -120,7 +125,7 @@ export class LightPass {
     gl.uniformMatrix3fv(uniforms.uToSun, true, view.axes);
     gl.uniform3f(uniforms.uMiddle, ...view.middle);
     gl.uniform1f(uniforms.uRadius, view.radius);
-    gl.bindVertexArray(this.shadows.vertexArray);
+    gl.bindVertexArray(this.vertexArray);
     gl.drawElements(gl.TRIANGLES, this.casters.length, gl.UNSIGNED_INT, 0);
     gl.disable(gl.DEPTH_TEST);
   }
@@ -128,10 +133,7 @@ export class LightPass {
   /**
    * Compute the colors seen from a camera (world to camera, row-major); returns their texture. Textures are the
    * renderer's, and the framebuffer and viewport are others afterwards.
-   * @param {ArrayLike<number>} camera
-   * @param {WebGLTexture} splats
-   * @param {WebGLTexture} tail
-   * @param {WebGLTexture} frames
+   * @type {(camera: ArrayLike<number>, splats: WebGLTexture, tail: WebGLTexture, frames: WebGLTexture) => WebGLTexture}
    */
   draw(camera, splats, tail, frames) {
     const { gl, colors, view, light } = this;
@@ -148,7 +150,12 @@ export class LightPass {
     gl.uniform3f(uniforms.uMiddle, ...view.middle);
     gl.uniform1f(uniforms.uRadius, view.radius);
     gl.uniform1f(uniforms.uTexel, view.texel);
-    this.setLight(light, uniforms);
+    const world = Float32Array.from(light?.world ?? [], (value, k) => GLOSSY[Math.floor(k / 3)] * value);
+    if (world.length) gl.uniform3fv(uniforms['uWorld[0]'], world);
+    gl.uniform3f(uniforms.uSunColor, ...(light?.sun?.color ?? [0, 0, 0]));
+    gl.uniform1f(uniforms.uFactor, light?.factor ?? 1);
+    gl.uniform4fv(uniforms.uKept, this.kept);
+    gl.uniform4fv(uniforms.uTypical, this.typical);
     const [x, y, z] = [0, 1, 2].map(
       (k) => -camera[k] * camera[3] - camera[4 + k] * camera[7] - camera[8 + k] * camera[11],
     );
@@ -157,30 +164,13 @@ export class LightPass {
     return colors.texture;
   }
 
-  /**
-   * @param {LitBy | null} light
-   * @param {Program['uniforms']} uniforms
-   */
-  setLight(light, uniforms) {
-    const { gl, surface, kept } = this;
-    const world = new Float32Array(3 * HARMONICS);
-    for (let k = 0; light && k < world.length; k++) world[k] = GLOSSY[Math.floor(k / 3)] * light.world[k];
-    gl.uniform3fv(uniforms['uWorld[0]'], world);
-    gl.uniform3f(uniforms.uSunColor, ...(light?.sun?.color ?? [0, 0, 0]));
-    gl.uniform1f(uniforms.uFactor, light?.factor ?? 1);
-    gl.uniform4f(uniforms.uKept, kept.gain[0], kept.gain[1], kept.gain[2], kept.share);
-    gl.uniform1f(uniforms.uDamping, surface.damping);
-    gl.uniform3f(uniforms.uTypical, surface.typical[0], surface.typical[1], surface.typical[2]);
-  }
-
   dispose() {
-    const { gl, shadows } = this;
-    for (const item of [this.surfaceTexture, this.vertexTexture, shadows.texture]) gl.deleteTexture(item);
-    gl.deleteFramebuffer(shadows.framebuffer);
-    gl.deleteBuffer(shadows.indexBuffer);
-    gl.deleteVertexArray(shadows.vertexArray);
+    const { gl } = this;
+    for (const item of [this.surfaceTexture, this.vertexTexture]) gl.deleteTexture(item);
+    gl.deleteBuffer(this.indexBuffer);
+    gl.deleteVertexArray(this.vertexArray);
     for (const item of [this.program, this.shadowProgram]) gl.deleteProgram(item.program);
-    deleteTarget(gl, this.colors);
+    for (const target of [this.colors, this.shadows]) deleteTarget(gl, target);
   }
 }
 
@@ -188,7 +178,7 @@ export class LightPass {
  * How a sun sees the head: rows across, up and along its rays; the middle and radius of what it sees, and the width of a
  * texel of its shadow map, in meters.
  * @param {ArrayLike<number>} vertices
- * @param {import('./types.js').Vector} toward
+ * @param {Vector} toward
  */
 function sunView(vertices, toward) {
   const [middle, half] = bounds(vertices);
@@ -203,38 +193,112 @@ function sunView(vertices, toward) {
   return { middle, radius: Math.sqrt(square) * 1.01 + 4 * LIFT_M, texel: (2 * half) / MAP_SIZE, axes };
 }
 
-/** @param {Surface} surface */
-function surfaceTexels({ count, color, irradiance, occlusion, roughness, corners, weights }) {
-  const values = new Float32Array(paddedLength(Math.max(1, count * SURFACE_TEXELS)));
-  for (let splat = 0; splat < count; splat++) {
-    const to = 4 * SURFACE_TEXELS * splat;
-    [color, irradiance, corners, weights].forEach((array, texel) =>
-      values.set(array.subarray(3 * splat, 3 * splat + 3), to + 4 * texel),
-    );
-    values[to + 3] = roughness[splat];
-    values[to + 7] = occlusion[splat];
+/**
+ * Where the splats are on the neutral mesh, and what that receives: normal, roughness (0: skin) | irradiance of the
+ * capture, occlusion | corners of the triangle | their weights.
+ * @param {Arrays} arrays
+ * @param {Float64Array} frames of the neutral mesh
+ */
+function surfaceTexels(arrays, frames) {
+  const { faces, neutral, splats_per_face, xyz } = arrays;
+  const light = (/** @type {string} */ name) => /** @type {Values} */ (arrays[`light_${name}`]?.values);
+  const [face, irradiance, occlusion, roughness] = ['face', 'irradiance', 'occlusion', 'roughness'].map(light);
+  const normals = vertexNormals(faces.values, neutral.values);
+  const least = [0, 0, 0];
+  for (let k = 0; k < irradiance.length; k++) least[k % 3] += (MIN_IRRADIANCE * 3 * irradiance[k]) / irradiance.length;
+  const values = new Float32Array(paddedLength(xyz.shape[0] * SURFACE_TEXELS));
+  for (let own = 0, splat = 0; own < splats_per_face.values.length; own++) {
+    for (const end = splat + splats_per_face.values[own]; splat < end; splat++) {
+      const from = 3 * ((own + face[splat]) % faces.shape[0]);
+      const corners = Array.from(faces.values.subarray(from, from + 3));
+      const [a, b, c] = corners.map((vertex) => neutral.values.subarray(3 * vertex, 3 * vertex + 3));
+      const weights = nearestWeights(a, b, c, placed(frames, own, xyz.values, splat));
+      const to = 4 * SURFACE_TEXELS * splat;
+      for (let k = 0; k < 3; k++) {
+        const [vertex, weight] = [corners[k], weights[k]];
+        for (let channel = 0; channel < 3; channel++) {
+          values[to + channel] += weight * normals[3 * vertex + channel];
+          values[to + 4 + channel] += weight * irradiance[3 * vertex + channel];
+        }
+        values[to + 3] += weight * roughness[vertex];
+        values[to + 7] += weight * occlusion[vertex];
+        values[to + 8 + k] = vertex;
+        values[to + 12 + k] = weight;
+      }
+      for (let k = 0; k < 3; k++) values[to + 4 + k] = Math.max(values[to + 4 + k], least[k]);
+    }
   }
   return values;
 }
 
 /**
- * @param {WebGL2RenderingContext} gl
- * @param {Uint32Array} faces
+ * The triangles of the lashes, as an array of their own.
+ * @param {Arrays} arrays
  */
-function makeShadowMap(gl, faces) {
-  const texture = gl.createTexture();
-  gl.activeTexture(gl.TEXTURE0);
-  gl.bindTexture(gl.TEXTURE_2D, texture);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.DEPTH_COMPONENT32F, MAP_SIZE, MAP_SIZE);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  const framebuffer = gl.createFramebuffer();
-  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, texture, 0);
-  const [vertexArray, indexBuffer] = [gl.createVertexArray(), gl.createBuffer()];
-  gl.bindVertexArray(vertexArray);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, indexBuffer);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
-  gl.bindVertexArray(null);
-  return { texture, framebuffer, vertexArray, indexBuffer };
+function lashFaces({ faces, light_lash_face }) {
+  const found = Array.from(light_lash_face?.values ?? [], (face) =>
+    Array.from(faces.values.subarray(3 * face, 3 * face + 3)),
+  );
+  return { shape: [found.length, 3], values: Int32Array.from(found.flat()) };
+}
+
+/**
+ * The point of a splat (xyz in its triangle's frame) in space.
+ * @param {Float64Array} world rows of the frames
+ * @param {number} face
+ * @param {Values} xyz
+ * @param {number} splat
+ * @returns {Vector}
+ */
+function placed(world, face, xyz, splat) {
+  const [x, y, z] = xyz.subarray(3 * splat, 3 * splat + 3);
+  const part = (/** @type {number} */ k) => world[k] * x + world[k + 1] * y + world[k + 2] * z + world[k + 3];
+  return [part(12 * face), part(12 * face + 4), part(12 * face + 8)];
+}
+
+/**
+ * Barycentric coordinates of a point in the plane of a triangle, clamped to it.
+ * @type {(a: ArrayLike<number>, b: ArrayLike<number>, c: ArrayLike<number>, point: Vector) => number[]}
+ */
+function nearestWeights(a, b, c, point) {
+  const [first, second, offset] = [difference(b, a), difference(c, a), difference(point, a)];
+  const uu = dotProduct(first, first);
+  const uv = dotProduct(first, second);
+  const vv = dotProduct(second, second);
+  const area = Math.max(uu * vv - uv * uv, 1e-30);
+  const [pu, pv] = [dotProduct(offset, first), dotProduct(offset, second)];
+  const [u, v] = [(vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area];
+  const clamped = [1 - u - v, u, v].map((weight) => Math.max(0, Math.min(1, weight)));
+  const sum = clamped[0] + clamped[1] + clamped[2];
+  return clamped.map((weight) => weight / sum);
+}
+
+/**
+ * Unit normals (3·V) weighted by the area of triangles; 0 where a vertex has none.
+ * @type {(faces: Values, vertices: ArrayLike<number>) => Float64Array<ArrayBuffer>}
+ */
+function vertexNormals(faces, vertices) {
+  const normals = new Float64Array(vertices.length);
+  for (let f = 0; f < faces.length; f += 3) {
+    const i = 3 * faces[f];
+    const j = 3 * faces[f + 1];
+    const k = 3 * faces[f + 2];
+    const ux = vertices[j] - vertices[i];
+    const uy = vertices[j + 1] - vertices[i + 1];
+    const uz = vertices[j + 2] - vertices[i + 2];
+    const vx = vertices[k] - vertices[i];
+    const vy = vertices[k + 1] - vertices[i + 1];
+    const vz = vertices[k + 2] - vertices[i + 2];
+    const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
+    for (const at of [i, j, k]) {
+      normals[at] += x;
+      normals[at + 1] += y;
+      normals[at + 2] += z;
+    }
+  }
+  for (let at = 0; at < normals.length; at += 3) {
+    const length = Math.max(Math.hypot(normals[at], normals[at + 1], normals[at + 2]), 1e-20);
+    for (let k = at; k < at + 3; k++) normals[k] /= length;
+  }
+  return normals;
 }

@@ -1,10 +1,10 @@
 // @ts-check
-// The recorded motion, and the values by which a person or a program replaces parts of it.
+// The recorded motion, ARKit's shapes and the values by which a person or a program replaces parts of it; and the mesh of a
+// pose.
 
-/** @import { Data } from './types.js' */
+/** @import { Data, Performance } from './types.js' */
 
-import { slerpAxisAngle } from './rotation.js';
-import { Shapes } from './shapes.js';
+import { axisAngleOf, matrixFromAxisAngle, multiplied, quaternionOf, slerpAxisAngle } from './vector.js';
 
 /** Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded one. */
 export class Motion {
@@ -44,24 +44,15 @@ export class Motion {
     const share = Math.min(Math.max(recorded - first, 0), 1);
     blend(this.recorded.coefficients.values, first, second, share, this.coefficients);
     blend(this.recorded.translation.values, first, second, share, this.translation);
-    this.turn(first, second, share);
-    if (this.shapes.active) this.shapes.apply(frame, this.coefficients, this.pose);
-    replacePinned(this.coefficients, this.pinnedCoefficients);
-    replacePinned(this.pose, this.pinnedPose);
-  }
-
-  /**
-   * @param {number} first
-   * @param {number} second
-   * @param {number} share
-   */
-  turn(first, second, share) {
     const [pose, size] = [this.recorded.pose.values, this.pose.length];
     for (let at = 0; at < size; at += 3) {
       const before = pose.subarray(first * size + at, first * size + at + 3);
       const after = pose.subarray(second * size + at, second * size + at + 3);
       this.pose.set(share > 0 ? slerpAxisAngle(before, after, share) : before, at);
     }
+    if (this.shapes.active) this.shapes.apply(frame, this.coefficients, this.pose);
+    replacePinned(this.coefficients, this.pinnedCoefficients);
+    replacePinned(this.pose, this.pinnedPose);
   }
 
   release() {
@@ -71,13 +62,7 @@ export class Motion {
   }
 }
 
-/**
- * @param {ArrayLike<number>} values
- * @param {number} first
- * @param {number} second
- * @param {number} share
- * @param {Float64Array} out
- */
+/** @type {(values: ArrayLike<number>, first: number, second: number, share: number, out: Float64Array) => void} */
 function blend(values, first, second, share, out) {
   const size = out.length;
   for (let k = 0; k < size; k++) {
@@ -86,10 +71,229 @@ function blend(values, first, second, share, out) {
   }
 }
 
-/**
- * @param {Float64Array} values
- * @param {Float64Array} pinned
- */
+/** @type {(values: Float64Array, pinned: Float64Array) => void} */
 function replacePinned(values, pinned) {
   for (let k = 0; k < values.length; k++) if (!Number.isNaN(pinned[k])) values[k] = pinned[k];
+}
+
+export class Rig {
+  /** @param {Data} data */
+  constructor({ header, arrays }) {
+    this.parents = header.parents;
+    this.base = arrays.base.values;
+    this.basis = arrays.basis.values;
+    this.correctives = arrays.correctives.values;
+    this.weights = arrays.weights.values;
+    this.jointRest = arrays.joint_rest.values;
+    this.jointBasis = arrays.joint_basis.values;
+    const joints = this.parents.length;
+    this.shaped = new Float64Array(this.base.length);
+    this.vertices = new Float64Array(this.base.length);
+    this.joints = new Float64Array(3 * joints);
+    this.local = new Float64Array(9 * joints);
+    this.skin = new Float64Array(12 * joints); // per joint: rotation and offset, rows of a 3×4 matrix
+    this.placed = new Float64Array(3 * joints);
+  }
+
+  /**
+   * Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
+   * @param {ArrayLike<number>} coefficients
+   * @param {ArrayLike<number>} pose
+   * @param {ArrayLike<number>} translation
+   */
+  pose(coefficients, pose, translation) {
+    this.shaped.set(this.base);
+    this.joints.set(this.jointRest);
+    addShapes(this.shaped, this.basis, coefficients);
+    addShapes(this.joints, this.jointBasis, coefficients);
+    for (let j = 0; j < this.parents.length; j++) matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
+    // Correctives follow the entries of the rotations of joints 1… minus identity.
+    const features = this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
+    if (this.correctives.length) addShapes(this.shaped, this.correctives, features);
+    this.chain();
+    this.skinVertices(translation);
+    return this.vertices;
+  }
+
+  /** Rotation and offset of each joint in the world, from the root outwards. */
+  chain() {
+    const { parents, joints, local, skin, placed } = this;
+    for (let j = 0; j < parents.length; j++) {
+      const parent = parents[j];
+      for (let row = 0; row < 3; row++) {
+        const to = 12 * j + 4 * row;
+        if (parent < 0) {
+          for (let c = 0; c < 3; c++) skin[to + c] = local[9 * j + 3 * row + c];
+          placed[3 * j + row] = joints[3 * j + row];
+        } else {
+          const from = 12 * parent + 4 * row;
+          for (let c = 0; c < 3; c++) {
+            const at = 9 * j + c;
+            skin[to + c] = skin[from] * local[at] + skin[from + 1] * local[at + 3] + skin[from + 2] * local[at + 6];
+          }
+          let sum = placed[3 * parent + row];
+          for (let c = 0; c < 3; c++) sum += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
+          placed[3 * j + row] = sum;
+        }
+        const turned = skin[to] * joints[3 * j] + skin[to + 1] * joints[3 * j + 1] + skin[to + 2] * joints[3 * j + 2];
+        skin[to + 3] = placed[3 * j + row] - turned;
+      }
+    }
+  }
+
+  /** @param {ArrayLike<number>} translation */
+  skinVertices(translation) {
+    const { shaped, weights, skin, vertices } = this;
+    const joints = this.parents.length;
+    for (let v = 0, at = 0; at < shaped.length; v++, at += 3) {
+      const x = shaped[at];
+      const y = shaped[at + 1];
+      const z = shaped[at + 2];
+      let px = translation[0];
+      let py = translation[1];
+      let pz = translation[2];
+      for (let j = 0; j < joints; j++) {
+        const w = weights[v * joints + j];
+        if (w === 0) continue;
+        const s = 12 * j;
+        px += w * (skin[s] * x + skin[s + 1] * y + skin[s + 2] * z + skin[s + 3]);
+        py += w * (skin[s + 4] * x + skin[s + 5] * y + skin[s + 6] * z + skin[s + 7]);
+        pz += w * (skin[s + 8] * x + skin[s + 9] * y + skin[s + 10] * z + skin[s + 11]);
+      }
+      vertices[at] = px;
+      vertices[at + 1] = py;
+      vertices[at + 2] = pz;
+    }
+  }
+}
+
+/**
+ * target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than the sums.
+ * @type {(target: Float64Array, shapes: ArrayLike<number>, factors: ArrayLike<number>) => void}
+ */
+function addShapes(target, shapes, factors) {
+  const size = target.length;
+  /** @type {number[]} */
+  const offset = [];
+  /** @type {number[]} */
+  const factor = [];
+  for (let k = 0; k < factors.length; k++) {
+    if (factors[k] === 0) continue;
+    offset.push(k * size);
+    factor.push(factors[k]);
+  }
+  while (offset.length % 8) {
+    offset.push(0);
+    factor.push(0);
+  }
+  for (let n = 0; n < offset.length; n += 8) {
+    const [a, b, c, d] = offset.slice(n, n + 4);
+    const [e, f, g, h] = offset.slice(n + 4, n + 8);
+    const [p, q, r, s] = factor.slice(n, n + 4);
+    const [t, u, v, w] = factor.slice(n + 4, n + 8);
+    for (let i = 0; i < size; i++) {
+      target[i] +=
+        p * shapes[a + i] +
+        q * shapes[b + i] +
+        r * shapes[c + i] +
+        s * shapes[d + i] +
+        t * shapes[e + i] +
+        u * shapes[f + i] +
+        v * shapes[g + i] +
+        w * shapes[h + i];
+    }
+  }
+}
+
+const JOINTS = ['jaw', 'left_eye', 'right_eye'];
+const NECK = 'neck';
+
+/** Weights of the shapes: pinned ones, else those of a performance, else 0; and what they pose. */
+export class Shapes {
+  /** @param {Data} data */
+  constructor({ header, arrays }) {
+    const { shapes, joints } = header;
+    this.names = shapes?.names ?? [];
+    this.linear = arrays.shape_linear?.values;
+    this.products = arrays.shape_products?.values;
+    this.columns = arrays.shape_linear?.shape[1] ?? 0;
+    this.expressions = arrays.shape_products?.shape[1] ?? 0;
+    this.opens = this.names.indexOf(shapes?.opens ?? '');
+    this.limited = this.names.indexOf(shapes?.limited ?? '');
+    this.joints = JOINTS.map((joint) => 3 * joints.indexOf(joint));
+    this.neck = 3 * joints.indexOf(NECK);
+    this.weights = new Float64Array(this.names.length);
+    this.pinned = new Float64Array(this.names.length).fill(NaN);
+    this.values = new Float64Array(this.columns);
+    /** @type {Performance | null} */
+    this.performance = null;
+  }
+
+  /** Whether the shapes replace the recorded expressions, jaw and eyes. */
+  get active() {
+    return this.performance !== null || this.pinned.some((value) => !Number.isNaN(value));
+  }
+
+  release() {
+    this.pinned.fill(NaN);
+  }
+
+  /**
+   * Replace expressions, jaw and eyes, and turn the neck as the performance does.
+   * @type {(frame: number, coefficients: Float64Array, pose: Float64Array) => void}
+   */
+  apply(frame, coefficients, pose) {
+    const head = this.sample(frame);
+    const { columns, expressions, linear, opens, products, values, weights } = this;
+    if (!linear || !products) return;
+    values.fill(0);
+    for (let shape = 0; shape < weights.length; shape++) {
+      let weight = weights[shape];
+      if (shape === this.limited) weight = Math.min(weight, Math.max(weights[opens], 0));
+      if (weight === 0) continue;
+      for (let k = 0; k < columns; k++) values[k] += weight * linear[shape * columns + k];
+      const product = weight * weights[opens];
+      for (let k = 0; k < expressions; k++) values[k] += product * products[shape * expressions + k];
+    }
+    coefficients.fill(0);
+    coefficients.set(values.subarray(0, expressions));
+    for (const [number, at] of this.joints.entries()) {
+      if (at >= 0) pose.set(values.subarray(expressions + 3 * number, expressions + 3 * number + 3), at);
+    }
+    if (head && this.neck >= 0) pose.set(headTurn(head), this.neck);
+  }
+
+  /**
+   * Fill the weights with those of the frame; returns yaw, pitch and roll of the head, where the performance has them.
+   * @type {(frame: number) => number[] | null}
+   */
+  sample(frame) {
+    const { performance, pinned, weights } = this;
+    weights.fill(0);
+    let head = null;
+    if (performance) {
+      const first = Math.min(Math.max(Math.floor(frame), 0), performance.rows.length - 1);
+      const second = Math.min(first + 1, performance.rows.length - 1);
+      const share = Math.min(Math.max(frame - first, 0), 1);
+      const [before, after] = [performance.rows[first], performance.rows[second]];
+      for (let k = 0; k < weights.length; k++) {
+        const column = performance.columns[k];
+        if (column >= 0) weights[k] = before[column] + share * (after[column] - before[column]);
+      }
+      if (performance.head.every((column) => column >= 0)) {
+        head = performance.head.map((column) => before[column] + share * (after[column] - before[column]));
+      }
+    }
+    for (let k = 0; k < weights.length; k++) if (!Number.isNaN(pinned[k])) weights[k] = pinned[k];
+    return head;
+  }
+}
+
+/**
+ * Axis-angle of yaw, pitch and roll: about y, then the turned x, then the turned z.
+ * @param {number[]} angles
+ */
+function headTurn([yaw, pitch, roll]) {
+  const turned = multiplied(quaternionOf([0, yaw, 0]), quaternionOf([pitch, 0, 0]));
+  return axisAngleOf(multiplied(turned, quaternionOf([0, 0, roll])));
 }

@@ -2,6 +2,172 @@
 // The page's controls. Everything that they do is in the public interface of <stga-avatar>.
 
 /**
+ * @import { Camera, Lighting, Vector } from './types.js'
+ * @typedef {'recorded' | 'dragged' | string} Kind the name of an environment, or one of these
+ */
+
+import { DataError } from './data.js';
+import { ENVIRONMENTS } from './light.js';
+import { StgaAvatar, hexOf } from './stga-avatar.js';
+import { scaled } from './vector.js';
+
+const fixed = (/** @type {number} */ value) => value.toFixed(2);
+const degrees = (/** @type {number} */ value) => `${Math.round(value)}°`;
+const signed = (/** @type {number} */ value) => `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
+const PAD_ANGLE = 2.6; // radians from the camera's own direction at the rim of the pad: the light comes from behind
+const DRAGGED = 'dragged';
+/** Label, kinds that have it ("*": all environments), range, first value and format of each slider. */
+const RANGES = {
+  strength: { label: 'Strength', kinds: DRAGGED, low: 0, high: 8, value: 3, format: fixed },
+  even: { label: 'Even light', kinds: DRAGGED, low: 0, high: 1, value: 0.15, format: fixed },
+  turn: { label: 'Turn', kinds: '*', low: -180, high: 180, value: 0, format: degrees },
+  exposure: { label: 'Exposure', kinds: `${DRAGGED}*`, low: -3, high: 3, value: 0, format: signed },
+};
+
+export class LightControls {
+  /**
+   * Fill and show `section` for an avatar whose light is known.
+   * @param {HTMLElement} section
+   * @param {StgaAvatar} avatar
+   */
+  constructor(section, avatar) {
+    this.avatar = avatar;
+    /** @type {Kind} */
+    this.kind = 'recorded';
+    /** @type {Vector} towards the light */
+    this.toward = fromPad(avatar.camera, -0.25, -0.22);
+    this.select = /** @type {HTMLSelectElement} */ (section.querySelector('select'));
+    this.pad = /** @type {HTMLElement} */ (section.querySelector('#light-pad'));
+    this.color = /** @type {HTMLInputElement} */ (section.querySelector('input[type="color"]'));
+    this.dragged = /** @type {HTMLElement} */ (section.querySelector('#light-dragged'));
+    section.hidden = false;
+    const environments = Object.entries(ENVIRONMENTS).map(([name, { label }]) => [name, label]);
+    for (const [name, label] of [['recorded', 'As recorded'], [DRAGGED, 'A light to drag'], ...environments]) {
+      this.select.add(new Option(label, name));
+    }
+    this.select.addEventListener('change', () => {
+      this.kind = this.select.value;
+      this.showKind();
+      this.apply();
+    });
+    this.rows = Object.entries(RANGES).map(([name, range]) => this.addRange(section, name, range));
+    this.color.addEventListener('input', () => this.apply());
+    for (const name of ['pointerdown', 'pointermove']) {
+      this.pad.addEventListener(name, (event) => this.drag(/** @type {PointerEvent} */ (event)));
+    }
+    avatar.addEventListener('camerachange', () => this.showDirection());
+    avatar.addEventListener('lightchange', () => {
+      const sun = avatar.lighting?.sun;
+      if (sun && this.kind === DRAGGED) this.toward = sun.toward; // it may have been dragged over the head
+      this.showDirection();
+    });
+    this.showKind();
+  }
+
+  /**
+   * @param {HTMLElement} section
+   * @param {string} name
+   * @param {typeof RANGES['turn']} range
+   */
+  addRange(section, name, { label, kinds, low, high, value, format }) {
+    const [row, output, input] = sliderRow(section, 'range', label, low, high);
+    [input.value, input.name] = [String(value), name];
+    const show = () => {
+      output.textContent = format(Number(input.value));
+      fillTrack(input);
+    };
+    input.addEventListener('input', () => {
+      show();
+      this.apply();
+    });
+    show();
+    return { name, row, input, kinds };
+  }
+
+  showKind() {
+    this.dragged.hidden = this.kind !== DRAGGED;
+    const isEnvironment = Object.hasOwn(ENVIRONMENTS, this.kind);
+    for (const { row, kinds } of this.rows) {
+      row.hidden = !(isEnvironment ? kinds.endsWith('*') : this.kind === DRAGGED && kinds.startsWith(DRAGGED));
+    }
+    this.showDirection();
+  }
+
+  apply() {
+    this.avatar.lighting = this.lighting();
+  }
+
+  /** @returns {Lighting | null} */
+  lighting() {
+    if (this.kind === 'recorded') return null;
+    const value = Object.fromEntries(this.rows.map(({ name, input }) => [name, Number(input.value)]));
+    const { strength, even, exposure } = value;
+    if (this.kind !== DRAGGED) return { environment: this.kind, turn: (Math.PI / 180) * value.turn, exposure };
+    const color = scaled(linearColor(this.color.value), strength);
+    return { even: [even, even, even], sun: { toward: this.toward, color }, exposure };
+  }
+
+  /** @param {PointerEvent} event */
+  drag(event) {
+    if (event.type === 'pointerdown') this.pad.setPointerCapture(event.pointerId);
+    else if (!this.pad.hasPointerCapture(event.pointerId)) return;
+    const { left, top, width, height } = this.pad.getBoundingClientRect();
+    const x = (2 * (event.clientX - left)) / width - 1;
+    const y = (2 * (event.clientY - top)) / height - 1;
+    this.toward = fromPad(this.avatar.camera, x, y);
+    this.apply();
+  }
+
+  showDirection() {
+    if (this.kind !== DRAGGED) return;
+    const [x, y] = onPad(this.avatar.camera, this.toward);
+    this.pad.style.setProperty('--x', `${50 + 50 * x}%`);
+    this.pad.style.setProperty('--y', `${50 + 50 * y}%`);
+  }
+}
+
+/**
+ * The direction in the world of a place on the pad, whose middle is where the camera looks from.
+ * @param {Camera | null} camera
+ * @param {number} x from -1 to 1, to the right
+ * @param {number} y from -1 to 1, down
+ * @returns {Vector}
+ */
+function fromPad(camera, x, y) {
+  const reach = Math.hypot(x, y);
+  const angle = PAD_ANGLE * Math.min(1, reach);
+  const side = reach > 0 ? Math.sin(angle) / reach : 0;
+  const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+  const part = (/** @type {number} */ k) => m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle);
+  return [part(0), part(1), part(2)];
+}
+
+/**
+ * The reverse, within the pad.
+ * @type {(camera: Camera | null, toward: Vector) => number[]}
+ */
+function onPad(camera, toward) {
+  const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+  const along = (/** @type {number} */ k) => m[k] * toward[0] + m[k + 1] * toward[1] + m[k + 2] * toward[2];
+  const [x, y, z] = [along(0), along(4), along(8)];
+  const side = Math.hypot(x, y);
+  const reach = Math.min(1, Math.atan2(side, -z) / PAD_ANGLE);
+  return side > 1e-9 ? [(x / side) * reach, (y / side) * reach] : [0, 0];
+}
+
+/**
+ * "#rrggbb" in linear light.
+ * @type {(hex: string) => Vector}
+ */
+function linearColor(hex) {
+  const part = (/** @type {number} */ at) => {
+    const value = parseInt(hex.slice(at, at + 2), 16) / 255;
+    return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
+  };
+  return [part(1), part(3), part(5)];
+}
+
+/**
  * @typedef {object} SliderOptions
  * @property {string} id
  * @property {string} label
@@ -9,24 +175,12 @@
  * @property {number} high
  * @property {() => number} read what plays
  * @property {(value: number | null) => void} write null: as recorded
- * @property {(value: number) => string} format
+ * @property {(value: number) => string} [format]
  */
 
-import { DataError } from './data.js';
-import { LightControls } from './light_controls.js';
-import { StgaAvatar } from './stga-avatar.js';
-
 const SLIDERS_SHOWN = 8;
-const SHAPES_FIRST = [
-  'browInnerUp',
-  'mouthPucker',
-  'mouthSmileRight',
-  'mouthSmileLeft',
-  'eyeBlinkRight',
-  'eyeBlinkLeft',
-  'mouthClose',
-  'jawOpen',
-]; // the last comes first
+const SHAPES_FIRST = // the last comes first
+  'browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight eyeBlinkLeft mouthClose jawOpen'.split(' ');
 const FACTS_INTERVAL_MS = 500;
 const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
 const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
@@ -59,15 +213,8 @@ function element(selector, kind, parent = document) {
   return found;
 }
 
-/** @param {string} id */
-function byId(id) {
-  return element(`#${id}`, HTMLElement);
-}
-
-/** @param {string} id */
-function inputOf(id) {
-  return element(`#${id}`, HTMLInputElement);
-}
+const byId = (/** @type {string} */ id) => element(`#${id}`, HTMLElement);
+const inputOf = (/** @type {string} */ id) => element(`#${id}`, HTMLInputElement);
 
 /** The loaded file's header. */
 function info() {
@@ -75,10 +222,7 @@ function info() {
   return avatar.info;
 }
 
-/**
- * @param {HTMLElement} button
- * @param {boolean} pressed
- */
+/** @type {(button: HTMLElement, pressed: boolean) => void} */
 function setPressed(button, pressed) {
   button.setAttribute('aria-pressed', String(pressed));
 }
@@ -169,13 +313,7 @@ const swatches = new Map(); // button → color; null: the theme's
 
 function applyBackground() {
   const dark = document.documentElement.dataset.theme === 'dark';
-  const trained = `#${info()
-    .background.map((part) =>
-      Math.round(255 * part)
-        .toString(16)
-        .padStart(2, '0'),
-    )
-    .join('')}`;
+  const trained = hexOf(info().background);
   avatar.background = background ?? (dark ? DARK_BACKGROUND : trained);
   for (const [swatch, color] of swatches) setPressed(swatch, color === background);
 }
@@ -190,11 +328,8 @@ function addBackgrounds() {
     swatch.addEventListener('click', () => chooseBackground(color || null));
     row.append(swatch);
   }
-  const custom = Object.assign(document.createElement('input'), {
-    type: 'color',
-    className: 'swatch',
-    title: 'Any color',
-  });
+  const custom = document.createElement('input');
+  Object.assign(custom, { type: 'color', className: 'swatch', title: 'Any color' });
   custom.addEventListener('input', () => chooseBackground(custom.value));
   row.append(custom);
   applyBackground();
@@ -221,18 +356,29 @@ function toggleTheme() {
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
 /**
+ * A row with a name, an `output` or a button that shows the value, and the slider itself.
  * @param {HTMLElement} parent
- * @param {SliderOptions} options
+ * @param {'slider' | 'range'} kind the first has the button
+ * @param {string} label
+ * @param {number} low
+ * @param {number} high
+ * @returns {[HTMLLabelElement, HTMLElement, HTMLInputElement]}
  */
-function addSlider(parent, { id, label, low, high, read, write, format }) {
-  const row = document.createElement('label');
-  row.className = 'slider';
-  row.dataset.name = id;
-  row.innerHTML = '<span></span><button class="value" title="Release"></button><input type="range" step="any">';
-  const [name, value] = [element('span', HTMLElement, row), element('button', HTMLElement, row)];
-  const input = element('input', HTMLInputElement, row);
+function sliderRow(parent, kind, label, low, high) {
+  const row = Object.assign(document.createElement('label'), { className: kind });
+  const shown = kind === 'slider' ? '<button class="value" title="Release"></button>' : '<output></output>';
+  row.innerHTML = `<span></span>${shown}<input type="range" step="any">`;
+  const [name, value, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([...row.children]);
   name.textContent = label;
   [input.min, input.max] = [String(low), String(high)];
+  parent.append(row);
+  return [row, value, input];
+}
+
+/** @type {(parent: HTMLElement, options: SliderOptions) => HTMLLabelElement} */
+function addSlider(parent, { id, label, low, high, read, write, format = fixed }) {
+  const [row, value, input] = sliderRow(parent, 'slider', label, low, high);
+  row.dataset.name = id;
   let pinned = false;
   const pin = (/** @type {boolean} */ whether) => {
     pinned = whether;
@@ -256,7 +402,6 @@ function addSlider(parent, { id, label, low, high, read, write, format }) {
     write(null);
   });
   sliders.push({ update, release: () => pin(false) });
-  parent.append(row);
   update();
   return row;
 }
@@ -281,7 +426,6 @@ function addExpressions() {
       high: reach,
       read: () => avatar.getExpression(name),
       write: (value) => avatar.setExpression(name, value),
-      format: (value) => value.toFixed(2),
     }),
   );
   section.hidden = !rows.length;
@@ -290,8 +434,7 @@ function addExpressions() {
 
 /**
  * Hide all but the first rows until the button is clicked.
- * @param {HTMLElement[]} rows
- * @param {HTMLElement} more
+ * @type {(rows: HTMLElement[], more: HTMLElement) => void}
  */
 function showFirst(rows, more) {
   more.hidden = rows.length <= SLIDERS_SHOWN;
@@ -318,7 +461,6 @@ function addFaceShapes() {
       high: 1,
       read: () => avatar.getShape(name),
       write: (value) => avatar.setShape(name, value),
-      format: (value) => value.toFixed(2),
     }),
   );
   showFirst(rows, byId('more-shapes'));
@@ -362,7 +504,7 @@ function addPose() {
       high,
       read: () => avatar.getPose(joints[0])[axis],
       write: (value) => joints.forEach((joint) => avatar.setPose(joint, replaced(joint, axis, value))),
-      format: (value) => `${Math.round((180 / Math.PI) * value)}°`,
+      format: (value) => degrees((180 / Math.PI) * value),
     });
   }
   byId('pose').hidden = !known.length;
@@ -371,11 +513,7 @@ function addPose() {
 /** @type {Record<string, (number | null)[]>} */
 const pinnedAngles = {}; // joint → three angles, null: as recorded
 
-/**
- * @param {string} joint
- * @param {number} axis
- * @param {number | null} value
- */
+/** @type {(joint: string, axis: number, value: number | null) => (number | null)[]} */
 function replaced(joint, axis, value) {
   pinnedAngles[joint] ??= [null, null, null];
   pinnedAngles[joint][axis] = value;

@@ -17,9 +17,7 @@ const MIN_SHAPES = 10; // of a table that holds a performance
 
 /**
  * The performance in a text, with a column per known shape (-1: it has none). Throws DataError in one sentence.
- * @param {string} text
- * @param {string[]} names
- * @returns {Performance}
+ * @type {(text: string, names: string[]) => Performance}
  */
 export function readPerformance(text, names) {
   const lines = text
@@ -57,9 +55,7 @@ function plainName(name) {
 
 /**
  * Seconds of each row from the first, or null where the table has none.
- * @param {string[]} header
- * @param {string[][]} cells
- * @returns {number[] | null}
+ * @type {(header: string[], cells: string[][]) => number[] | null}
  */
 function times(header, cells) {
   const names = header.map((name) => name.toLowerCase());
@@ -104,9 +100,7 @@ function median(values) {
 
 /**
  * The performance at even times, with rows that are missing interpolated.
- * @param {Performance} performance
- * @param {number[] | null} seconds
- * @returns {Performance}
+ * @type {(performance: Performance, seconds: number[] | null) => Performance}
  */
 function evenly(performance, seconds) {
   if (!seconds || seconds.length < 2) return performance;

@@ -4,14 +4,12 @@
 /** @import { Camera, Color, Data, Lighting } from './types.js' */
 
 import { cameraOfView, fitted, frontCamera, bounds } from './camera.js';
-import { DepthSort } from './depth_sort.js';
 import { FaceFrames } from './face_frames.js';
 import { RendererError } from './gl.js';
 import { LightPass } from './light_pass.js';
-import { litBy } from './lighting.js';
-import { Motion } from './motion.js';
-import { Renderer } from './renderer.js';
-import { Rig } from './rig.js';
+import { litBy } from './light.js';
+import { Motion, Rig } from './motion.js';
+import { DepthSort, Renderer } from './renderer.js';
 
 const TIMING_SHARE = 0.1; // of the newest frame in the running mean
 

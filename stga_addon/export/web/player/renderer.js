@@ -1,13 +1,22 @@
 // @ts-check
-// Splats on a WebGL2 canvas: blended back to front into a float target, then over the background.
+// Splats on a WebGL2 canvas: sorted, blended back to front into a float target, then over the background.
 
 /**
  * @import { LightPass } from './light_pass.js'
  * @import { Arrays, Camera, Color, Data, Program, Target, Values } from './types.js'
  */
 
-import { RendererError, bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength, program } from './gl.js';
-import { wholeQuaternion } from './rotation.js';
+import { FACE_FLOATS } from './face_frames.js';
+import {
+  RendererError,
+  bindTexture,
+  deleteTarget,
+  floatTexture,
+  makeTarget,
+  paddedLength,
+  program,
+  updateTexture,
+} from './gl.js';
 import {
   FACE_TEXELS,
   OVER_FRAGMENT_SHADER,
@@ -18,6 +27,7 @@ import {
   splatVertexShader,
   tailTexels,
 } from './shaders.js';
+import { wholeQuaternion } from './vector.js';
 
 const SH_C0 = 0.28209479177387814;
 
@@ -50,20 +60,15 @@ export class Renderer {
     this.frameTexture = floatTexture(gl, gl.RGBA32F, this.frameValues);
     this.vertexArray = gl.createVertexArray();
     this.indexBuffer = gl.createBuffer();
-    this.fillIndexArray();
-    /** @type {Target | null} */
-    this.target = null;
-    this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
-  }
-
-  fillIndexArray() {
-    const gl = this.gl;
     gl.bindVertexArray(this.vertexArray);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
     gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(0, 1);
+    /** @type {Target | null} */
+    this.target = null;
+    this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
   }
 
   /**
@@ -80,8 +85,15 @@ export class Renderer {
   draw(order, camera, background, showSelection, framebuffer = null, format = this.gl.RGBA16F) {
     const gl = this.gl;
     const [width, height] = camera.size;
-    const target = this.resizedTarget(width, height, format);
-    this.upload(order);
+    if (this.target?.width !== width || this.target.height !== height || this.target.format !== format) {
+      if (this.target) deleteTarget(gl, this.target);
+      this.target = makeTarget(gl, format, width, height);
+    }
+    const { target } = this;
+    updateTexture(gl, this.frameTexture, this.frameValues);
+    gl.bindVertexArray(this.vertexArray);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
     const colors = this.lightPass?.draw(camera.matrix, this.splatTexture, this.tailTexture, this.frameTexture);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, width, height);
@@ -94,18 +106,6 @@ export class Renderer {
     const [red, green, blue, alpha] = background;
     gl.uniform4f(this.overProgram.uniforms.uBackground, red * alpha, green * alpha, blue * alpha, alpha);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-  }
-
-  /** @param {Uint32Array} order */
-  upload(order) {
-    const gl = this.gl;
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.frameTexture);
-    const rows = this.frameValues.length / (4 * TEXTURE_WIDTH);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RGBA, gl.FLOAT, this.frameValues);
-    gl.bindVertexArray(this.vertexArray);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
   }
 
   /**
@@ -133,19 +133,6 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
     gl.disable(gl.BLEND);
-  }
-
-  /**
-   * @param {number} width
-   * @param {number} height
-   * @param {number} format
-   */
-  resizedTarget(width, height, format) {
-    const { target } = this;
-    if (target?.width === width && target.height === height && target.format === format) return target;
-    if (target) deleteTarget(this.gl, target);
-    this.target = makeTarget(this.gl, format, width, height);
-    return this.target;
   }
 
   /**
@@ -202,10 +189,7 @@ function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_sca
   return values;
 }
 
-/**
- * @param {Arrays} arrays
- * @param {number} texels
- */
+/** @type {(arrays: Arrays, texels: number) => Float32Array<ArrayBuffer>} */
 function tailValues({ xyz, sh, strain_color }, texels) {
   const values = new Float32Array(paddedLength(Math.max(1, xyz.shape[0] * texels)));
   let offset = 0;
@@ -218,4 +202,82 @@ function tailValues({ xyz, sh, strain_color }, texels) {
     offset += size;
   }
   return values;
+}
+
+// Order of the splats from back to front: a radix sort of their depths in 22 bits.
+
+const DIGIT_BITS = 11; // of which a key has two
+const DIGITS = 1 << DIGIT_BITS;
+const MAX_KEY = DIGITS * DIGITS - 1;
+
+export class DepthSort {
+  /**
+   * xyz (3·N) of splats sorted by triangle, and how many each triangle has.
+   * @param {ArrayLike<number>} xyz
+   * @param {ArrayLike<number>} splatsPerFace
+   */
+  constructor(xyz, splatsPerFace) {
+    this.xyz = xyz;
+    this.splatsPerFace = splatsPerFace;
+    const count = xyz.length / 3;
+    this.depth = new Float32Array(count);
+    this.key = new Int32Array(count);
+    this.byLow = new Int32Array(count);
+    this.order = new Uint32Array(count);
+    this.low = new Int32Array(DIGITS); // number of each digit, then where it begins
+    this.high = new Int32Array(DIGITS);
+  }
+
+  /**
+   * Indices of the splats, farthest first; `frames` as FaceFrames.compose writes them.
+   * @param {ArrayLike<number>} frames
+   */
+  sort(frames) {
+    const { byLow, depth, high, key, low, order } = this;
+    const [near, far] = this.measureDepth(frames);
+    const scale = MAX_KEY / (far - near || 1);
+    low.fill(0);
+    high.fill(0);
+    for (let i = 0; i < key.length; i++) {
+      // From 0 for the farthest to MAX_KEY for the nearest and those behind the camera; below 0 only by rounding.
+      const steps = (far - depth[i]) * scale;
+      key[i] = steps < MAX_KEY ? Math.max(steps, 0) : MAX_KEY;
+      low[key[i] & (DIGITS - 1)]++;
+      high[key[i] >> DIGIT_BITS]++;
+    }
+    for (const counts of [low, high]) {
+      for (let digit = 0, begin = 0; digit < DIGITS; digit++) {
+        const count = counts[digit];
+        counts[digit] = begin;
+        begin += count;
+      }
+    }
+    for (let i = 0; i < key.length; i++) byLow[low[key[i] & (DIGITS - 1)]++] = i;
+    for (let n = 0; n < key.length; n++) order[high[key[byLow[n]] >> DIGIT_BITS]++] = byLow[n];
+    return order;
+  }
+
+  /**
+   * Fill `depth`; returns the nearest in front of the camera, and the farthest.
+   * @param {ArrayLike<number>} frames
+   */
+  measureDepth(frames) {
+    const { depth, splatsPerFace, xyz } = this;
+    let near = Infinity;
+    let far = 0;
+    for (let f = 0, i = 0; f < splatsPerFace.length; f++) {
+      const at = FACE_FLOATS * f + 8;
+      const a = frames[at];
+      const b = frames[at + 1];
+      const c = frames[at + 2];
+      const d = frames[at + 3];
+      for (const end = i + splatsPerFace[f]; i < end; i++) {
+        const z = a * xyz[3 * i] + b * xyz[3 * i + 1] + c * xyz[3 * i + 2] + d;
+        depth[i] = z;
+        if (z < near && z > 0) near = z;
+        if (z > far) far = z;
+      }
+    }
+    return [Math.min(near, far), far];
+  }
 }

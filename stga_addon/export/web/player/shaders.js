@@ -1,58 +1,71 @@
 // @ts-check
-// GLSL of the renderer: splats as quads, then the picture over its background.
+// GLSL: splats as quads, then the picture over its background; and a pass that computes the color of each splat under a
+// light once, with the shadow map of the sun.
 
 export const TEXTURE_WIDTH = 2048;
 export const SPLAT_TEXELS = 4; // xyz, triangle | rotation | scale, opacity | color
 export const FACE_TEXELS = 4; // rows of the frame in camera space | strain, selected
+export const SURFACE_TEXELS = 4; // normal, roughness | irradiance, occlusion | corners | weights
+export const VERTEX_TEXELS = 3; // position | normal | irradiance of the world and of skin around
+export const MAP_SIZE = 512;
+export const LIFT_M = 0.001;
+const SKIN_ROUGHNESS = 0.45;
 const MIN_ALPHA = 1 / 255;
+/** Of the recorded color without what depends on the view, by degree from 1 (light/relight.py). */
+const VIEW_MEANS = [0.65, 0.195, -0.089375];
 
-const SH = [
-  '-0.4886025119029199 * y',
-  '0.4886025119029199 * z',
-  '-0.4886025119029199 * x',
-  '1.0925484305920792 * x * y',
-  '-1.0925484305920792 * y * z',
-  '0.31539156525252005 * (2.0 * zz - xx - yy)',
-  '-1.0925484305920792 * x * z',
-  '0.5462742152960396 * (xx - yy)',
-  '-0.5900435899266435 * y * (3.0 * xx - yy)',
-  '2.890611442640554 * x * y * z',
-  '-0.4570457994644658 * y * (4.0 * zz - xx - yy)',
-  '0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)',
-  '-0.4570457994644658 * x * (4.0 * zz - xx - yy)',
-  '1.445305721320277 * z * (xx - yy)',
-  '-0.5900435899266435 * x * (xx - 3.0 * yy)',
-];
+const PREAMBLE = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+ivec2 texel(int index) {
+  return ivec2(index & ${TEXTURE_WIDTH - 1}, index >> ${Math.log2(TEXTURE_WIDTH)});
+}`;
+
+/** Of degree 1 on, by x, y, z and their squares: what the export writes here. */
+const SH = '{{harmonics}}'.split('; ');
 
 /**
  * Texels a splat needs for its view-dependent and strain-dependent colors.
- * @param {number} harmonics
- * @param {number} strains
+ * @type {(harmonics: number, strains: number) => number}
  */
 export function tailTexels(harmonics, strains) {
   return Math.ceil((3 * (harmonics + strains)) / 4);
 }
 
+/** @param {number} k */
+function tailTriple(k) {
+  return `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map((at) => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
+}
+
 /**
- * Sum of coefficients times basis functions, unrolled: dynamic indices are slow on many GPUs.
+ * Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices are slow on many GPUs.
  * @param {number} harmonics
- * @param {number} strains
- * @param {string} [direction] in which the eye sees the splat
- * @param {string} [byView] variable that is added to
- * @param {string} [byStrain] the same of what depends on strain
+ * @param {string} direction
+ * @param {string} sum
+ * @param {number[]} [factors] of degree 1 on
  */
-export function tailColor(harmonics, strains, direction = 'uToWorld * center', byView = 'color', byStrain = 'color') {
+function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
+  const terms = SH.slice(0, harmonics).map((term, k) => {
+    const factor = factors[Math.floor(Math.sqrt(k + 1)) - 1];
+    return `${sum} += ${factor.toFixed(8)} * (${term}) * ${tailTriple(k)};`;
+  });
+  return `{
+    float x = ${direction}.x, y = ${direction}.y, z = ${direction}.z, xx = x * x, yy = y * y, zz = z * z;
+    ${terms.join('\n    ')}
+  }`;
+}
+
+/**
+ * Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain to `byStrain`.
+ * @type {(harmonics: number, strains: number, direction: string, byView?: string, byStrain?: string) => string}
+ */
+function tailColor(harmonics, strains, direction, byView = 'color', byStrain = 'color') {
   const texels = tailTexels(harmonics, strains);
   const lines = [];
   for (let t = 0; t < texels; t++) lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
-  const part = (/** @type {number} */ k) => `t${k >> 2}.${'xyzw'[k & 3]}`;
-  const triple = (/** @type {number} */ k) => `vec3(${part(3 * k)}, ${part(3 * k + 1)}, ${part(3 * k + 2)})`;
-  if (harmonics) {
-    lines.push(`vec3 d = normalize(${direction});`);
-    lines.push('float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;');
-  }
-  for (let k = 0; k < harmonics; k++) lines.push(`${byView} += (${SH[k]}) * ${triple(k)};`);
-  for (let k = 0; k < strains; k++) lines.push(`${byStrain} += face.${'xyz'[k]} * ${triple(harmonics + k)};`);
+  if (harmonics) lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
+  for (let k = 0; k < strains; k++) lines.push(`${byStrain} += face.${'xyz'[k]} * ${tailTriple(harmonics + k)};`);
   return lines.join('\n  ');
 }
 
@@ -63,10 +76,7 @@ export function tailColor(harmonics, strains, direction = 'uToWorld * center', b
  * @param {boolean} [isLit] whether colors come from the light pass
  */
 export function splatVertexShader(harmonics, strains, isLit = false) {
-  return `#version 300 es
-precision highp float;
-precision highp int;
-precision highp sampler2D;
+  return `${PREAMBLE}
 uniform sampler2D uFaces;
 uniform sampler2D uSplats;
 uniform sampler2D ${isLit ? 'uColors' : 'uTail'};
@@ -80,10 +90,6 @@ flat out vec4 vColor;
 
 const float SNAP = 0.07; // pixels: more than a corner moves to the driver's grid, of 1/16 pixel at the coarsest
 const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.15;
-
-ivec2 texel(int index) {
-  return ivec2(index & ${TEXTURE_WIDTH - 1}, index >> ${Math.log2(TEXTURE_WIDTH)});
-}
 
 mat3 rotation(vec4 q) {
   float w = q.x, x = q.y, y = q.z, z = q.w;
@@ -140,7 +146,7 @@ void main() {
   if (uShowSelection && face.w < 0.5) {
     color = vec3(0.25 + 0.4 * dot(color, vec3(0.299, 0.587, 0.114)));
   } else {
-  ${isLit ? 'color = texelFetch(uColors, texel(splat), 0).rgb;' : tailColor(harmonics, strains)}
+  ${isLit ? 'color = texelFetch(uColors, texel(splat), 0).rgb;' : tailColor(harmonics, strains, 'uToWorld * center')}
   }
   vColor = vec4(max(color, 0.0), opacity);
   gl_Position = vec4(2.0 * pixel.x / uSize.x - 1.0, 1.0 - 2.0 * pixel.y / uSize.y, 0.0, 1.0);
@@ -161,6 +167,7 @@ void main() {
   result = vec4(vColor.rgb * alpha, alpha);
 }`;
 
+/** A triangle over everything. */
 export const OVER_VERTEX_SHADER = `#version 300 es
 void main() {
   gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0);
@@ -175,3 +182,73 @@ void main() {
   vec4 picture = texelFetch(uPicture, ivec2(gl_FragCoord.xy), 0);
   result = vec4(min(picture.rgb, 1.0), picture.a) + (1.0 - picture.a) * uBackground;
 }`;
+
+/** Vertices by their index, as the sun sees them: depth from 0 to 1 within twice the radius of the head. */
+export const SHADOW_VERTEX_SHADER = `${PREAMBLE}
+uniform sampler2D uVertices;
+uniform mat3 uToSun;
+uniform vec3 uMiddle;
+uniform float uRadius;
+void main() {
+  vec3 local = uToSun * (texelFetch(uVertices, texel(gl_VertexID * ${VERTEX_TEXELS}), 0).xyz - uMiddle);
+  gl_Position = vec4(local / uRadius, 1.0);
+}`;
+
+export const SHADOW_FRAGMENT_SHADER = `#version 300 es
+void main() {}`;
+
+/**
+ * A texel a splat: its color in sRGB, not clipped.
+ * @param {number} harmonics of splats whose color depends on the view
+ * @param {number} strains 3 where it depends on strain
+ */
+export function lightFragmentShader(harmonics, strains) {
+  return `${PREAMBLE}
+uniform sampler2D uSplats, uTail, uFaces, uSurface, uVertices, uShadows;
+uniform mat3 uToSun;
+uniform vec3 uMiddle, uEye, uSunColor, uWorld[9];
+uniform vec4 uKept, uTypical;
+uniform float uRadius, uTexel, uFactor;
+out vec4 result;
+#define SHADOW_DEPTH(cell) texelFetch(uShadows, cell, 0).r
+#define WORLD(first, k) uWorld[k]
+{{shading}}
+vec3 mean(ivec3 corners, vec3 weights, int k) {
+  return weights.x * texelFetch(uVertices, texel(corners.x + k), 0).xyz
+    + weights.y * texelFetch(uVertices, texel(corners.y + k), 0).xyz
+    + weights.z * texelFetch(uVertices, texel(corners.z + k), 0).xyz;
+}
+
+void main() {
+  int splat = int(gl_FragCoord.x) + ${TEXTURE_WIDTH} * int(gl_FragCoord.y);
+  vec4 surface = texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS}), 0);
+  vec4 old = texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS} + 1), 0);
+  ivec3 corners = ${VERTEX_TEXELS} * ivec3(texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS} + 2), 0).xyz + 0.5);
+  vec3 weights = texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS} + 3), 0).xyz;
+  vec3 normal = mean(corners, weights, 1);
+  normal /= max(length(normal), 1e-12);
+  vec3 point = mean(corners, weights, 0), lifted = point + LIFT * normal;
+  vec3 arriving = mean(corners, weights, 2);
+  float roughness = surface.a > 0.0 ? surface.a : ${SKIN_ROUGHNESS};
+  vec3 highlight = sky_highlight(0, normal, normalize(uEye - point), roughness, old.a);
+  vec3 view = normalize(uEye - lifted), towardSun = -vec3(uToSun[0].z, uToSun[1].z, uToSun[2].z);
+  float facing = dot(normal, towardSun);
+  if (facing > 0.0 && uSunColor != vec3(0.0)) {
+    vec3 local = uToSun * (lifted - uMiddle);
+    float depth = (local.z - shadow_bias(facing, uTexel)) / uRadius * 0.5 + 0.5;
+    vec2 place = (local.xy / uRadius * 0.5 + 0.5) * float(MAP_SIZE);
+    vec3 light = uSunColor * facing * lit_share(ivec2(0), place, depth);
+    arriving += light;
+    highlight += light * ggx(normal, towardSun, view, pow(roughness, 4.0));
+  }
+  vec3 byView = vec3(0.0), byStrain = vec3(0.0);
+  int triangle = int(texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS}), 0).w);
+  vec4 face = texelFetch(uFaces, texel(triangle * ${FACE_TEXELS} + 3), 0);
+  ${tailColor(harmonics, strains, 'point - uEye', 'byView', 'byStrain')}
+  vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + byStrain, recorded = color + byView;
+  vec3 inward = -surface.xyz / max(length(surface.xyz), 1e-12);
+  ${harmonics ? harmonicsSum(harmonics, 'inward', 'color', VIEW_MEANS) : ''}
+  vec3 lit = lit_color(vec4(color, surface.a), old.rgb, arriving, highlight, recorded, uTypical, uKept);
+  result = vec4(linear_to_srgb(uFactor * lit), 1.0);
+}`;
+}

@@ -3,11 +3,10 @@
 
 /** @import { Camera, Lighting } from './types.js' */
 
-import { cameraOfView } from './camera.js';
-import { addControls } from './controls.js';
+import { addControls, cameraOfView } from './camera.js';
 import { DataError, readData } from './data.js';
 import { RendererError } from './gl.js';
-import { litBy } from './lighting.js';
+import { litBy } from './light.js';
 import { readPerformance } from './performance.js';
 import { Player } from './player.js';
 
@@ -56,11 +55,7 @@ export class StgaAvatar extends HTMLElement {
     new ResizeObserver(() => this.#resize()).observe(this);
   }
 
-  /**
-   * @param {string} name
-   * @param {string | null} before
-   * @param {string | null} value
-   */
+  /** @type {(name: string, before: string | null, value: string | null) => void} */
   attributeChangedCallback(name, before, value) {
     if (name === 'src' && value) this.load(value).catch(() => {});
     if (name === 'loop') this.loop = value !== null;
@@ -127,8 +122,7 @@ export class StgaAvatar extends HTMLElement {
 
   /**
    * Replace an expression (its name or component) by a value; null: as recorded.
-   * @param {string | number} name
-   * @param {number | null} value
+   * @type {(name: string | number, value: number | null) => void}
    */
   setExpression(name, value) {
     const component = this.#component(name);
@@ -143,11 +137,10 @@ export class StgaAvatar extends HTMLElement {
 
   /**
    * Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded; null: all parts.
-   * @param {string} joint
-   * @param {ArrayLike<number | null> | null} rotation
+   * @type {(joint: string, rotation: ArrayLike<number | null> | null) => void}
    */
   setPose(joint, rotation) {
-    const at = 3 * this.#joint(joint);
+    const at = 3 * this.#index(this.#loaded.data.header.joints, joint, 'joint');
     const { pinnedPose } = this.#loaded.motion;
     for (let k = 0; k < 3; k++) pinnedPose[at + k] = rotation?.[k] ?? NaN;
     this.#posed();
@@ -155,25 +148,25 @@ export class StgaAvatar extends HTMLElement {
 
   /** @param {string} joint */
   getPose(joint) {
-    const at = 3 * this.#joint(joint);
+    const at = 3 * this.#index(this.#loaded.data.header.joints, joint, 'joint');
     return Array.from(this.#loaded.motion.pose.subarray(at, at + 3));
   }
 
   /**
    * Replace a shape (one of `info.shapes.names`) by a weight; null: as the performance has it, or 0. While one is
    * replaced, the shapes move expressions, jaw and eyes instead of the recording.
-   * @param {string} name
-   * @param {number | null} weight
+   * @type {(name: string, weight: number | null) => void}
    */
   setShape(name, weight) {
     const { shapes } = this.#loaded.motion;
-    shapes.pinned[this.#shape(name)] = weight ?? NaN;
+    shapes.pinned[this.#index(shapes.names, name, 'shape')] = weight ?? NaN;
     this.#posed();
   }
 
   /** @param {string} name */
   getShape(name) {
-    return this.#loaded.motion.shapes.weights[this.#shape(name)];
+    const { names, weights } = this.#loaded.motion.shapes;
+    return weights[this.#index(names, name, 'shape')];
   }
 
   /**
@@ -217,7 +210,19 @@ export class StgaAvatar extends HTMLElement {
    */
   set camera(value) {
     const player = this.#loaded;
-    player.camera = typeof value === 'string' ? cameraOfView(this.#view(value)) : value;
+    const { views } = player.data.header;
+    player.camera =
+      typeof value === 'string'
+        ? cameraOfView(
+            views[
+              this.#index(
+                views.map((view) => view.name),
+                value,
+                'view',
+              )
+            ],
+          )
+        : value;
     player.pivot = player.middle;
     this.#changed('camerachange');
   }
@@ -230,11 +235,7 @@ export class StgaAvatar extends HTMLElement {
   /** "#rrggbb" or "transparent". */
   get background() {
     const [red, green, blue, alpha] = this.#player?.background ?? [1, 1, 1, 1];
-    const hex = (/** @type {number} */ part) =>
-      Math.round(255 * part)
-        .toString(16)
-        .padStart(2, '0');
-    return alpha ? `#${hex(red)}${hex(green)}${hex(blue)}` : 'transparent';
+    return alpha ? hexOf([red, green, blue]) : 'transparent';
   }
 
   set background(value) {
@@ -291,8 +292,7 @@ export class StgaAvatar extends HTMLElement {
 
   /**
    * The current frame as a PNG (Blob) from `camera`, by default the current one at its own size.
-   * @param {Camera} [camera]
-   * @returns {Promise<Blob | null>}
+   * @type {(camera?: Camera) => Promise<Blob | null>}
    */
   async snapshot(camera = this.#loaded.camera) {
     const pixels = this.#loaded.read(camera);
@@ -313,32 +313,21 @@ export class StgaAvatar extends HTMLElement {
     return this.#player;
   }
 
-  /** @param {string} name */
-  #view(name) {
-    const view = this.#loaded.data.header.views.find((found) => found.name === name);
-    if (!view) throw new RangeError(`There is no view "${name}".`);
-    return view;
+  /**
+   * Index of a name among the names of a kind of thing. Throws RangeError where there is none.
+   * @type {(names: (string | number)[], name: string | number, kind: string) => number}
+   */
+  #index(names, name, kind) {
+    const index = names.indexOf(name);
+    if (index < 0) throw new RangeError(`There is no ${kind} "${name}".`);
+    return index;
   }
 
-  /** @param {string | number} name */
+  /** @param {string | number} name of an expression, or its component */
   #component(name) {
-    const slider = this.#loaded.data.header.sliders.find((found) => found.name === name || found.component === name);
-    if (!slider) throw new RangeError(`There is no expression "${name}".`);
-    return slider.component;
-  }
-
-  /** @param {string} name */
-  #shape(name) {
-    const index = this.#loaded.motion.shapes.names.indexOf(name);
-    if (index < 0) throw new RangeError(`There is no shape "${name}".`);
-    return index;
-  }
-
-  /** @param {string} name */
-  #joint(name) {
-    const index = this.#loaded.data.header.joints.indexOf(name);
-    if (index < 0) throw new RangeError(`There is no joint "${name}".`);
-    return index;
+    const { sliders } = this.#loaded.data.header;
+    const names = sliders.map((slider) => (typeof name === 'string' ? slider.name : slider.component));
+    return sliders[this.#index(names, name, 'expression')].component;
   }
 
   /** @param {Player} player */
@@ -373,14 +362,8 @@ export class StgaAvatar extends HTMLElement {
     if (!this.#player) return;
     const { camera, pivot, background, showSelection, lighting, data, motion } = this.#player;
     try {
-      this.#player = Object.assign(new Player(this.#canvas, data), {
-        camera,
-        pivot,
-        background,
-        showSelection,
-        lighting,
-        motion,
-      });
+      const kept = { camera, pivot, background, showSelection, lighting, motion };
+      this.#player = Object.assign(new Player(this.#canvas, data), kept);
     } catch (error) {
       this.#fail(error);
       return;
@@ -423,10 +406,7 @@ export class StgaAvatar extends HTMLElement {
     if (this.#playing) this.#changed('frame');
   }
 
-  /**
-   * @param {number} now
-   * @param {number} fps
-   */
+  /** @type {(now: number, fps: number) => void} */
   #advance(now, fps) {
     const step = this.#last ? Math.min(Math.max((now - this.#last) / 1000, 0), MAX_STEP_S) : 0;
     this.#last = now;
@@ -445,6 +425,17 @@ export class StgaAvatar extends HTMLElement {
     this.#canvas.height = height;
     if (this.#player) this.#player.draw(); // at once: setting its size has cleared the canvas
   }
+}
+
+/** @param {number[]} color red, green, blue from 0 to 1 */
+export function hexOf(color) {
+  return `#${color
+    .map((part) =>
+      Math.round(255 * part)
+        .toString(16)
+        .padStart(2, '0'),
+    )
+    .join('')}`;
 }
 
 /** @param {string} address */

@@ -14,15 +14,6 @@ export interface DataArray {
   values: Values;
 }
 
-/** Entry of an array in the header of a data file (docs/formats.md), before it is checked. */
-export interface Entry {
-  type: unknown;
-  shape: number[];
-  planes: number;
-  low: number;
-  step: number;
-}
-
 export interface View {
   name: string;
   size: [number, number];
@@ -50,44 +41,18 @@ export interface Header {
   sliders: Slider[];
   /** Controls that move expressions, jaw and eyes together: one counts up to the weight of another only. */
   shapes?: { names: string[]; opens: string; limited: string };
-  /** How much albedo is drawn to its mean, 0 to 1; where the light of the capture is known. */
-  light?: { damping: number };
+  /** Where it is known, the light of the capture (27 harmonics); how much albedo is drawn to its mean, 0 to 1, and that. */
+  light?: { damping: number; recorded: number[]; typical: number[] };
   views: View[];
 }
 
-/** Arrays of a data file, checked. */
-export interface Arrays {
-  xyz: DataArray;
-  rotation: DataArray;
-  rotation_largest: DataArray;
-  log_scale: DataArray;
-  opacity: DataArray;
-  color: DataArray;
-  faces: DataArray;
-  neutral: DataArray;
-  splats_per_face: DataArray;
-  base: DataArray;
-  basis: DataArray;
-  correctives: DataArray;
-  weights: DataArray;
-  joint_rest: DataArray;
-  joint_basis: DataArray;
-  coefficients: DataArray;
-  pose: DataArray;
-  translation: DataArray;
-  selection?: DataArray;
-  sh?: DataArray;
-  strain_color?: DataArray;
-  strain_range?: DataArray;
-  shape_linear?: DataArray;
-  shape_products?: DataArray;
-  light_transfer?: DataArray;
-  light_occlusion?: DataArray;
-  light_irradiance?: DataArray;
-  light_roughness?: DataArray;
-  /** Coefficients of signals (signals.js). */
-  [offset: string]: DataArray | undefined;
-}
+type NeededArrays =
+  | ('xyz' | 'rotation' | 'rotation_largest' | 'log_scale' | 'opacity' | 'color' | 'splats_per_face')
+  | ('faces' | 'neutral' | 'base' | 'basis' | 'correctives' | 'weights' | 'joint_rest' | 'joint_basis')
+  | ('coefficients' | 'pose' | 'translation');
+
+/** Arrays of a data file, checked; what others there are, `checkData` (data.js) lists. */
+export type Arrays = Record<NeededArrays, DataArray> & { [name: string]: DataArray | undefined };
 
 export interface Data {
   header: Header;
@@ -115,7 +80,7 @@ export interface Lighting {
   /** A built-in environment, turned about the upward axis by `turn` radians. */
   environment?: string;
   turn?: number;
-  /** Nine spherical harmonics of radiance, red, green, blue of each (harmonics.js). */
+  /** Nine spherical harmonics of radiance, red, green, blue of each (light.js). */
   harmonics?: number[];
   /** Throws shadows; takes the place of the environment's sun. */
   sun?: Sun;

@@ -1,12 +1,12 @@
-"""What a driven offset is: coefficients of each triangle, trained, by which its splats follow a signal of the pose."""
+"""Driven offsets: coefficients of each triangle, trained, by which its splats follow a signal of the pose."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..embedding import FaceFrames, shifted_frames
-from ..strain import StrainBasis
+from .embedding import FaceFrames, shifted_frames
+from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain
 
 Signal = Callable[[StrainBasis, FaceFrames], np.ndarray]
 """(F, S) float32 of a posed mesh's triangles, from the neutral mesh's basis and the frames; 0 where it is at rest."""
@@ -14,7 +14,7 @@ Signal = Callable[[StrainBasis, FaceFrames], np.ndarray]
 
 @dataclass(frozen=True)
 class DrivenOffset:
-    """A row of OFFSETS (`table`): a triangle's splats move by signal (S,) · coefficients (S, 3), in its own frame.
+    """A row of OFFSETS: a triangle's splats move by signal (S,) · coefficients (S, 3), in its own frame.
 
     name        of the coefficients (F, S, 3) in settings, avatar files and checkpoints
     signals     S
@@ -26,6 +26,14 @@ class DrivenOffset:
     signals: int
     signal: Signal
     rate_share: float
+
+
+STRAIN_POSITION = DrivenOffset(
+    "strain_position", STRAIN_COMPONENTS, lambda basis, frames: smoothed_strain(basis, frames.strain), rate_share=0.5
+)
+"""Positions that follow the strain around their triangle: skin that is compressed bulges."""
+OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in (STRAIN_POSITION,)}
+"""By name. Everything that trains, stores or poses avatars goes by this table."""
 
 
 def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:

@@ -1,1 +1,0 @@
-"""Driven offsets: positions of splats that follow a signal of the pose."""

@@ -1,0 +1,42 @@
+"""GLSL that lights splats as `relight.Relighter` does, for Blender's shaders and the web page's player."""
+
+from pathlib import Path
+
+from .lamps import BIAS_M, LIFT_M, MAP_SIZE, MAX_BIAS_M, TAP_STEP
+from .relight import (
+    ALIKE_AT_SPLAT,
+    HIGHLIGHT_SHARE,
+    MIN_DIFFUSE_SHARE,
+    REFLECTANCE,
+    UNLIKE_AT_SPLAT,
+    WET_HIGHLIGHT_SHARE,
+)
+
+SHADING_DEFINES = f"""
+#define MAP_SIZE {MAP_SIZE}
+#define LIFT {LIFT_M!r}
+#define BIAS {BIAS_M!r}
+#define MAX_BIAS {MAX_BIAS_M!r}
+#define TAP_STEP {TAP_STEP!r}
+#define REFLECTANCE {REFLECTANCE!r}
+#define HIGHLIGHT_SHARE {HIGHLIGHT_SHARE!r}
+#define WET_HIGHLIGHT_SHARE {WET_HIGHLIGHT_SHARE!r}
+#define MIN_DIFFUSE_SHARE {MIN_DIFFUSE_SHARE!r}
+#define ALIKE_AT_SPLAT {ALIKE_AT_SPLAT!r}
+#define UNLIKE_AT_SPLAT {UNLIKE_AT_SPLAT!r}
+#define PI 3.14159265358979
+"""
+SRGB_FUNCTIONS = """
+vec3 srgb_to_linear(vec3 srgb)
+{
+  vec3 curve = pow((max(srgb, vec3(0.04045)) + 0.055) / 1.055, vec3(2.4));
+  return mix(curve, max(srgb, vec3(0.0)) / 12.92, vec3(lessThanEqual(srgb, vec3(0.04045))));
+}
+
+vec3 linear_to_srgb(vec3 light)
+{
+  vec3 curve = 1.055 * pow(max(light, vec3(0.0031308)), vec3(1.0 / 2.4)) - 0.055;
+  return mix(curve, light * 12.92, vec3(lessThanEqual(light, vec3(0.0031308))));
+}
+"""
+SHADING_FUNCTIONS = SRGB_FUNCTIONS + Path(__file__).with_suffix(".glsl").read_text(encoding="utf-8")
