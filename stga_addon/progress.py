@@ -1,11 +1,14 @@
 """Progress of work, whatever it is, and how it is reported and cancelled."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+
+from .format import format_duration
 
 Item = TypeVar("Item")
 
@@ -54,3 +57,24 @@ def counted(items: Iterable[Item], total: int, report: Report, stage: str, unit:
         yield item
         if report(Progress(number / total, stage, f"{unit} {number} of {total}")):
             raise Cancelled
+
+
+def describe_figures(figures: Mapping[str, float]) -> list[str]:
+    """Figures of a training as short lines for a narrow panel, without those that are not known yet."""
+    loss = ("loss", "loss {:.4f}")
+    quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)
+    if "psnr_unmatched" in figures:
+        quality = (("psnr", "PSNR {:.2f} dB (exposure fitted)"), ("psnr_unmatched", "{:.2f} dB without")), (loss,)
+    pairs = (
+        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
+        *quality,
+        (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
+    )
+    lines = []
+    for pair in pairs:
+        known = [
+            (text, figures[name], name) for name, text in pair if figures.get(name) and not math.isnan(figures[name])
+        ]
+        parts = [text.format(format_duration(value) if name == "left_s" else value) for text, value, name in known]
+        lines.append("   ".join(parts).replace(",", "\u202f"))
+    return [line for line in lines if line]

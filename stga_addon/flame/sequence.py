@@ -20,7 +20,10 @@ from .forward import (
 from .model import JOINTS, FlameModel
 from .teeth import TEETH_VERTICES
 
-ZERO_POSES = ("head", "all")
+ZERO_POSES = {
+    "head": "head rotation, translation and neck; jaw and eyes count as expression",
+    "all": "head motion, jaw and eyes",
+}
 FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
 COEFFICIENT_FIELDS = ("expr", "shape")
 REQUIRED_FIELDS = ("expr", "rotation", "translation")
