@@ -35,10 +35,9 @@ from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.effects.rules import RULES
 from stga_addon.training.evaluate.metrics import evaluate_avatar
-from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.folder import Run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.tracking_file import with_refined_tracking
+from stga_addon.training.run.session import train
 from stga_addon.training.settings import make_settings
 
 LEFT_TO_AUTO = ("selection",)

@@ -28,9 +28,8 @@ from effects import derive
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
-from stga_addon.perform.training import Prepared, prepare
+from stga_addon.jobs.train import Extend, Prepared, Refine, prepare
 from stga_addon.progress import ignore
-from stga_addon.requests.values import Extend, Refine
 from stga_addon.selection import SelectionOptions, select_capture
 from stga_addon.training.effects.plan import add_effects, plan_effects
 from stga_addon.training.evaluate.match_exposure import known_exposure
@@ -42,11 +41,11 @@ from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.continuation import (
     DENSITY_INTERVAL,
     continued_evaluation_views,
+    continued_order,
     starting_state,
 )
 from stga_addon.training.run.folder import Run, read_run
-from stga_addon.training.run.loop import train
-from stga_addon.training.run.replay import continued_order
+from stga_addon.training.run.session import train
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import TrainingSettings, make_settings
 

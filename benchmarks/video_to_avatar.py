@@ -1,6 +1,6 @@
 """Time from a person's video to an avatar, step by step.
 
-    python benchmarks/video_to_avatar.py VIDEO [--frames 300] [--budget 5m] [--out FOLDER]
+    python benchmarks/video_to_avatar.py VIDEO [--frames 300] [--seconds 300] [--out FOLDER]
 
 Carries out `stga avatar VIDEO` with its defaults and prints a row in Markdown for each step: what its progress is
 called, and seconds of wall time. Below, processor seconds, of helping processes too. --out keeps what is made.
@@ -12,28 +12,29 @@ import tempfile
 from pathlib import Path
 from time import perf_counter
 
-from stga_addon.cli import avatar
-from stga_addon.perform.perform import perform
+from stga_addon.jobs.perform import perform
+from stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track
+from stga_addon.jobs.train import Train
 from stga_addon.progress import Progress
+from stga_addon.training.settings import make_settings
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("video")
-    parser.add_argument("--frames", default="300")
-    parser.add_argument("--budget", default="5m")
+    parser.add_argument("video", type=Path)
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--seconds", type=float, default=300.0, help="of training")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        out = str(options.out or Path(folder) / "avatar")
-        measure([options.video, "--out", out, "--stop", options.frames, "--budget", options.budget])
+        out = options.out or Path(folder) / "avatar"
+        track = Track(options.video.resolve(), None, out / CAPTURE_FOLDER, stop=options.frames)
+        settings = make_settings(seconds=options.seconds)
+        measure(MakeAvatar(track, Train(out / RUN_FOLDER, track.out, settings)))
 
 
-def measure(arguments: list[str]) -> None:
-    """Make the avatar that `stga avatar` makes of these arguments, and print where the time went."""
-    commands = argparse.ArgumentParser()
-    avatar.add_arguments(commands, None)
-    request = avatar.avatar_request(commands.parse_args(arguments))
+def measure(request: MakeAvatar) -> None:
+    """Make the avatar, and print where the time went."""
     begin = last = perf_counter()
     seconds: dict[str, float] = {}
     stage = "Start"

@@ -4,9 +4,9 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.requests.values import Analyze
-from ..stga_addon.training.effect_decisions import parse_choices
+from ..stga_addon.jobs.analyze import Analyze
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.training.effect_decisions import parse_choice
 from . import ids
 from .common import capture_source, head_of, needs_head, reporting, scene_settings
 from .request import needs_idle, start
@@ -37,5 +37,5 @@ def chosen_effects(settings: Any) -> list[str]:
 
 def _request(head: Any, settings: Any) -> Analyze:
     capture, flame, principal_point = capture_source(head)
-    effects = parse_choices(chosen_effects(settings))
+    effects = dict(map(parse_choice, chosen_effects(settings)))
     return Analyze(capture, flame, principal_point, effects, settings.device, timed=True)

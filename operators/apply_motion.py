@@ -41,9 +41,11 @@ from .common import (
     reporting,
     rig_or_none,
 )
+from .options import option_property
 
 LAST_FRAME = 1_048_574
 """Blender's maximum frame number."""
+NEUTRAL_LABELS = {"none": "As Recorded", "quiet": "Quiet Face", "first": "First Frame"}
 
 
 def _part_property(name: str, description: str) -> Any:
@@ -94,15 +96,7 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     eyes: _part_property("Eyes", "Apply the rotation of the eyes")
     neck: _part_property("Neck", "Apply the rotation of the neck")
     head: _part_property("Head", "Apply the rotation and translation of the whole head")
-    strength: bpy.props.FloatProperty(
-        name="Strength",
-        description="1: as recorded; above 1: exaggerated. Head motion is scaled about its first pose",
-        default=1.0,
-        min=0.0,
-        soft_max=2.0,
-        max=10.0,
-        options={"SKIP_SAVE"},
-    )
+    strength: option_property(MotionOptions, "strength", soft_max=2.0, options={"SKIP_SAVE"})
     own_offsets: bpy.props.BoolProperty(
         name="Own Offsets",
         description="The motion is this head's own, refined by training: keep its tracked per-frame offsets, if any",
@@ -111,17 +105,7 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     start: bpy.props.IntProperty(
         name="Start Frame", description="Frame of the first keyframe", default=1, min=0, options={"SKIP_SAVE"}
     )
-    neutral: bpy.props.EnumProperty(
-        name="Neutral",
-        description="What the motion is taken relative to, so that this head's own face is moved, not the performer's",
-        items=(
-            ("none", "As Recorded", "Nothing is exchanged"),
-            ("quiet", "Quiet Face", "Both recordings are at rest in the fifth of their frames that are most alike"),
-            ("first", "First Frame", "Both recordings begin at rest"),
-            ("calibrated", "Calibrated", "The motion is relative to the performer's resting face already"),
-        ),
-        options={"SKIP_SAVE"},
-    )
+    neutral: option_property(MotionOptions, "neutral", labels=NEUTRAL_LABELS, options={"SKIP_SAVE"})
     stay_trained: bpy.props.FloatProperty(
         name="Stay Trained",
         description="Lead expression, jaw and eyes softly back to the range of the head's own recording; 1: fully",
@@ -129,17 +113,8 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         max=1.0,
         options={"SKIP_SAVE"},
     )
-    smoothing: bpy.props.FloatProperty(
-        name="Smoothing",
-        description="Of a face performance: standard deviation in seconds",
-        min=0.0,
-        soft_max=0.2,
-        max=10.0,
-        options={"SKIP_SAVE"},
-    )
-    mirror: bpy.props.BoolProperty(
-        name="Mirror", description="Of a face performance: exchange left and right", options={"SKIP_SAVE"}
-    )
+    smoothing: option_property(MotionOptions, "smoothing", soft_max=0.2, options={"SKIP_SAVE"})
+    mirror: option_property(MotionOptions, "mirror", options={"SKIP_SAVE"})
     face_gain: _gain_property("Face Gain", "the face's shapes")
     jaw_gain: _gain_property("Jaw Gain", "the jaw's shapes")
     eyes_gain: _gain_property("Eyes Gain", "the gaze")

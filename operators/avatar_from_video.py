@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.avatar_folder import check_inputs, read_inputs
-from ..stga_addon.requests.monitor_state import TRAINS
-from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track
-from ..stga_addon.requests.values import Train as TrainRequest
+from ..stga_addon.jobs.table import TRAINS
+from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track, check_inputs, read_inputs
+from ..stga_addon.jobs.train import Train as TrainRequest
 from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
 from ..stga_addon.training.settings import make_settings
 from . import ids
 from .common import FileImport, file_filter, file_path, path_property, reporting
+from .options import option_property
 from .request import needs_idle, start
 from .training_python import training_python
 
@@ -39,9 +39,7 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
         options={"SKIP_SAVE"},
     )
     minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
-    focal: bpy.props.FloatProperty(
-        name="Focal Length", description="Of the camera, in pixels; 0: unknown", min=0.0, options={"SKIP_SAVE"}
-    )
+    focal: option_property(Track, "focal", "Focal Length", options={"SKIP_SAVE"})
     python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that tracks and trains; empty: that of the preferences, or Blender's own",

@@ -10,13 +10,13 @@ import numpy as np
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import motion_arrays
-from ..stga_addon.requests.values import Played
+from ..stga_addon.jobs.avatar_source import Played
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.timeline import frames_per_second, iterate_frames
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.run.tracking_file import TRACKING
+from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.launch import start_python
 from . import ids
 from .common import capture_of, capture_source, file_path, is_head, scene_settings
@@ -27,7 +27,7 @@ IN_BLENDER = ("select", "export", "demo")
 Python that trains, also where that is Blender's own: as `stga_addon`, whose kernels are compiled."""
 
 if TYPE_CHECKING:
-    from ..stga_addon.requests.open_head import OpenHead
+    from ..stga_addon.jobs.avatar_source import OpenHead
 
 _commands: list[Any] = []
 
@@ -50,7 +50,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _open_head() -> "OpenHead | None":
-    from ..stga_addon.requests.open_head import OpenHead
+    from ..stga_addon.jobs.avatar_source import OpenHead
 
     head = scene_settings(bpy.context).head
     if not is_head(head):
@@ -70,7 +70,7 @@ def _open_head() -> "OpenHead | None":
 
 def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
     """Run the command in the Python that trains; returns its exit code. Raises StgaError where there is none."""
-    from ..stga_addon.requests.open_head import FOLDER, write_head
+    from ..stga_addon.jobs.avatar_source import FOLDER, write_head
 
     python = training_python(bpy.context)
     with TemporaryDirectory() as folder:
@@ -84,7 +84,7 @@ def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> in
 
 def _make_avatar(arguments: list[str], options: Any) -> int:
     """Track and train in the Python for it, which needs no bpy, and write the .blend file here."""
-    from ..stga_addon.cli.avatar import RUN_FOLDER, write_blend
+    from ..stga_addon.cli.commands import RUN_FOLDER, write_blend
 
     code = _delegate([*arguments, "--no-blend"], None, played=False)
     if code or options.no_blend:

@@ -7,13 +7,14 @@ import numpy as np
 
 from ..stga_addon.capture.meshes import SELECTED_WEIGHT
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.values import Extend as ExtendRequest
-from ..stga_addon.requests.values import Refine as RefineRequest
+from ..stga_addon.jobs.train import Extend as ExtendRequest
+from ..stga_addon.jobs.train import Refine as RefineRequest
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.vertex_groups import read_triangle_weights, selected_triangles
 from ..stga_addon.training.run.folder import AVATAR, next_folder
 from . import ids
 from .common import capture_source, file_path, head_of, path_property, reporting, scene_settings
+from .options import option_property
 from .train import DeviceOptions, TrainingOperator, device_of, start_training
 
 
@@ -25,22 +26,15 @@ class RefineOptions:
         description="Vertex group whose triangles are refined; empty: the active one. In Edit Mode, the selected "
         "triangles are refined instead",
     )
-    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=20.0, min=0.1)
-    growth: bpy.props.FloatProperty(
-        name="More Splats",
-        description="Splats that may be added, as a share of those in the region",
-        default=0.0,
-        min=0.0,
-        soft_max=2.0,
-        subtype="FACTOR",
-    )
+    seconds: option_property(RefineRequest, "seconds", description="Training time", default=20.0, min=0.1)
+    growth: option_property(RefineRequest, "growth", "More Splats", soft_max=2.0, subtype="FACTOR")
 
 
 class ExtendOptions:
     """What a run is extended by, and for how long: of the operator, and of the panel that calls it."""
 
     take: path_property("Take", "Folder of a further capture of the same head", "DIR_PATH")
-    seconds: bpy.props.FloatProperty(name="Seconds", description="Training time", default=60.0, min=0.1)
+    seconds: option_property(ExtendRequest, "seconds", description="Training time", default=60.0, min=0.1)
 
 
 class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator):

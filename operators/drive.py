@@ -8,7 +8,7 @@ import bpy
 from ..stga_addon.driving.head_map import head_map
 from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES, Receiver, leaves_this_machine
 from ..stga_addon.driving.live.stream import Recording
-from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S
+from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S, MotionOptions
 from ..stga_addon.driving.transfer import trained_range
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.rig.live_pose import LivePose
@@ -29,6 +29,7 @@ from .common import (
     scene_settings,
 )
 from .live_session import LiveSession, Target, live_options
+from .options import option_property
 
 MAX_PORT = 65535
 
@@ -53,14 +54,7 @@ class DriveOptions:
     phone: bpy.props.StringProperty(
         name="Phone", description="IP address that the app on the phone shows", default=LOOPBACK
     )
-    strength: bpy.props.FloatProperty(
-        name="Strength",
-        description="1: as received; above 1: exaggerated",
-        default=1.0,
-        min=0.0,
-        soft_max=2.0,
-        max=10.0,
-    )
+    strength: option_property(MotionOptions, "strength", soft_max=2.0)
     smoothing: bpy.props.FloatProperty(
         name="Smoothing",
         description="Time constant in seconds; the head follows later by as much",
@@ -75,7 +69,7 @@ class DriveOptions:
         min=0.0,
         max=1.0,
     )
-    mirror: bpy.props.BoolProperty(name="Mirror", description="Exchange left and right, as a mirror does")
+    mirror: option_property(MotionOptions, "mirror")
     exchange_jaw: exchange_property("jaw")
     exchange_mouth: exchange_property("mouth")
     takes: path_property(

@@ -14,6 +14,7 @@ from ..stga_addon.driving.head_map import page_controls
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar
 from ..stga_addon.format import format_bytes
+from ..stga_addon.jobs.export import Export
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.display.splat_object import check_head
 from ..stga_addon.scene.rig.motion import sample_motion
@@ -32,6 +33,7 @@ from .common import (
 )
 from .export_range import RangeExport
 from .export_web import exact_motion, scene_playback
+from .options import option_property
 
 STEP_INTERVAL_S = 0.005
 SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
@@ -57,11 +59,7 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     )
 
     filter_glob: file_filter(*SUFFIXES)
-    motion_only: bpy.props.BoolProperty(
-        name="Motion Only",
-        description="Leave out blend shapes, skeleton and sliders of the FLAME model. The head's triangles and posed "
-        "meshes stay in the page: FLAME's licence decides who may receive it either way",
-    )
+    motion_only: option_property(Export, "motion_only")
     _range: RangeExport | None = None
     _is_invoked = False
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon import __version__
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.worker.status import failure_report
 from . import ids, monitor
 from .common import file_path, reporting

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.requests.values import Relight
+from ..stga_addon.jobs.finished_run import Relight
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import get_input
 from ..stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow

@@ -1,6 +1,6 @@
 """Request monitor: the one timer, which reads the status of workers and brings their results into their scenes.
 
-What is to be done is decided by `requests.monitor_state`; this module reads files, owns the timer and carries out
+What is to be done is decided by `jobs.monitor_state`; this module reads files, owns the timer and carries out
 effects, those that depend on the kind of request by the table in `results`.
 """
 
@@ -19,30 +19,21 @@ from bpy.app.handlers import persistent
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
-from ..stga_addon.report.curve_image import curve_image
-from ..stga_addon.requests import monitor_state as states
-from ..stga_addon.requests.folder import PICTURE, PREVIEW, remove_request, request_folder
-from ..stga_addon.requests.monitor_state import (
-    CHECK_INTERVAL_S,
-    SLICE_INTERVAL_S,
-    STORED,
-    TRANSIENT,
-    Kind,
-    RequestState,
-    RunFiles,
-    transition,
-)
-from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER
+from ..stga_addon.jobs import monitor_state as states
+from ..stga_addon.jobs.folder import PICTURE, PREVIEW, remove_request, request_folder
+from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, RequestState, RunFiles, transition
+from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
+from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
+from ..stga_addon.report import curve_image
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.viewports import open_sidebar
 from ..stga_addon.tracking.folder import SPLIT_FILES
-from ..stga_addon.training.run.folder import AVATAR
+from ..stga_addon.training.run.folder import AVATAR, TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
-from ..stga_addon.training.run.tracking_file import TRACKING
 from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker, refuse_running_worker, request_cancel
 from . import ids
 from .common import is_head
-from .results import KINDS, loader
+from .results import IN_SCENE, loader
 
 Curve = tuple[np.ndarray, str, str]
 """Pixels of a run's curve, the ranges of its axes and of the detail difference; or those of a tracking's picture."""
@@ -216,7 +207,7 @@ def _key(scene: Any, kind: Kind) -> tuple[int, Kind]:
 
 
 def _is_edited(scene: Any, kind: Kind) -> bool:
-    changed = KINDS[kind].changed(scene, _states[_key(scene, kind)])
+    changed = IN_SCENE[kind].changed(scene, _states[_key(scene, kind)])
     return changed is not None and changed.mode == "EDIT"
 
 
@@ -230,7 +221,7 @@ def _stored_state(scene: Any, kind: Kind) -> RequestState:
 
 
 def _read_stored(scene: Any, kind: Kind) -> tuple[Path | None, bool]:
-    settings, (subject, result_shown) = getattr(scene, ids.SETTINGS), KINDS[kind].stored or ("", "")
+    settings, (subject, result_shown) = getattr(scene, ids.SETTINGS), IN_SCENE[kind].stored or ("", "")
     path = getattr(settings, subject)
     return Path(path) if path else None, getattr(settings, result_shown)
 
@@ -298,7 +289,7 @@ def _handle(scene: Any, kind: Kind, event: states.Event) -> RequestState:
 def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states.Event | None:
     match effect:
         case states.Store(subject, result_shown):
-            names = KINDS[state.kind].stored
+            names = IN_SCENE[state.kind].stored
             assert names is not None
             for name, value in zip(names, (str(subject or ""), result_shown), strict=True):
                 setattr(getattr(scene, ids.SETTINGS), name, value)
@@ -327,7 +318,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
 
 def _show(scene: Any, state: RequestState) -> states.Event | None:
     try:
-        return KINDS[state.kind].show(scene, state)
+        return IN_SCENE[state.kind].show(scene, state)
     except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
         return states.Failed(str(error).strip().removeprefix("Error: "))
     except Exception as error:

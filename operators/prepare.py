@@ -9,12 +9,11 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.raster.kernel_cache import has_kernels
-from ..stga_addon.worker.cache import CACHE_VARIABLE, KERNELS, cache_folder
-from ..stga_addon.worker.launch import start_in_background
+from ..stga_addon.worker.launch import CACHE_VARIABLE, KERNELS, cache_folder, start_in_background
 from .common import package
 from .training_python import training_python
 
-PREPARATION = "stga_addon.perform.preparation"
+PREPARATION = "stga_addon.jobs.preparation"
 START_DELAY_S = 1.0
 """After the extension was enabled: neither enabling nor Blender's start waits for a process."""
 

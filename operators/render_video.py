@@ -11,12 +11,13 @@ from typing import Any, ClassVar
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.capture.camera import TURNTABLE_S, Camera, to_and_fro
+from ..stga_addon.capture.camera import Camera, to_and_fro
 from ..stga_addon.errors import StgaError
+from ..stga_addon.jobs.blender import RenderRecording
+from ..stga_addon.jobs.render import Render
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.recording import Recorder, check_output
-from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.requests.values import RenderRecording
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.render.camera_path import scene_camera, turntable_cameras
@@ -27,6 +28,7 @@ from ..stga_addon.scene.timeline import frames_per_second
 from ..stga_addon.worker.status import status_writer
 from . import ids, monitor
 from .common import file_filter, file_path, is_head, path_property, polled, reporting, scene_settings
+from .options import option_property
 from .render_engine import render_device
 from .request import needs_idle, start
 from .training_python import has_training_python, training_python
@@ -68,13 +70,7 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         max=2 * pi,
         default=0.0,
     )
-    seconds: bpy.props.FloatProperty(
-        name="Seconds",
-        description="Least duration of the turntable; longer motion is played whole",
-        default=TURNTABLE_S,
-        min=0.1,
-        soft_max=60.0,
-    )
+    seconds: option_property(Render, "seconds", min=0.1, soft_max=60.0)
     filename_ext = ""
     filter_glob: file_filter(".mp4")
 

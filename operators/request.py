@@ -10,15 +10,13 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.folder import check_request, request_folder, worker_arguments, write_request
-from ..stga_addon.requests.monitor_state import DISMISSIBLE, STORED, SUBJECTS, TRAINS, TRANSIENT, Kind
-from ..stga_addon.requests.values import Request
+from ..stga_addon.jobs.folder import check_request, request_folder, worker_arguments, write_request
+from ..stga_addon.jobs.table import DISMISSIBLE, JOBS, KINDS, STORED, TRAINS, TRANSIENT, Kind, Request
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, failure_report, inspect_worker
 from ..stga_addon.worker.training_python import missing_packages
 from . import ids, monitor
 from .common import polled, reporting
-from .results import KINDS
 from .training_python import training_python
 
 
@@ -31,8 +29,9 @@ def start(scene: Any, request: Request, python: str | None, folder: Path | None 
     Raises StgaError for what is known to fail, while a worker is there, and where the interpreter cannot be started;
     where it was waited for, also with the error of the worker or of its result.
     """
-    kind, name = SUBJECTS[type(request)]
-    subject = getattr(request, name)
+    job = JOBS[type(request)]
+    kind, subject = job.kind, getattr(request, job.subject)
+    assert kind is not None
     if folder is None:
         folder = request_folder(subject) if kind in STORED else Path(tempfile.mkdtemp(prefix="stga_"))
     try:
@@ -69,7 +68,7 @@ def _perform_here(folder: Path) -> None:
 
     Raises what the work raises.
     """
-    from ..stga_addon.perform.perform import perform_in_folder
+    from ..stga_addon.jobs.perform import perform_in_folder
 
     manager = bpy.context.window_manager
 

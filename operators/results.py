@@ -1,4 +1,4 @@
-"""What Blender does with each kind of request: what the scene stores of it, and how its result reaches the scene."""
+"""How the result of each kind of request reaches the scene, and what the scene stores of it."""
 
 import json
 from collections.abc import Callable
@@ -12,9 +12,10 @@ import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.folder import read_request, read_result
-from ..stga_addon.requests.monitor_state import Kind, RequestState, Shown, SliceBuilt
-from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar
+from ..stga_addon.jobs.folder import read_request, read_result
+from ..stga_addon.jobs.monitor_state import RequestState, Shown, SliceBuilt
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
@@ -27,8 +28,7 @@ from ..stga_addon.scene.display.splat_object import (
 )
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
-from ..stga_addon.training.run.folder import AVATAR
-from ..stga_addon.training.run.tracking_file import TRACKING
+from ..stga_addon.training.run.folder import AVATAR, TRACKING
 from . import ids
 from .common import is_head
 from .select import count_selected
@@ -38,21 +38,17 @@ Answer = SliceBuilt | Shown | None
 
 
 @dataclass(frozen=True)
-class RequestKind:
-    """What Blender does with requests of one kind.
+class InScene:
+    """What a kind of request is in the scene.
 
-    label    what is running, for messages
-    cancel   what Cancel does
-    stored   properties of the scene's settings: the subject's path, and whether its result was shown
     show     puts what was loaded into the scene; None: it is still being read. Raises StgaError or RuntimeError
     changed  the object that `show` changes, which has to leave Edit Mode before
+    stored   properties of the scene's settings: the subject's path, and whether its result was shown
     """
 
-    label: str
-    cancel: str
-    stored: tuple[str, str] | None = None
     show: Callable[[Any, RequestState], Answer] = lambda scene, state: Shown()
     changed: Callable[[Any, RequestState], Any] = lambda scene, state: None
+    stored: tuple[str, str] | None = None
 
 
 def _head(scene: Any, state: RequestState) -> Any:
@@ -238,41 +234,13 @@ def _store_light(scene: Any, state: RequestState) -> Answer:
     return Shown(undoable=True)
 
 
-KINDS = {
-    Kind.TRAINING: RequestKind(
-        "Training",
-        "Stop training and keep the avatar trained so far; Resume continues from there",
-        ("training_run", "result_shown"),
-        _show_avatar,
-        _run_object,
-    ),
-    Kind.TRACKING: RequestKind(
-        "Tracking",
-        "Stop tracking; the landmarks of whole cameras are kept, and Track continues with the others",
-        ("tracking_capture", "tracking_shown"),
-        _import_tracked,
-        _head,
-    ),
-    Kind.AVATAR: RequestKind(
-        "Making an avatar",
-        "Stop, and keep what there is so far; Avatar from Video with the same video continues",
-        ("avatar_folder", "avatar_shown"),
-        _show_made,
-        _run_object,
-    ),
-    Kind.ANALYSIS: RequestKind("The analysis", "Stop the analysis; earlier results stay", show=_fill_effects),
-    Kind.SELECTION: RequestKind(
-        "The selection", "Stop selecting; the groups stay as they are", show=_select_for_take, changed=_head
-    ),
-    Kind.PERFORMANCE: RequestKind(
-        "The performance of the video",
-        "Stop watching the video; nothing is written",
-        show=_apply_performance,
-        changed=_head,
-    ),
-    Kind.LIGHT: RequestKind("The estimate of light", "Stop; the avatar stays as it is", show=_store_light),
-    Kind.VIDEO: RequestKind(
-        "The video", "Stop making the video; nothing is written, or the PNGs that are finished stay"
-    ),
+IN_SCENE = {
+    Kind.TRAINING: InScene(_show_avatar, _run_object, ("training_run", "result_shown")),
+    Kind.TRACKING: InScene(_import_tracked, _head, ("tracking_capture", "tracking_shown")),
+    Kind.AVATAR: InScene(_show_made, _run_object, ("avatar_folder", "avatar_shown")),
+    Kind.ANALYSIS: InScene(_fill_effects),
+    Kind.SELECTION: InScene(_select_for_take, _head),
+    Kind.PERFORMANCE: InScene(_apply_performance, _head),
+    Kind.LIGHT: InScene(_store_light),
+    Kind.VIDEO: InScene(),
 }
-"""The only table of what depends on the kind of a request in Blender."""

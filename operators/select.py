@@ -12,10 +12,11 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.display.heat_map import RESIDUAL, has_heat_map, hide_heat_map, show_heat_map, shows_residuals
 from ..stga_addon.scene.vertex_groups import read_regions, read_selection, splats_per_face, write_selection
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
-from ..stga_addon.training.run.residual_file import read_residuals
+from ..stga_addon.training.run.folder import read_residuals
 from ..stga_addon.training.settings import TrainingSettings
 from . import ids
 from .common import capture_of, file_path, head_of, needs_head, needs_own_head, path_property, reporting, scene_settings
+from .options import option_property
 
 LARGEST_RESIDUAL_QUANTILE = 0.98
 """Triangles with residuals from here up are shown alike, so that a few at the border do not make all others blue."""
@@ -28,23 +29,9 @@ class Select(bpy.types.Operator):
     bl_label = "Select Moving Triangles"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    threshold: bpy.props.FloatProperty(
-        name="Threshold",
-        description="Distance from the neutral face above which a triangle is selected in a frame",
-        default=SelectionOptions.threshold,
-        min=0.0,
-        soft_max=0.05,
-        step=0.1,
-        precision=4,
-        unit="LENGTH",
-    )
-    zero_pose: bpy.props.EnumProperty(
-        name="Ignore",
-        description="Motion that does not count as expression",
-        items=(
-            ("head", "Head Motion", "Head rotation, translation and neck; jaw and eyes count as expression"),
-            ("all", "Whole Pose", "Head motion, jaw and eyes"),
-        ),
+    threshold: option_property(SelectionOptions, "threshold", soft_max=0.05, step=0.1, precision=4, unit="LENGTH")
+    zero_pose: option_property(
+        SelectionOptions, "zero_pose", "Ignore", labels={"head": "Head Motion", "all": "Whole Pose"}
     )
     regions: bpy.props.StringProperty(
         name="Key Regions",

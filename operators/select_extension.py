@@ -4,8 +4,8 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.requests.values import SelectForTake
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.jobs.train import SelectForTake
 from . import ids
 from .common import capture_source, file_path, head_of, needs_own_head, path_property, reporting
 from .request import needs_idle, start

@@ -1,14 +1,14 @@
 """Tracks a head through footage in a worker process beside Blender, and imports what it tracked."""
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.requests.values import SolveAgain, Track
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.jobs.track import MATTES, SolveAgain, Track
 from . import ids
 from .common import file_path, path_property, reporting
+from .options import given_values, option_property
 from .request import needs_idle, start
 from .training_python import training_python
 
@@ -16,32 +16,21 @@ from .training_python import training_python
 class TrackOptions:
     """What is tracked, and with what: of the operator, and of the panel that calls it."""
 
-    footage: path_property("Footage", "Folder with a folder of images or a video for each camera; or one video")
-    cameras: path_property(
-        "Cameras",
-        "Calibration: COLMAP, Metashape, RealityCapture or transforms.json; empty: the one in the footage's folder",
-    )
-    model: path_property(
-        "Head Model",
-        "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb); empty: the head of this add-on",
-    )
+    footage: option_property(Track, "footage")
+    cameras: option_property(Track, "cameras")
+    model: option_property(Track, "model", "Head Model")
     directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
-    focal: bpy.props.FloatProperty(
-        name="Focal Length",
-        description="In pixels, of a single camera without calibration; 0: as its file says, or from the head's turns",
-        min=0.0,
-    )
-    start: bpy.props.IntProperty(name="Start", description="First frame of the footage, counted from 0", min=0)
-    stop: bpy.props.IntProperty(name="Stop", description="Frame to stop before; 0: all", min=0)
-    step: bpy.props.IntProperty(name="Step", description="Use every nth frame", min=1, default=1)
+    focal: option_property(Track, "focal", "Focal Length")
+    start: option_property(Track, "start")
+    stop: option_property(Track, "stop")
+    step: option_property(Track, "step")
     mattes: bpy.props.EnumProperty(
         name="Mattes",
         description="Masks that tell the person from the background",
-        items=(
-            ("auto", "Auto", "Made for frames without a mask"),
-            ("none", "None", "Only those of the footage"),
+        items=[
+            *((name, name.title(), text.capitalize()) for name, text in MATTES.items()),
             ("folder", "Folder", "Those of a folder, named as the images"),
-        ),
+        ],
     )
     matte_folder: path_property("Matte Folder", "Folder of masks, named as the images of the footage", "DIR_PATH")
 
@@ -53,9 +42,7 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
     bl_label = "Track Footage"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    landmarks: path_property(
-        "Landmarks", "Folder with landmark files of another detector", "DIR_PATH", options={"SKIP_SAVE"}
-    )
+    landmarks: option_property(Track, "landmarks", subtype="DIR_PATH", options={"SKIP_SAVE"})
     python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that tracks; empty: that of the preferences, or Blender's own",
@@ -69,24 +56,11 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        python = training_python(context, self.python)
-        out, footage = file_path(self.directory, "capture").resolve(), file_path(self.footage, "footage")
-
-        def optional(value: str, what: str) -> Path | None:
-            return file_path(value, what).resolve() if value else None
-
-        request = Track(
-            footage.resolve(),
-            optional(self.model, "head model"),
-            out,
-            optional(self.cameras, "cameras"),
-            optional(self.landmarks, "landmarks"),
-            self.focal or None,
-            self.start,
-            self.stop or None,
-            self.step,
-            mattes=str(file_path(self.matte_folder, "mattes").resolve()) if self.mattes == "folder" else self.mattes,
-        )
+        names = ("footage", "cameras", "model", "landmarks", "focal", "start", "stop", "step")
+        given = {"model": None, **given_values(self, Track, *names)}
+        out = file_path(self.directory, "capture").resolve()
+        mattes = str(file_path(self.matte_folder, "mattes").resolve()) if self.mattes == "folder" else self.mattes
+        request, python = Track(**given, out=out, mattes=mattes), training_python(context, self.python)
         return start_tracking(self, context, request, python)
 
 

@@ -8,8 +8,8 @@ import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.monitor_state import Kind
-from ..stga_addon.requests.values import SolveAgain as SolveAgainRequest
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.jobs.track import SolveAgain as SolveAgainRequest
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.rig.flame_rig import rig_of

@@ -5,15 +5,16 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.monitor_state import TRAINS
-from ..stga_addon.requests.values import Extend, Refine, Resume
-from ..stga_addon.requests.values import Train as TrainRequest
+from ..stga_addon.jobs.table import TRAINS
+from ..stga_addon.jobs.train import Extend, Refine, Resume
+from ..stga_addon.jobs.train import Train as TrainRequest
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.effect_decisions import parse_choices
+from ..stga_addon.training.effect_decisions import parse_choice
 from ..stga_addon.training.run.folder import read_run
-from ..stga_addon.training.settings import PRESETS, make_settings
+from ..stga_addon.training.settings import PRESETS, TrainingSettings, make_settings
 from . import ids
 from .common import capture_source, file_path, head_of, needs_head, path_property, reporting
+from .options import option_property
 from .request import needs_idle, python_of, start
 from .training_python import test
 
@@ -58,24 +59,14 @@ class TrainOptions(DeviceOptions):
     """How an avatar is trained: of the operator, and of the panel that calls it."""
 
     minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
-    strategy: bpy.props.EnumProperty(
-        name="Strategy",
-        description="Which splats each iteration trains",
-        items=(
-            ("global", "Global", "Every iteration trains all splats; most accurate on the captures measured so far"),
-            ("selective", "Selective", "Local iterations train the triangles selected in each frame; global ones, all"),
-            ("gaussian-avatars", "GaussianAvatars", "The binding, losses and learning rates of GaussianAvatars"),
-        ),
-    )
+    strategy: option_property(TrainingSettings, "strategy", labels={"gaussian-avatars": "GaussianAvatars"})
     preset: preset_property()
 
 
 class TrainingOperator:
     """Options of an operator that trains which no panel has."""
 
-    iterations: bpy.props.IntProperty(
-        name="Iterations", description="Number of iterations, instead of a time", min=0, options={"SKIP_SAVE"}
-    )
+    iterations: option_property(TrainingSettings, "iterations", options={"SKIP_SAVE"})
     python: bpy.props.StringProperty(
         name="Python",
         description="Python interpreter that trains; empty: that of the preferences, or Blender's own",
@@ -102,7 +93,7 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     directory: path_property("Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH")
-    seed: bpy.props.IntProperty(name="Seed", description="Seed of the random numbers", min=0, options={"SKIP_SAVE"})
+    seed: option_property(TrainingSettings, "seed", options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
         description="NAME=on or NAME=off, separated by spaces, for effects that the capture should not decide",
@@ -127,7 +118,7 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
             # The head may be that of any take.
             moved = None if read_run(run).takes else capture
             return Resume(run, moved, flame, principal_point, device_of(self), training_selection(head))
-        effects = None if self.strategy == "gaussian-avatars" else parse_choices(self.effects.split())
+        effects = None if self.strategy == "gaussian-avatars" else dict(map(parse_choice, self.effects.split()))
         preset = None if self.preset == "none" else self.preset
         budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
         settings = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.python_check import CHECK_TIMEOUT_S, Checked, finish_check, start_check
+from ..stga_addon.jobs.python_check import CHECK_TIMEOUT_S, Checked, finish_check, start_check
 from ..stga_addon.worker.training_python import find_training_python
 from . import ids, monitor
 from .common import polled, preferences, reporting

@@ -35,15 +35,22 @@ def setting(
     accepts: Callable[[Any], bool] | None = None,
     expected: str = "",
     is_path: Callable[[str], bool] | None = None,
+    default_factory: Any = dataclasses.MISSING,
+    **option: Any,
 ) -> Any:
     """A dataclass field with its allowed values; the bounds hold for each number of a tuple.
 
     minimum, maximum  inclusive; above: exclusive lower bound
+    choices           allowed texts; a mapping also says what each is
     accepts           whether a value of the right type is allowed, and `expected`: what it accepts, for the message
     is_path           whether a text is that of a path, where it can be a name as well
+    option            what the command line and Blender ask for it with (`options.option`)
     """
-    limits = {"minimum": minimum, "maximum": maximum, "above": above, "choices": choices}
-    return field(default=default, metadata={**limits, "accepts": accepts, "expected": expected, IS_PATH: is_path})
+    limits = {"minimum": minimum, "maximum": maximum, "above": above, "choices": choices, "accepts": accepts}
+    metadata = {**limits, "expected": expected, IS_PATH: is_path, **option}
+    if default_factory is not dataclasses.MISSING:
+        return field(default_factory=default_factory, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 # Validation
@@ -55,10 +62,10 @@ def validate(value: Any, prefix: str = "") -> None:
     A field is allowed by its type hint and the limits of `setting`; what fields must have in common, a dataclass says
     in a method `check()` that raises StgaError.
     """
-    hints = _hints(type(value))  # type: ignore[arg-type]
+    hints = type_hints(type(value))  # type: ignore[arg-type]
     for spec in dataclasses.fields(value):
         found, hint = getattr(value, spec.name), hints[spec.name]
-        expected = _expected(found, hint, spec.metadata)
+        expected = expectation(found, hint, spec.metadata)
         if expected is not None:
             raise StgaError(complaint(prefix + spec.name, expected, found))
         for name, part in _parts(spec.name, found):
@@ -81,18 +88,18 @@ def _parts(name: str, value: Any) -> list[tuple[str, Any]]:
 
 
 @cache
-def _hints(kind: Any) -> dict[str, Any]:
+def type_hints(kind: Any) -> dict[str, Any]:
     return {name: hint for name, hint in get_type_hints(kind).items() if hint is not dataclasses.KW_ONLY}
 
 
-def _kinds(hint: Any) -> tuple[Any, ...]:
+def alternatives(hint: Any) -> tuple[Any, ...]:
     """The alternatives of a type hint; None is `types.NoneType`."""
     return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
 
 
-def _expected(value: Any, hint: Any, limits: Mapping[str, Any]) -> str | None:
+def expectation(value: Any, hint: Any, limits: Mapping[str, Any]) -> str | None:
     """What `value` should have been by its type and its limits; None where it is allowed."""
-    kinds = _kinds(hint)
+    kinds = alternatives(hint)
     if value is None and types.NoneType in kinds:
         return None
     found = [_expected_kind(value, kind, limits) for kind in kinds if kind is not types.NoneType]
@@ -121,14 +128,14 @@ def _expected_items(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any
     size = None if hints[-1] is Ellipsis else len(hints)
     if not isinstance(value, tuple) or size not in (None, len(value)):
         return "a tuple" if size is None else f"a tuple of {size}"
-    found = (_expected(item, hints[0], limits) for item in value)
+    found = (expectation(item, hints[0], limits) for item in value)
     return next((f"a tuple, each item {text}" for text in found if text is not None), None)
 
 
 def _expected_mapping(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
     if not isinstance(value, Mapping):
         return "an object of Mapping"
-    fits = all(isinstance(key, hints[0]) and _expected(item, hints[1], limits) is None for key, item in value.items())
+    fits = all(isinstance(key, hints[0]) and expectation(item, hints[1], limits) is None for key, item in value.items())
     return None if fits else "texts by name" if hints == (str, str) else "values by name"
 
 
@@ -163,12 +170,12 @@ def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None) -> Any:
 
 def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
     if dataclasses.is_dataclass(value):
-        hints = _hints(type(value))  # type: ignore[arg-type]
+        hints = type_hints(type(value))  # type: ignore[arg-type]
         fields = {
             spec.name: _plain(getattr(value, spec.name), hints[spec.name], arrays, _joined(name, spec.name))
             for spec in dataclasses.fields(value)
         }
-        several = sum(dataclasses.is_dataclass(kind) for kind in _kinds(hint)) > 1
+        several = sum(dataclasses.is_dataclass(kind) for kind in alternatives(hint)) > 1
         return {KIND: type(value).__name__, **fields} if several else fields
     if isinstance(value, np.ndarray):
         assert arrays is not None, f"{name}: an array, and nothing to keep it in"
@@ -176,7 +183,7 @@ def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
         return {ARRAY: name}
     if isinstance(value, Path):
         return str(value)
-    (kind,) = [kind for kind in _kinds(hint) if kind is not types.NoneType][:1]
+    (kind,) = [kind for kind in alternatives(hint) if kind is not types.NoneType][:1]
     items = get_args(kind) or (Any, Any)
     if isinstance(value, Mapping):
         return {str(key): _plain(item, items[1], arrays, _joined(name, str(key))) for key, item in value.items()}
@@ -202,11 +209,11 @@ def from_json(kind: Any, values: Any, where: str = "", arrays: Mapping[str, np.n
 
 def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:
     """The value in the types of the hint where it has their form; else as it is, for `validate` to name."""
-    kinds = [kind for kind in _kinds(hint) if kind is not types.NoneType]
+    kinds = [kind for kind in alternatives(hint) if kind is not types.NoneType]
     classes = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
     if isinstance(value, dict) and ARRAY in value and np.ndarray in kinds:
         return arrays.get(value[ARRAY]) if isinstance(value[ARRAY], str) else None
-    if classes and (value is not None or len(kinds) == len(_kinds(hint))):
+    if classes and (value is not None or len(kinds) == len(alternatives(hint))):
         return _parsed_dataclass(classes, value, where, arrays)
     if isinstance(value, str) and Path in kinds and str not in kinds:
         return Path(value)
@@ -234,7 +241,7 @@ def _parsed_dataclass(classes: list[Any], value: Any, where: str, arrays: Mappin
         if not isinstance(named, str) or named not in names:
             raise StgaError(complaint(_joined(where, KIND), f"one of {', '.join(names)}", named))
         kind, value = names[named], {name: item for name, item in value.items() if name != KIND}
-    hints = _hints(kind)
+    hints = type_hints(kind)
     if not isinstance(value, dict) or value.keys() != hints.keys():
         differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
         fields = ", ".join(sorted(map(str, differing)))[:200]

@@ -9,6 +9,7 @@ import numpy as np
 from .capture.model import Capture
 from .errors import StgaError, shorten
 from .flame.sequence import ZERO_POSES
+from .options import option
 
 KEY_REGIONS = ("left_eye", "right_eye", "mouth", "nose")
 
@@ -23,8 +24,10 @@ class SelectionOptions:
     Raises StgaError for other values.
     """
 
-    threshold: float = 0.002
-    zero_pose: str = "head"
+    threshold: float = option(
+        "movement from the neutral face from which a triangle is selected", 0.002, 0, metavar="METERS"
+    )
+    zero_pose: str = option("motion that does not count as expression", "head", choices=ZERO_POSES)
     regions: tuple[str, ...] = KEY_REGIONS
 
     def __post_init__(self) -> None:

@@ -28,7 +28,8 @@ TRAININGS = ("stga_addon/raster/", "stga_addon/training/")
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"},
-    {"files", "format", "progress", "schema"},
+    {"files", "format", "schema"},
+    {"options", "progress"},
     {"worker"},
     {"flame"},
     {"capture"},
@@ -41,15 +42,16 @@ LAYERS = (
     {"driving"},
     {"training"},
     {"report"},
-    {"requests"},
-    {"perform"},
+    {"jobs"},
     {"batch"},
     {"scene"},
     {"cli"},
     {"development"},
     {"__main__", "__init__"},
 )
-NAMED_WHERE_THERE = {"stga_addon/cli/main.py": "development", "stga_addon/perform/perform.py": "development"}
+NAMED_WHERE_THERE = dict.fromkeys(
+    ("stga_addon/cli/main.py", "stga_addon/jobs/perform.py", "stga_addon/jobs/table.py"), "development"
+)
 """Files that name modules of a room after their own, because the extension's zip leaves that room out."""
 LIGHT = (
     "errors",
@@ -61,7 +63,10 @@ LIGHT = (
     "avatar.file",
     "export.ply",
     "selection",
-    "requests.folder",
+    "jobs.folder",
+    "jobs.perform",
+    "jobs.monitor_state",
+    "jobs.python_check",
 )
 
 
@@ -249,9 +254,9 @@ def test_numpy_is_enough_to_import_the_engine():
 
 LOADED = """
 import sys
-from stga_addon.perform.perform import load_ahead
+from stga_addon.jobs.perform import load_ahead
 load_ahead()
-assert "stga_addon.training.run.loop" in sys.modules
+assert "stga_addon.training.run.session" in sys.modules
 assert "torch" not in sys.modules
 """
 

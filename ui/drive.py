@@ -8,7 +8,7 @@ import bpy
 from ..operators import ids, live_session
 from ..operators.common import scene_settings
 from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.jobs.table import Kind
 from .motion import MotionPanel
 from .request import draw_running
 from .sidebar import SidebarPanel

@@ -6,7 +6,7 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import scene_settings
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.jobs.table import Kind
 from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text

@@ -8,7 +8,7 @@ from bpy.app.handlers import persistent
 
 from ..operators import ids
 from ..operators.common import scene_settings
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.display.hints import shows_nodes
 from ..stga_addon.scene.display.splat_object import stored_light
 from ..stga_addon.scene.light.settings import lighting_settings

@@ -10,7 +10,7 @@ from ..operators.open_demo import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes

@@ -5,37 +5,12 @@ from typing import Any
 
 from ..operators import ids, monitor
 from ..stga_addon.format import describe_figures
-from ..stga_addon.requests.monitor_state import STORED, Kind, RequestState
+from ..stga_addon.jobs.monitor_state import RequestState
+from ..stga_addon.jobs.table import KINDS, STORED, Kind
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
 from .text import columns, draw_text
 
-ENDS = {
-    Kind.TRAINING: {
-        WorkerState.FINISHED: "Trained",
-        WorkerState.CANCELLED: "Cancelled, avatar kept",
-        WorkerState.FAILED: "Training failed",
-        WorkerState.NONE: "Run not found",
-    },
-    Kind.TRACKING: {
-        WorkerState.FINISHED: "Tracked",
-        WorkerState.CANCELLED: "Cancelled; Track continues",
-        WorkerState.FAILED: "Tracking failed",
-        WorkerState.NONE: "Capture not found",
-    },
-    Kind.AVATAR: {
-        WorkerState.FINISHED: "Avatar made",
-        WorkerState.CANCELLED: "Cancelled; Avatar from Video continues",
-        WorkerState.FAILED: "Making the avatar failed",
-        WorkerState.NONE: "Its folder was not found",
-    },
-    Kind.VIDEO: {
-        WorkerState.FINISHED: "Video rendered",
-        WorkerState.CANCELLED: "Video cancelled",
-        WorkerState.FAILED: "Video failed",
-    },
-}
-"""What is said about the end of a request."""
 WAITING = "Done; shown as soon as Edit Mode or rendering ends"
 
 
@@ -64,7 +39,9 @@ def draw_end(layout: Any, context: Any, state: RequestState) -> Any:
     box, worker = layout.box(), state.snapshot.state
     row = box.row()
     icons = {WorkerState.FINISHED: "CHECKMARK", WorkerState.CANCELLED: "INFO"}
-    text = ENDS[state.kind].get(WorkerState.FAILED if worker.failed else worker, "")
+    ends = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED, WorkerState.NONE)
+    texts = dict(zip(ends, KINDS[state.kind].ends, strict=True))
+    text = texts.get(WorkerState.FAILED if worker.failed else worker, "")
     row.label(text=text, icon=icons.get(worker, "ERROR"))
     if state.can_be_dismissed:
         row.operator(ids.DISMISS, text="", icon="X", emboss=False).request = state.kind

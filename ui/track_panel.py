@@ -9,7 +9,7 @@ from ..operators import ids, monitor
 from ..operators.common import is_head, scene_settings
 from ..operators.track import TrackOptions
 from ..operators.track_correct import tracking_keys
-from ..stga_addon.requests.monitor_state import Kind
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.tracking.folder import SHEET_FILE
 from .options import set_options

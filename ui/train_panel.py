@@ -11,9 +11,10 @@ from ..operators.common import is_head, package, scene_settings
 from ..operators.train import TrainOptions
 from ..operators.training_python import has_training_python
 from ..stga_addon.format import describe_figures, format_duration
-from ..stga_addon.requests.monitor_state import Kind, RequestState
+from ..stga_addon.jobs.monitor_state import RequestState
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
-from ..stga_addon.training.run.tracking_file import TRACKING
+from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.status import WorkerState
 from .curve import draw_curve
 from .options import set_options

@@ -16,16 +16,15 @@ from filelock import SoftFileLease
 
 from ..errors import StgaError
 from ..files import read_json, write_json
-from ..requests.folder import has_request, write_request
-from ..requests.values import Request
+from ..jobs.folder import has_request, write_request
+from ..jobs.table import Request
 from ..schema import from_json, setting, to_json
 from ..training.run.folder import AVATAR, RUN, has_run
 from ..training.run.identity import file_digest
 from ..worker.launch import prepare_status_folder
 from ..worker.lock import hold_lock, is_locked, lock_owner
 from ..worker.status import LOCK_FILE, WorkerState, read_status
-from .job import Job, input_paths, output_field
-from .plan import REPLACED, Plan
+from .plan import REPLACED, Job, Plan, input_paths, output_field
 
 
 def job_digests(plan: Plan) -> dict[str, str]:

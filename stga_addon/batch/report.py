@@ -19,7 +19,6 @@ from ..training.evaluate.forecast import curve_of, saved_line
 from ..training.run.folder import has_run, read_run
 from ..training.run.metrics_log import read_metrics
 from ..worker.status import log_lines
-from .job import Job
 from .run import Batch, Entry, JobState
 
 MAX_LIVE_ROWS = 20
@@ -124,19 +123,14 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
 
 
 def _plan_row(entry: Entry) -> Sequence[str]:
-    job = entry.job
+    job, needs = entry.job, entry.job.resources
     state = "finished before" if entry.state.is_done else ""
     forecast = format_duration(entry.forecast_s) if entry.forecast_s and not state else ""
-    threads = job.resources.threads
-    needs = (
-        f"{threads} thread{'' if threads == 1 else 's'}, {job.resources.memory_gb:g} GB" + ", GPU" * job.resources.gpu
-    )
-    return job.name, type(job.request).__name__, needs, forecast or state or "?", _after(job)
-
-
-def _after(job: Job) -> str:
+    plural = "" if needs.threads == 1 else "s"
+    machine = f"{needs.threads} thread{plural}, {needs.memory_gb:g} GB" + ", GPU" * needs.gpu
     more = f" and {len(job.after) - 1} more" if len(job.after) > 1 else ""
-    return f"after {job.after[0]}{more}" if job.after else ""
+    after = f"after {job.after[0]}{more}" if job.after else ""
+    return job.name, type(job.request).__name__, machine, forecast or state or "?", after
 
 
 REPORT = "report.html"
@@ -218,19 +212,14 @@ def _forecast_error(entry: Entry) -> float | None:
 
 
 def _failures(batch: Batch) -> str:
-    failed = batch.failures
-    if not failed:
-        return ""
-    items = [_failure(entry) for entry in failed[:MAX_FAILURES]]
-    more = f"<p>… and {len(failed) - MAX_FAILURES} more</p>" if len(failed) > MAX_FAILURES else ""
-    return f"<h2>Failures</h2>{''.join(items)}{more}"
-
-
-def _failure(entry: Entry) -> str:
-    name, error = html.escape(entry.job.name), html.escape(entry.error)
-    log = log_lines(entry.job.request_folder, LOG_LINES) if entry.state == JobState.FAILED else []
-    text = f"<pre>{html.escape(chr(10).join(log))}</pre>" if log else ""
-    return f'<p><b>{name}</b>: <span class="failed">{error or entry.state}</span></p>{text}'
+    failed, parts = batch.failures, []
+    for entry in failed[:MAX_FAILURES]:
+        name, error = html.escape(entry.job.name), html.escape(entry.error or entry.state)
+        parts.append(f'<p><b>{name}</b>: <span class="failed">{error}</span></p>')
+        log = log_lines(entry.job.request_folder, LOG_LINES) if entry.state == JobState.FAILED else []
+        parts += [f"<pre>{html.escape(chr(10).join(log))}</pre>"] if log else []
+    parts += [f"<p>… and {len(failed) - MAX_FAILURES} more</p>"] if len(failed) > MAX_FAILURES else []
+    return f"<h2>Failures</h2>{''.join(parts)}" if failed else ""
 
 
 def _chart(runs: Sequence[Run]) -> str:
@@ -238,7 +227,7 @@ def _chart(runs: Sequence[Run]) -> str:
     shown = [run for run in _spread(runs, MAX_CURVES) if curve_of(run[1])]
     if not shown or find_spec("matplotlib") is None:
         return ""
-    from ..report.charts import finish_axes, psnr_axes
+    from ..report import finish_axes, psnr_axes
 
     figure, axes = psnr_axes("PSNR on held-out views")
     for entry, metrics in reversed(shown):
@@ -252,26 +241,17 @@ def _chart(runs: Sequence[Run]) -> str:
 
 
 def _pictures(runs: Sequence[Run]) -> str:
-    figures = [_picture(entry, _figures((entry, metrics))) for entry, metrics in _spread(runs, MAX_PICTURES)]
-    shown = [figure for figure in figures if figure]
-    if not shown:
-        return ""
-    return f"<h2>Held-out views: image and avatar, from the lowest PSNR</h2>{''.join(shown)}"
-
-
-def _picture(entry: Entry, figures: dict[str, Any]) -> str:
-    """A run's first held-out image beside its avatar; empty where it has none, or cannot be opened here."""
-    try:
-        pair = held_out_pair(entry.job.folder)
-    except (StgaError, ModuleNotFoundError):
-        return ""
-    if pair is None:
-        return ""
-    psnr = f", {figures['psnr']:.2f} dB" if "psnr" in figures else ""
-    data = base64.b64encode(_jpeg(pair)).decode("ascii")
-    name = html.escape(entry.job.name)
-    image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="data:image/jpeg;base64,{data}">'
-    return f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>"
+    """A held-out image of each run beside its avatar, where its capture has one and can be opened here."""
+    shown = []
+    for entry, metrics in _spread(runs, MAX_PICTURES):
+        with suppress(StgaError, ModuleNotFoundError):
+            pair, figures = held_out_pair(entry.job.folder), _figures((entry, metrics))
+            if pair is not None:
+                psnr = f", {figures['psnr']:.2f} dB" if "psnr" in figures else ""
+                data, name = base64.b64encode(_jpeg(pair)).decode("ascii"), html.escape(entry.job.name)
+                image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="data:image/jpeg;base64,{data}">'
+                shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
+    return f"<h2>Held-out views: image and avatar, from the lowest PSNR</h2>{''.join(shown)}" if shown else ""
 
 
 def held_out_pair(run: Path) -> np.ndarray | None:
@@ -283,8 +263,7 @@ def held_out_pair(run: Path) -> np.ndarray | None:
     from ..capture.images import read_image
     from ..render.render import render_avatar
     from ..training.evaluate.evaluation_views import choose_evaluation_views
-    from ..training.run.folder import AVATAR
-    from ..training.run.open_run import open_refined
+    from ..training.run.folder import AVATAR, open_refined
 
     capture = open_refined(run)
     views = choose_evaluation_views(capture)

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from ..files import write_npz
 from ..format import describe_figures
+from ..jobs.analyze import Select
+from ..jobs.results import Result, Selected
+from ..jobs.table import Request
+from ..jobs.train import SelectForTake
 from ..progress import Progress, ignore
-from ..requests.results import Result, Selected
-from ..requests.values import Request, Select, SelectForTake
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -23,7 +25,7 @@ LAYOUT, LAYOUT_WITH_TIME_LEFT = (
 
 def carry_out(request: Request, with_bar: bool = True) -> Result:
     """Carry out the request, with a progress bar if it takes long, and print what it says. Raises as `perform` does."""
-    from ..perform.perform import perform
+    from ..jobs.perform import perform
 
     with ProgressBar() as bar:
         result = perform(request, bar.report if with_bar else ignore, bar.say)

@@ -7,36 +7,16 @@ import sys
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import NoReturn
 
 from .. import __version__
 from ..errors import StgaError, one_line
-from ..requests.open_head import FOLDER, OpenHead, read_head
+from ..jobs.avatar_source import FOLDER, OpenHead, read_head
+from .commands import COMMANDS, Command
 from .streams import safe_streams
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Before NumPy is imported: BLAS divides even matrices of nine rows among threads, and takes longer for it.
-COMMANDS = (
-    ".avatar",
-    ".track",
-    ".train",
-    ".refine",
-    ".extend",
-    ".relight",
-    ".perform",
-    ".batch",
-    ".render",
-    ".eval",
-    ".select",
-    ".export",
-    ".drive",
-    ".info",
-    ".presets",
-    "..development.benchmark.command",
-    "..development.demo.command",
-)
-"""A module per command: NAME, HELP, add_arguments(parser, head) and run(options)."""
+DEVELOPMENT = {"benchmark": "..development.benchmark.command", "demo": "..development.demo.command"}
+"""Commands of `development`, which the extension's zip leaves out: each COMMAND of a module."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -66,9 +46,9 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
         folder = os.environ.get(FOLDER)
         if head is None and folder:
             head = read_head(Path(folder))
-        options = _with_head(make_parser(head).parse_args(arguments), head)
+        options = make_parser(head).parse_args(arguments)
         command = options.command
-        options.run(options)
+        all_commands()[command].carry_out(options, head)
     except StgaError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -104,25 +84,14 @@ def make_parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
     top = _Parser(prog="stga", description="Selective-training Gaussian head avatars.")
     top.add_argument("--version", action="version", version=__version__)
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in command_modules():
-        command = commands.add_parser(module.NAME, help=module.HELP, description=module.__doc__)
-        module.add_arguments(command, head)
-        command.set_defaults(run=module.run)
+    for name, command in all_commands().items():
+        about = " ".join(command.about.split()).replace("%", "%%")
+        first = about.partition(". ")[0].rstrip(".")
+        command.add_arguments(commands.add_parser(name, help=first[0].lower() + first[1:], description=about), head)
     return top
 
 
-def command_modules() -> list[ModuleType]:
-    """The commands of this installation; the extension's zip leaves those of `development` out."""
-    development = find_spec("..development", __package__) is not None
-    return [import_module(name, __package__) for name in COMMANDS if development or not name.startswith("..")]
-
-
-def _with_head(options: argparse.Namespace, head: OpenHead | None) -> argparse.Namespace:
-    """`options.head`: the open file's head where no capture is named; its capture and model are then used."""
-    options.head = head if head is not None and getattr(options, "capture", "none such") is None else None
-    if options.head is not None:
-        options.capture = options.head.capture
-        options.flame = options.flame or options.head.flame
-        if "principal_point" in options:
-            options.principal_point = options.principal_point or options.head.principal_point
-    return options
+def all_commands() -> dict[str, Command]:
+    """The commands of this installation."""
+    found = DEVELOPMENT if find_spec("..development", __package__) is not None else {}
+    return {**COMMANDS, **{name: import_module(module, __package__).COMMAND for name, module in found.items()}}

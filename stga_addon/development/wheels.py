@@ -19,7 +19,7 @@ from packaging.tags import Tag, cpython_tags
 from packaging.utils import canonicalize_name, parse_wheel_filename
 
 from ..errors import StgaError
-from ..worker.requirements import GPU_REQUIREMENT, REQUIREMENTS
+from ..worker.training_python import GPU_REQUIREMENT, REQUIREMENTS
 
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 """PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which PyPI has for Linux,

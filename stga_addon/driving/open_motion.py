@@ -13,7 +13,7 @@ from ..flame.forward import FlameFrame
 from ..flame.model import FlameModel
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..flame.teeth import flame_model
-from ..schema import setting
+from ..options import option
 from .head_map import HeadMap, head_map, person_of
 from .names import ARKIT_SHAPES, PARTS
 from .performance import (
@@ -41,30 +41,6 @@ from .transfer import (
 MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
 
 
-@dataclass(frozen=True)
-class MotionOptions:
-    """What is done to a motion on its way to a head.
-
-    strength   of expression, jaw, eyes and neck about the neutral face; of the head's motion about its first pose
-    neutral    "none"; "quiet" or "first": the motion is taken relative to the performer's quiet face, or first frame,
-               and put on the head's own; "calibrated": it is relative already, and is put on the head's own
-    smoothing  seconds, standard deviation; of performances alone, like the next two
-    mirror     exchange left and right
-    gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
-    exchange   pairs of shapes of a performance whose left and right were exchanged by the sender (`EXCHANGEABLE`)
-    stay_trained  0 to 1: how far parameters are led back to the range that the avatar was trained on; None: that range
-                  is not asked for
-    """
-
-    strength: float = setting(1.0, 0, MAX_FACTOR)
-    neutral: str = setting("none", choices=NEUTRALS)
-    smoothing: float = setting(0.0, 0, MAX_SMOOTHING_S)
-    mirror: bool = False
-    gains: Mapping[str, float] = field(default_factory=dict)
-    stay_trained: float | None = setting(None, 0, 1)
-    exchange: tuple[str, ...] = setting((), choices=EXCHANGEABLE)
-
-
 def parsed_gain(text: str) -> tuple[str, float]:
     """Name and factor of `jawOpen=0.8`, a key and value of `MotionOptions.gains`. Raises StgaError for other text."""
     name, _, number = text.partition("=")
@@ -77,6 +53,45 @@ def parsed_gain(text: str) -> tuple[str, float]:
     if not 0 <= value <= MAX_FACTOR:
         raise StgaError(f"'{number}' is not a number from 0 to {MAX_FACTOR:g}")
     return name, value
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """What is done to a motion on its way to a head; smoothing, mirror, gains and exchange to performances alone.
+
+    strength   of expression, jaw, eyes and neck about the neutral face; of the head's motion about its first pose
+    neutral    whose resting face the motion is put on the head's own from (`NEUTRALS`)
+    smoothing  standard deviation in seconds
+    gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
+    stay_trained  0 to 1; None: how far the motion is outside that range is not asked for
+    """
+
+    strength: float = option(
+        "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first pose",
+        1.0, 0, MAX_FACTOR,
+    )  # fmt: skip
+    neutral: str = option(
+        "what the motion is taken relative to, so that this head's own face is moved, not the performer's",
+        "none", choices=NEUTRALS,
+    )  # fmt: skip
+    smoothing: float = option(
+        "smooth a face performance in time, by this standard deviation",
+        0.0, 0, MAX_SMOOTHING_S, flag="--smooth", metavar="SECONDS",
+    )  # fmt: skip
+    mirror: bool = option("exchange left and right of a face performance", False)
+    gains: Mapping[str, float] = option(
+        "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may be repeated",
+        default_factory=dict, flag="--gain", metavar="NAME=FACTOR", parse=parsed_gain,
+    )  # fmt: skip
+    stay_trained: float | None = option(
+        "lead the motion softly back to the range that the run was trained on, and print how far it was outside; "
+        "0: print only, 1 (default): fully",
+        None, 0, 1, metavar="SHARE", bare=1.0,
+    )  # fmt: skip
+    exchange: tuple[str, ...] = option(
+        "exchange left and right of one pair alone, which some senders exchange; may be repeated",
+        (), choices=EXCHANGEABLE,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

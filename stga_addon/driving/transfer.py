@@ -14,7 +14,12 @@ PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
 QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000
 """Share of the frames that count as quiet: those most alike, or of least weight; and how many are compared."""
-NEUTRALS = ("none", "quiet", "first", "calibrated")
+NEUTRALS = {
+    "none": "as recorded",
+    "quiet": "both recordings are at rest in the fifth of their frames that are most alike",
+    "first": "both recordings begin at rest",
+    "calibrated": "the motion is relative to the performer's resting face already",
+}
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
 OUTER_QUANTILE = 0.01

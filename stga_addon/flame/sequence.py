@@ -21,7 +21,10 @@ from .model import JOINTS, FlameModel
 from .quaternions import from_axis_angle, slerp, to_axis_angle
 from .teeth import TEETH_VERTICES
 
-ZERO_POSES = ("head", "all")
+ZERO_POSES = {
+    "head": "head rotation, translation and neck; jaw and eyes count as expression",
+    "all": "head motion, jaw and eyes",
+}
 FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
 COEFFICIENT_FIELDS = ("expr", "shape")
 REQUIRED_FIELDS = ("expr", "rotation", "translation")

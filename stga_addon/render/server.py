@@ -3,7 +3,7 @@
 import sys
 from typing import BinaryIO
 
-from ..worker.stdout import claim_stdout
+from ..worker.helpers import claim_stdout
 
 
 def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:

@@ -1,6 +1,5 @@
 """Effect plan of a run: what was decided about each effect, and why (`effects.rules` decides)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..errors import StgaError
@@ -37,14 +36,9 @@ class EffectDecision:
         return f"{'on' if self.on else 'off'}{asked}: {self.reason}" + (f" [{self.cost}]" if self.on else "")
 
 
-def parse_choices(texts: Sequence[str]) -> dict[str, str]:
-    """Effect -> choice, from texts such as "jaw=off". Raises StgaError for anything else."""
-    choices = {}
-    for text in texts:
-        name, _, choice = text.partition("=")
-        if name not in EFFECTS or choice not in CHOICES:
-            raise StgaError(
-                f"--effect: '{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}"
-            )
-        choices[name] = choice
-    return choices
+def parse_choice(text: str) -> tuple[str, str]:
+    """Effect and choice, from a text such as "jaw=off". Raises StgaError for anything else."""
+    name, _, choice = text.partition("=")
+    if name not in EFFECTS or choice not in CHOICES:
+        raise StgaError(f"'{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}")
+    return name, choice

@@ -9,13 +9,18 @@ from ..avatar.embedding import CONVENTIONS
 from ..avatar.offsets import OFFSETS
 from ..avatar.splats import ADDED, MAX_SH_DEGREE
 from ..errors import StgaError
+from ..options import duration, option
 from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
 from .backdrop import BACKDROPS
 from .effect_catalog import EFFECTS
-from .effect_decisions import CHOICES
+from .effect_decisions import CHOICES, parse_choice
 
-STRATEGIES = ("selective", "global", "gaussian-avatars")
+STRATEGIES = {
+    "global": "every iteration trains all splats; most accurate on the captures measured so far",
+    "selective": "local iterations train the triangles selected in each frame; global ones, all",
+    "gaussian-avatars": "the binding, losses and learning rates of GaussianAvatars",
+}
 CONTINUATIONS = ("refine", "extend")
 """Strategies of runs that continue a finished one (`run.continuation`)."""
 SCHEDULES = ("default", "paper")
@@ -48,6 +53,31 @@ class Rates:
 
 MAX_FINE_TRIANGLES = 16_000
 """Of FLAME's size and less; on meshes of 20,000 and more triangles, 3 splats a triangle give the same images as 6."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A level of quality: its purpose, the settings that differ from the defaults, and how long to train.
+
+    iterations, passes  train so many iterations, but at least so many passes over all training views
+    """
+
+    purpose: str
+    iterations: int
+    passes: float
+    changes: dict[str, Any]
+
+    def iterations_for(self, views: int) -> int:
+        """Iterations for a capture of so many training views."""
+        return max(self.iterations, math.ceil(self.passes * views))
+
+
+PRESETS = {
+    "draft": Preset("a first look", 800, 0.5, {"lattice": 1}),
+    "standard": Preset("everyday work", 3000, 2.0, {}),
+    "final": Preset("the best quality of the three", 9000, 6.0, {"growth": 0.6}),
+}
+"""Fewer splats are ahead in the first seconds, more of them in the end."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +139,19 @@ class TrainingSettings:
                    (`effects.plan`). None: these settings are final
     """
 
-    strategy: str = setting("global", choices=(*STRATEGIES, *CONTINUATIONS))
-    schedule: str = setting("default", choices=SCHEDULES)
-    seconds: float | None = setting(None, above=0)
-    iterations: int | None = setting(None, 1, MAX_COUNT)
-    seed: int = setting(0, 0, (1 << 63) - 1)
+    strategy: str = option(
+        "which splats an iteration trains (default global; selective with --schedule paper)",
+        "global", choices=(*STRATEGIES, *CONTINUATIONS), offered=STRATEGIES,
+    )  # fmt: skip
+    schedule: str = option(
+        "paper: the settings of the STGA paper (default: what measured best)", "default", choices=SCHEDULES
+    )
+    seconds: float | None = option(
+        "training time such as 90s, 10m (default 2m)", None, above=0,
+        flag="--budget", metavar="TIME", parse=duration, group="budget",
+    )  # fmt: skip
+    iterations: int | None = option("number of iterations instead of a time", None, 1, MAX_COUNT, group="budget")
+    seed: int = option("fixes every random choice", 0, 0, (1 << 63) - 1)
     lattice: int | None = setting(None, 0, 16)
     convention: str = setting("stga", choices=CONVENTIONS)
     views_per_visit: int = setting(1, 0, MAX_COUNT)
@@ -145,9 +183,14 @@ class TrainingSettings:
     backdrop: str = setting("plain", choices=BACKDROPS)
     scale: float = setting(1.0, 0.05, 1)
     coarse_share: float = setting(0.0, 0, 1)
-    target_psnr: float | None = setting(None, maximum=200, above=0)
-    stop_when_flat: bool = False
-    preset: str | None = None
+    target_psnr: float | None = option(
+        "stop when the held-out views reach it", None, maximum=200, above=0, metavar="DB"
+    )
+    stop_when_flat: bool = option("stop when more time no longer helps", False)
+    preset: str | None = option(
+        "quality, and with it training time; `stga presets` shows the times", None,
+        choices={name: preset.purpose for name, preset in PRESETS.items()},
+    )  # fmt: skip
     strain_color: bool = False
     driven_offsets: tuple[str, ...] = ()
     antialiased: bool = False
@@ -155,7 +198,10 @@ class TrainingSettings:
     torso: bool = False
     exposure: tuple[tuple[float, ...], ...] = ()
     tracking: bool = False
-    effects: Mapping[str, str] | None = None
+    effects: Mapping[str, str] | None = option(
+        "switch an effect on or off instead of deciding from the capture (docs/effects.md); may be repeated",
+        None, flag="--effect", metavar="NAME=on|off", parse=parse_choice,
+    )  # fmt: skip
 
     @property
     def added(self) -> tuple[str, ...]:
@@ -175,8 +221,6 @@ class TrainingSettings:
 
     def check(self) -> None:
         """Raise StgaError for settings at odds with each other, and for rows and names that types do not tell."""
-        if self.preset not in (None, *PRESETS):
-            raise StgaError(complaint("preset", f"one of {', '.join(PRESETS)}", self.preset))
         given = (self.seconds is not None) + (self.iterations is not None)
         if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")
@@ -229,31 +273,6 @@ GAUSSIAN_AVATARS_SETTINGS = {
     "growth": 8.0,
 }
 """GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and released settings)."""
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A level of quality: its purpose, the settings that differ from the defaults, and how long to train.
-
-    iterations, passes  train so many iterations, but at least so many passes over all training views
-    """
-
-    purpose: str
-    iterations: int
-    passes: float
-    changes: dict[str, Any]
-
-    def iterations_for(self, views: int) -> int:
-        """Iterations for a capture of so many training views."""
-        return max(self.iterations, math.ceil(self.passes * views))
-
-
-PRESETS = {
-    "draft": Preset("a first look", 800, 0.5, {"lattice": 1}),
-    "standard": Preset("everyday work", 3000, 2.0, {}),
-    "final": Preset("the best quality of the three", 9000, 6.0, {"growth": 0.6}),
-}
-"""Fewer splats are ahead in the first seconds, more of them in the end."""
 
 
 def with_budget(settings: TrainingSettings, views: int) -> TrainingSettings:

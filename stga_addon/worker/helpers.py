@@ -17,15 +17,14 @@ from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from traceback import format_exc
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from .launch import end_with_this_process, start_python
-from .own_python import own_python
-from .stdout import claim_stdout
+from .training_python import own_python
 
 MAX_HELPERS = 8
 """Each takes some 300 MB."""
@@ -213,6 +212,22 @@ class _Unpickler(pickle.Unpickler):
 def _send(stream: IO[bytes], message: Any) -> None:
     pickle.dump(message, stream, pickle.HIGHEST_PROTOCOL)
     stream.flush()
+
+
+def claim_stdout() -> BinaryIO:
+    """Return a stream on standard output, and send whatever else is written there to standard error.
+
+    Call it before anything that may print is imported: libraries in C write to descriptor 1, whatever `sys.stdout` is.
+    """
+    sys.stdout.flush()
+    try:
+        os.fstat(2)
+    except OSError:  # standard error is closed
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    messages = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    return messages
 
 
 def help_until_closed() -> None:

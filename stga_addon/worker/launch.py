@@ -10,10 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
-from .cache import BYTECODE, CACHE_VARIABLE, CHARTS
-from .own_python import own_python
+from .lock import is_locked
 from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, remove_status_folder
+from .training_python import own_python
 
+CACHE_VARIABLE = "STGA_CACHE"
+"""Environment variable that names the folder. Blender's extension sets it to one that uninstalling removes."""
+KERNELS, BUNDLED, BYTECODE, CHARTS = "kernels", "bundled kernels", "bytecode", "matplotlib"
+"""Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with its own
+(`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
+PREPARING = "preparing.lock"
+"""Held in it by the process that compiles ahead of a training (`jobs.preparation`)."""
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS, BACKGROUND_NICENESS = 5, 15
@@ -26,6 +33,21 @@ PR_SET_PDEATHSIG = 1
 _DETACHED: dict[str, Any] = (
     {"creationflags": 0x00000200 | 0x08000000 | 0x00004000} if os.name == "nt" else {"start_new_session": True}
 )
+
+
+def cache_folder() -> Path:
+    """The folder that CACHE_VARIABLE names, else the user's cache folder."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named:
+        return Path(named)
+    from platformdirs import user_cache_path  # a Python without it, such as Blender's, has the variable
+
+    return user_cache_path("stga", appauthor=False)
+
+
+def is_preparing() -> bool:
+    """Whether a process compiles ahead of a training."""
+    return is_locked(cache_folder() / PREPARING)
 
 
 def prepare_status_folder(folder: Path) -> None:

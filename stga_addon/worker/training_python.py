@@ -1,17 +1,53 @@
-"""The Python that tracks and trains beside Blender: Blender's own where it has the packages, or one that was chosen."""
+"""The Python that tracks and trains: Blender's own where it has the packages, or one that was chosen."""
 
 import os
 import sys
+from functools import cache
 from importlib.util import find_spec
+from pathlib import Path
 
 from ..errors import StgaError
-from .own_python import own_python
-from .requirements import REQUIREMENTS, package_name
 
+REQUIREMENTS = {
+    "numpy": "numpy>=1.26,<3",
+    "torch": "torch>=2.4,<3",
+    "numba": "numba>=0.60,<1",
+    "scipy": "scipy>=1.11,<2",
+    "PIL": "pillow>=10,<14",
+    "platformdirs": "platformdirs>=4,<5",
+    "trimesh": "trimesh>=4,<6",
+    "tqdm": "tqdm>=4.60,<5",
+    "filelock": "filelock>=4,<5",
+    "matplotlib": "matplotlib>=3.8,<4",
+    "av": "av>=14,<19",
+    "cv2": "opencv-python-headless>=4.12,<5",
+}
+"""Packages that tracking and training need: imported module -> requirement, which `pyproject.toml` repeats."""
+GPU_REQUIREMENT = "wgpu>=0.32,<1"
+"""Trains on a GPU; without it, or where it has no driver, the CPU trains."""
 PYTHON_VARIABLE = "STGA_PYTHON"
 """Environment variable that names the interpreter that tracks and trains, above every other choice: for farms."""
 BLENDER_VARIABLE = "STGA_BLENDER"
 """Environment variable with the command that starts Blender on a machine that renders .blend files."""
+
+
+def package_name(requirement: str) -> str:
+    return requirement.partition(">=")[0]
+
+
+@cache
+def own_python() -> str:
+    """Path of the interpreter whose library this process runs; workers of this Python are started with it.
+
+    Embedded in Blender, `sys.executable` is what Python finds by its name: beside Blender's library in official builds,
+    but a stranger's where Blender uses the system's library and another program of that name comes first on PATH.
+    """
+    prefix = Path(sys.prefix)
+    if Path(sys.executable).is_relative_to(prefix):
+        return sys.executable
+    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    names = ("bin/python.exe", "python.exe") if os.name == "nt" else (f"bin/python{version}", "bin/python3")
+    return next((str(path) for path in (prefix / name for name in names) if path.is_file()), sys.executable)
 
 
 def find_training_python(preferred: str = "") -> str:

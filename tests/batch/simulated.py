@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from stga_addon.batch.folder import hold_folder
-from stga_addon.batch.job import Ended, Engine, Job
-from stga_addon.batch.plan import Plan, make_plan
+from stga_addon.batch.plan import Ended, Engine, Job, Plan, make_plan
 from stga_addon.batch.run import Batch, run_batch
-from stga_addon.perform.perform import perform_in_folder
+from stga_addon.jobs.perform import perform_in_folder
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 
 Outcome = Callable[[Job], tuple[WorkerState | None, str]]

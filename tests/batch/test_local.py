@@ -13,8 +13,7 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.batch.engines.local import LocalEngine
-from stga_addon.batch.job import Job
-from stga_addon.batch.plan import read_plan
+from stga_addon.batch.plan import Job, read_plan
 from stga_addon.batch.run import Batch, JobState
 from stga_addon.cli.main import main
 from stga_addon.training.run.folder import CHECKPOINT, read_run
@@ -98,7 +97,7 @@ def test_captures_of_the_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches options that are forgotten where captures are given, or silently ignored where a plan is."""
-    monkeypatch.setattr("stga_addon.batch.engines.table.make_engine", lambda *_: InProcessEngine())
+    monkeypatch.setattr("stga_addon.batch.engines.make_engine", lambda *_: InProcessEngine())
     tiny_plan(tmp_path)
     capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
     options = ["--iterations", "2", "--device", "cpu", "--threads", "1", "--principal-point", "opencv", "--seed", "5"]

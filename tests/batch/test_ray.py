@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from capture.factory import write_mesh_capture
 
+from stga_addon.batch.engines import make_engine
 from stga_addon.batch.engines import ray as ray_engine
-from stga_addon.batch.engines.table import make_engine
 from stga_addon.errors import StgaError
 
 from .conftest import TrainedHere
@@ -22,7 +22,7 @@ import os, subprocess, sys
 sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tests"]
 from pathlib import Path
 from batch.simulated import carry_out
-from stga_addon.batch.engines.table import make_engine
+from stga_addon.batch.engines import make_engine
 from stga_addon.batch.plan import make_plan
 
 engine = make_engine("ray")
@@ -47,7 +47,7 @@ from pathlib import Path
 from ray.cluster_utils import Cluster
 from batch.simulated import carry_out
 from batch.tiny import tiny_plan
-from stga_addon.batch.engines.table import make_engine
+from stga_addon.batch.engines import make_engine
 from stga_addon.training.run.folder import CHECKPOINT
 from stga_addon.worker.lock import is_locked
 from stga_addon.worker.status import LOCK_FILE

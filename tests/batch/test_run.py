@@ -16,12 +16,12 @@ import pytest
 from stga_addon.batch.engines import local
 from stga_addon.batch.engines.local import LocalEngine
 from stga_addon.batch.folder import LOCK, hold_folder, is_done, prepare, read_record
-from stga_addon.batch.job import Ended, Job, Resources
-from stga_addon.batch.plan import make_plan
+from stga_addon.batch.plan import Ended, Job, Resources, make_plan
 from stga_addon.batch.report import plan_lines, table_lines
 from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.errors import StgaError
-from stga_addon.requests.values import ConvertMotion, RenderBlend
+from stga_addon.jobs.blender import RenderBlend
+from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.worker import lock
 from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, inspect_worker
 

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from stga_addon.batch.engines import slurm
+from stga_addon.batch.engines import make_engine, slurm
 from stga_addon.batch.engines.slurm import SlurmEngine
-from stga_addon.batch.engines.table import make_engine
 from stga_addon.batch.run import JobState
 from stga_addon.errors import StgaError
 from stga_addon.worker.lock import lock_owner

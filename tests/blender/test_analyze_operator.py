@@ -12,7 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from capture.factory import write_mesh_capture  # noqa: E402
 
-from stga_addon.requests.monitor_state import Kind  # noqa: E402
+from stga_addon.jobs.table import Kind  # noqa: E402
 from stga_addon.training.run.folder import read_run  # noqa: E402
 from stga_addon.training.settings import PRESETS  # noqa: E402
 

@@ -22,7 +22,7 @@ from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking  # noqa: E402
-from stga_addon.training.run.tracking_file import with_refined_tracking, write_tracking  # noqa: E402
+from stga_addon.training.run.folder import with_refined_tracking, write_tracking  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6

@@ -35,21 +35,23 @@ def asked(extension, monkeypatch):
 
 def begin(requests):
     """What the worker writes first."""
-    folder = import_module(type(requests[-1]).__module__.replace("values", "avatar_folder"))
-    folder.write_inputs(requests[-1].track)
+    jobs, request = import_module(type(requests[-1]).__module__), requests[-1]
+    request.out.mkdir(parents=True, exist_ok=True)
+    jobs.write_json(request.out / jobs.INPUTS, jobs._inputs(request.track))
 
 
-def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path):
+def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path, monkeypatch):
     """Catches a second way to an avatar, with other settings than `stga avatar VIDEO`."""
     out = tmp_path / "out"
     assert bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(out), minutes=0.05, focal=2308.3) == {
         "FINISHED"
     }
-    main, avatar = (import_module(f"{extension.__name__}.stga_addon.cli.{name}") for name in ("main", "avatar"))
-    options = main.make_parser().parse_args(
-        ["avatar", str(video), "--out", str(out), "--budget", "3s", "--focal", "2308.3"]
-    )
-    assert asked == [avatar.avatar_request(options)]
+    main, commands = (import_module(f"{extension.__name__}.stga_addon.cli.{name}") for name in ("main", "commands"))
+    made: list[object] = []
+    monkeypatch.setattr(commands, "carry_out", made.append)
+    options = ["--out", str(out), "--budget", "3s", "--focal", "2308.3", "--no-blend"]
+    assert main.main(["avatar", str(video), *options]) == 0
+    assert asked == made
 
 
 def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):

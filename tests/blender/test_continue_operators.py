@@ -10,7 +10,8 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import write_mesh_capture  # noqa: E402
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
-from stga_addon.requests.monitor_state import Kind, RequestState  # noqa: E402
+from stga_addon.jobs.monitor_state import RequestState  # noqa: E402
+from stga_addon.jobs.table import Kind  # noqa: E402
 from stga_addon.training.run.folder import read_run  # noqa: E402
 
 from .test_analyze_operator import error_of, tick_until_done, write_interpreter  # noqa: E402
@@ -99,7 +100,7 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
     """Catches a heat map of other triangles than those with the error, and unknown ones that are shown as bad."""
     residual = np.full(len(head.data.polygons), 0.01, np.float32)
     residual[7], residual[9] = 0.2, np.nan
-    extension.stga_addon.training.run.residual_file.write_residuals(run, residual)
+    extension.stga_addon.training.run.folder.write_residuals(run, residual)
     assert bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run)) == {"FINISHED"}
     shown = np.array([item.value for item in head.data.attributes["stga_residual"].data])
     assert shown.argmax() == 7
@@ -116,8 +117,8 @@ def answer(extension, tmp_path, selection) -> str:
     """The body of a stand-in for a worker that selects these triangles."""
     given = tmp_path / "given"
     given.mkdir(exist_ok=True)
-    requests = extension.stga_addon.requests
-    requests.folder.write_result(given, requests.results.Selected(selection))
+    jobs = extension.stga_addon.jobs
+    jobs.folder.write_result(given, jobs.results.Selected(selection))
     return f"shutil.copytree({str(given)!r}, FOLDER, dirs_exist_ok=True)\nend('finished')"
 
 

@@ -24,6 +24,7 @@ from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.export.formats import export_avatar  # noqa: E402
 from stga_addon.export.ply import read_ply, read_vertices, write_ply  # noqa: E402
+from stga_addon.jobs.track import Track  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
@@ -118,6 +119,26 @@ def test_every_operator_explains_itself(extension):
         assert kind.description not in ("", "(undocumented operator)"), name
         for prop in kind.properties:
             assert prop.identifier == "rna_type" or prop.is_hidden or prop.description, (name, prop.identifier)
+
+
+def test_options_are_those_of_the_request(extension):
+    """Catches a limit, default or choice that differs from the command line's, and 0 that is not taken for "not given",
+    or is called a value."""
+    shown = bpy.ops.stga.track_footage.get_rna_type().properties
+    for name in ("focal", "start", "stop", "step"):
+        field = Track.__dataclass_fields__[name]
+        least = 0 if field.default is None else field.metadata["minimum"]
+        assert (shown[name].hard_min, shown[name].default) == (least, field.default or 0), name
+        assert "default" not in shown[name].description
+    assert shown["stop"].description == "Timestep to stop before; 0: all"
+    assert {item.identifier for item in bpy.ops.stga.train.get_rna_type().properties["strategy"].enum_items} == {
+        "global", "selective", "gaussian-avatars",
+    }  # fmt: skip
+    given = SimpleNamespace(focal=0.0, start=0, stop=0, step=2, model="", cameras="/a.json", mattes="none")
+    names = ("focal", "start", "stop", "step", "model", "cameras")
+    assert extension.operators.options.given_values(given, Track, *names) == {
+        "start": 0, "step": 2, "cameras": Path("/a.json"),
+    }  # fmt: skip
 
 
 SET_BY_PANEL = {

@@ -12,7 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from capture.factory import write_mesh_capture  # noqa: E402
 
-from stga_addon.requests.monitor_state import Kind  # noqa: E402
+from stga_addon.jobs.table import Kind  # noqa: E402
 
 from .test_curve import lines  # noqa: E402
 from .test_operators import write_ball_avatar  # noqa: E402
@@ -65,10 +65,10 @@ def trained(extension, tmp_path, monkeypatch):
     """A scene whose run has finished, with curve and refined tracking, as the timer has read it."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     bpy.ops.stga.select(threshold=0.0005)
-    run, requests, monitor = tmp_path / "run", extension.stga_addon.requests, extension.operators.monitor
-    folder = requests.folder.request_folder(run)
+    run, jobs, monitor = tmp_path / "run", extension.stga_addon.jobs, extension.operators.monitor
+    folder = jobs.folder.request_folder(run)
     settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-    requests.folder.write_request(folder, requests.values.Train(run, tmp_path / "capture", settings))
+    jobs.folder.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
     with extension.stga_addon.worker.status.status_writer(folder) as writer:
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer.update(0.5, "Training")

@@ -22,9 +22,9 @@ from stga_addon.development.editions import complete
 from stga_addon.development.package import ROOT, build_zip, target_of, wheel_folder
 from stga_addon.development.wheels import collect_wheels
 from stga_addon.errors import StgaError
-from stga_addon.perform.perform import perform
+from stga_addon.jobs.perform import perform
+from stga_addon.jobs.train import Train
 from stga_addon.progress import ignore
-from stga_addon.requests.values import Train
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
 from stga_addon.worker.status import WorkerState, inspect_worker

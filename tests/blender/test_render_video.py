@@ -20,7 +20,7 @@ from capture.factory import write_mesh_capture  # noqa: E402
 from stga_addon.avatar.file import write_avatar  # noqa: E402
 from stga_addon.avatar.splats import Splats  # noqa: E402
 from stga_addon.export.ply import write_ply  # noqa: E402
-from stga_addon.requests.monitor_state import Kind  # noqa: E402
+from stga_addon.jobs.table import Kind  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
 

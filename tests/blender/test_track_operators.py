@@ -13,7 +13,7 @@ from mathutils import Quaternion  # noqa: E402
 from tracking.test_head_model import blender_head  # noqa: E402
 
 from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
-from stga_addon.perform.perform import perform_in_folder  # noqa: E402
+from stga_addon.jobs.perform import perform_in_folder  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.tracking.head_model import HeadModel, read_head_model  # noqa: E402
@@ -30,9 +30,9 @@ def track(take, out, **more):
 
 def asked(extension, take, out):
     """Ask for the tracking of the take, without a worker."""
-    requests = extension.stga_addon.requests
-    wanted = requests.values.Track(take / "footage", take / "head.npz", out, landmarks=take / "points")
-    requests.folder.write_request(requests.folder.request_folder(out), wanted)
+    jobs = extension.stga_addon.jobs
+    wanted = jobs.track.Track(take / "footage", take / "head.npz", out, landmarks=take / "points")
+    jobs.folder.write_request(jobs.folder.request_folder(out), wanted)
 
 
 def mesh_at(frame):

@@ -15,7 +15,7 @@ from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E40
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.files import write_json  # noqa: E402
-from stga_addon.requests.monitor_state import Kind  # noqa: E402
+from stga_addon.jobs.table import Kind  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
@@ -34,12 +34,12 @@ def worker(extension, head, tmp_path):
     """A stand-in for a worker of the scene's training: the test says what it does."""
     from contextlib import ExitStack
 
-    requests, monitor = extension.stga_addon.requests, extension.operators.monitor
+    jobs, monitor = extension.stga_addon.jobs, extension.operators.monitor
     with ExitStack() as stack:
         run = tmp_path / "run"
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-        folder = requests.folder.request_folder(run)
-        requests.folder.write_request(folder, requests.values.Train(run, tmp_path / "capture", settings))
+        folder = jobs.folder.request_folder(run)
+        jobs.folder.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
         writer.update(0.25, "Training")

@@ -1,10 +1,9 @@
 """Types of option values: times, colors, numbers."""
 
-import argparse
-
 import pytest
 
-from stga_addon.cli.arguments import color, duration
+from stga_addon.errors import StgaError
+from stga_addon.options import color, duration
 
 
 @pytest.mark.parametrize(
@@ -19,7 +18,7 @@ def test_durations(text: str, seconds: float) -> None:
 @pytest.mark.parametrize("text", ["", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s10m", "1,5m", "٣"])
 def test_durations_that_are_none(text: str) -> None:
     """Catches a budget that means something else than what was typed."""
-    with pytest.raises(argparse.ArgumentTypeError, match="is not a time such as"):
+    with pytest.raises(StgaError, match="is not a time such as"):
         duration(text)
 
 
@@ -36,5 +35,5 @@ def test_colors() -> None:
 )
 def test_colors_that_are_none(text: str) -> None:
     """Catches 0…255 taken for 0…1, and values that would wrap around in the image."""
-    with pytest.raises(argparse.ArgumentTypeError, match="is not white, black or R,G,B"):
+    with pytest.raises(StgaError, match="is not white, black or R,G,B"):
         color(text)

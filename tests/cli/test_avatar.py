@@ -7,7 +7,7 @@ from io import StringIO
 import pytest
 
 from stga_addon.capture.open import open_capture
-from stga_addon.cli import avatar
+from stga_addon.cli import commands
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
@@ -118,13 +118,14 @@ def test_a_folder_of_something_else_is_left_alone(take, tmp_path, capsys):
 
 def test_a_python_without_blender_says_so(take, tmp_path, monkeypatch, capsys):
     """Catches a command that fails at its very end, where the training Python has no bpy."""
-    monkeypatch.setattr(avatar, "find_spec", lambda name: None)
-    assert avatar._write_blend(tmp_path) is None
+    monkeypatch.setattr(commands, "find_spec", lambda name: None)
+    monkeypatch.setattr(commands, "carry_out", lambda request: None)
+    assert make(take, tmp_path / "out") == 0
     assert "this Python has no bpy" in capsys.readouterr().out
 
 
 def test_a_blend_file_needs_an_avatar(tmp_path):
     """Catches a traceback for a folder that `stga avatar` did not finish."""
     with pytest.raises(StgaError, match=r"inputs\.json"):
-        avatar.write_blend(tmp_path, lambda capture: capture)
+        commands.write_blend(tmp_path, lambda capture: capture)
     assert not list(tmp_path.iterdir())

@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from time import process_time
 from types import SimpleNamespace
@@ -19,11 +20,11 @@ from stga_addon import __version__
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
-from stga_addon.cli import info
+from stga_addon.cli import commands
 from stga_addon.cli.main import main, make_parser
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
-from stga_addon.perform.render import unique_names
+from stga_addon.jobs.render import unique_names
 from stga_addon.selection import SelectionOptions
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
@@ -299,6 +300,7 @@ NONSENSE_OPTIONS = [
     *(("train", "--target-psnr", value) for value in ("nan", "inf", "-1")),
     *(("train", "--out", value) for value in ("", "a" * 300, "no/" + "a" * 300, "a\0b", "\ud800")),
     ("train", "--budget=5m --iterations", "5"),
+    *(("refine", "--growth", value) for value in ("1e9", "101", "-1")),
     *(("select", "--threshold", value) for value in ("nan", "-1", "inf")),
 ]
 
@@ -377,10 +379,10 @@ def test_interruption_and_mistakes_have_their_codes(
     """Catches a traceback after Ctrl-C, and an unexpected exception reported as the user's mistake."""
 
     def fails_with(error: BaseException) -> None:
-        def run(options: argparse.Namespace) -> None:
+        def run(options: argparse.Namespace, head: object) -> None:
             raise error
 
-        monkeypatch.setattr(info, "run", run)
+        monkeypatch.setitem(commands.COMMANDS, "info", replace(commands.COMMANDS["info"], run=run))
 
     fails_with(KeyboardInterrupt())
     assert main(["info", str(root)]) == 130

@@ -9,6 +9,9 @@ import pytest
 import trimesh
 from capture import factory
 
+from stga_addon.cli.main import main
+from stga_addon.training.run.folder import read_run
+
 from .conftest import TIMESTEPS, refused
 
 REFUSALS = [
@@ -21,10 +24,20 @@ REFUSALS = [
      "--motion-only cannot be combined with --format ply, only with web"),
     ("export {run} --format usd --out {o}.usda", "o.usda: expected a name that ends in .usdc or .usdz"),
     ("refine {run}", "--region: is missing"),
-    ("refine {none} --region mouth --growth 1e9",
-     "stga: setting growth: expected a finite number from 0 up to 100, got 1000000000.0"),
     ("extend {run}", "CAPTURE: is missing"),
-    ("extend {none} {root} --growth 101", "growth: expected a finite number from 0 up to 100"),
+    # Options that another replaces, or that have no effect without another
+    *((f"train {{root}} --out {{o}} --iterations 1 {options}", says) for options, says in (
+        ("--schedule paper --strategy gaussian-avatars", "--schedule paper: cannot be combined with --strategy "
+         "gaussian-avatars, which has settings of its own"),
+        ("--schedule paper --preset draft", "--preset: cannot be combined with --schedule paper"),
+        ("--preset final --strategy gaussian-avatars", "--preset: cannot be combined with --strategy gaussian-avatars"),
+        ("--threshold 0.01", "--threshold: has no effect without --strategy selective, or --schedule paper"),
+        ("--threshold 0.01 --strategy global --schedule paper", "--threshold: has no effect without"))),
+    ("avatar {root} --model m.npz --out {o} --threshold 0.01", "--threshold: has no effect without --strategy"),
+    ("render {avatar} --video v.mp4 --capture {root} --principal-point opencv",
+     "--principal-point: has no effect without --cameras"),
+    ("export {avatar} --format ply --out {o}.ply --motion take.csv",
+     "--motion: has no effect with --format ply without --timestep"),
     # A resumed run goes on as it began
     *((f"train {{root}} --out {{run}} --resume {option}", f"{option.split()[0]}: this run began with")
       for option in ("--stop-when-flat", "--target-psnr 30", "--preset final", "--seed 5")),
@@ -115,3 +128,14 @@ def test_refusals(refusable: dict[str, Path], capsys: pytest.CaptureFixture[str]
     assert {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()} == before
     assert not refusable["o"].exists()
     assert not refusable["none"].exists()
+
+
+def test_a_threshold_is_given_again_when_a_run_is_resumed(root: Path, tmp_path: Path) -> None:
+    """Catches `train --resume` that refuses the threshold that the run began with."""
+    run = ["train", str(root), "--out", str(tmp_path / "run"), "--device", "cpu"]
+    chosen = ["--threshold", "0.01", "--schedule", "paper", "--iterations", "1"]
+    assert main([*run, *chosen]) == 0
+    assert main([*run, *chosen, "--resume"]) == 0
+    assert main([*run, "--threshold", "0.01", "--resume"]) == 0
+    assert main([*run, "--threshold", "0.02", "--resume"]) == 2
+    assert read_run(tmp_path / "run").settings.selection.threshold == 0.01

@@ -100,17 +100,15 @@ def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path)
 
 # A command that is interrupted while a library makes an object, which then complains when it is collected.
 HALF_MADE = """
-import argparse
+from dataclasses import replace
 from stga_addon.cli import main
 class Half:
     def __init__(self):
         raise KeyboardInterrupt
     def __del__(self):
         self.handle
-parser = argparse.ArgumentParser()
-parser.set_defaults(command="info", run=lambda options: Half())
-main.make_parser = lambda head: parser
-raise SystemExit(main.main([]))
+main.COMMANDS["info"] = replace(main.COMMANDS["info"], run=lambda options, head: Half())
+raise SystemExit(main.main(["info", "capture"]))
 """
 
 

@@ -19,7 +19,7 @@ from stga_addon.development.package import (
 )
 from stga_addon.development.wheels import PINS, TARGETS, Target, check_wheels, needs
 from stga_addon.errors import StgaError
-from stga_addon.worker.requirements import REQUIREMENTS
+from stga_addon.worker.training_python import REQUIREMENTS
 
 LINUX = Target("linux-x64", "3.11", ("4.2.0", "5.1.0"))
 WINDOWS = Target("windows-x64", "3.13", ("5.1.0", ""))

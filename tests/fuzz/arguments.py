@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
-from stga_addon.requests import values as ask
+from stga_addon.jobs import table as ask
 
 REQUESTS = tuple(kind.__name__ for kind in get_args(ask.Request))
 NUMBERS = [

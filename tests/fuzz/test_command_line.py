@@ -29,8 +29,9 @@ from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import Performance
-from stga_addon.requests import values as ask
-from stga_addon.requests.folder import write_request
+from stga_addon.jobs import table as ask
+from stga_addon.jobs.avatar_source import Played
+from stga_addon.jobs.folder import write_request
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.training import preset_timing
 from stga_addon.training.run.folder import read_run
@@ -96,7 +97,7 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
     capture, run, footage, once = case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"}
     settings = read_run(case / "run").settings
     key = np.zeros(synthetic_flame(0).n_expression + 18)
-    avatar, played = case / "run/avatar.npz", ask.Played({4: open_capture(capture).neutral})
+    avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
     tracking = ask.Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points")
     capture_of_avatar = case / "made/capture"
     requests: tuple[ask.Request, ...] = (

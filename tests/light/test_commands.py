@@ -16,9 +16,9 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
+from stga_addon.jobs.finished_run import add_light
 from stga_addon.light.estimate import estimate_light
 from stga_addon.light.relight import Relighter, albedo_avatar
-from stga_addon.perform.relighting import add_light
 from stga_addon.training.run.folder import locked
 
 LIGHTS = """
@@ -106,7 +106,7 @@ def test_a_running_trainings_avatar_is_kept(
             pytest.fail("a training could begin between reading and writing")
         return estimate_light(*given)
 
-    monkeypatch.setattr("stga_addon.perform.relighting.estimate_light", estimate)
+    monkeypatch.setattr("stga_addon.light.estimate.estimate_light", estimate)
     assert main(["relight", str(copy), "--gray-card", "0.5,0.5,0.5"]) == 0
     light = read_avatar(copy / "avatar.npz").light
     assert light is not None

@@ -130,7 +130,7 @@ def test_what_is_a_device() -> None:
 def test_wgpu_is_imported_only_where_it_works() -> None:
     """Catches a run on the CPU that needs wgpu, or waits for a driver."""
     script = (
-        "import sys; from stga_addon.render import device; from stga_addon.training.run import loop; "
+        "import sys; from stga_addon.render import device; from stga_addon.training.run import session; "
         "device.choose_device('cpu'); sys.exit('wgpu' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0

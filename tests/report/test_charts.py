@@ -8,7 +8,7 @@ from PIL import Image
 
 from stga_addon.development.benchmark.benchmark import benchmark_chart
 from stga_addon.development.benchmark.statistics import MeanCurve
-from stga_addon.report.charts import run_chart
+from stga_addon.report import run_chart
 
 
 def evaluations(count: int) -> list[dict[str, Any]]:

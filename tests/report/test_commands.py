@@ -30,7 +30,7 @@ def test_what_is_timed_is_what_will_train(
     """Catches a GPU that is given the minutes of the CPU."""
     timed: list[str] = []
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3)
-    for module in ("perform.analysis", "render.device"):
+    for module in ("jobs.analyze", "render.device"):
         monkeypatch.setattr(f"stga_addon.{module}.choose_device", lambda wanted: ("gpu:Card", "why"))
     device = ["--device", "gpu"]
     assert main(["presets", str(toy_root), *device]) == 0

@@ -6,14 +6,13 @@ from typing import Any
 
 import pytest
 
+from stga_addon import report
 from stga_addon.capture.model import Capture
 from stga_addon.format import describe_figures
-from stga_addon.report import run_summary
-from stga_addon.report.run_summary import CURVE, CurveUpdater, report_run, summarize_continuation, summarize_run
+from stga_addon.report import CURVE, CurveUpdater, report_run, summarize_continuation, summarize_run
 from stga_addon.training.evaluate.forecast import describe_forecast
 from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import train
-from stga_addon.training.run.progress import Progress
+from stga_addon.training.run.session import train
 from stga_addon.training.settings import make_settings
 
 
@@ -67,9 +66,10 @@ def test_fitted_exposure_is_said() -> None:
     rising = metrics([20.0, 25.0, 27.0, 28.0, 28.5], psnr_unmatched=25.0)
     assert "PSNR with exposure fitted" in describe_forecast(rising, 50.0, 100.0, None)
     assert "at the end, exposure fitted" in describe_forecast(rising, 50.0, 100.0, 60.0)
-    progress = Progress(psnr=31.0, psnr_unmatched=25.0)
-    assert "PSNR 31.00 dB (exposure fitted)   25.00 dB without" in describe_figures(progress.figures())
-    assert "PSNR 31.00 dB" in " ".join(describe_figures(Progress(psnr=31.0).figures()))
+    assert "PSNR 31.00 dB (exposure fitted)   25.00 dB without" in describe_figures(
+        {"psnr": 31.0, "psnr_unmatched": 25.0}
+    )
+    assert "PSNR 31.00 dB" in " ".join(describe_figures({"psnr": 31.0}))
 
 
 def test_targets_and_plateaus() -> None:
@@ -98,7 +98,7 @@ def test_the_reason_for_no_curve(toy: Capture, tmp_path: Path, monkeypatch: pyte
     train(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)
     assert report_run(tmp_path / "bare")[-1] == f"{CURVE} was not drawn: no held-out views (split 'val') were evaluated"
     train(toy, tmp_path / "run", run)
-    monkeypatch.setattr(run_summary, "find_spec", lambda name: None)
+    monkeypatch.setattr(report, "find_spec", lambda name: None)
     assert report_run(tmp_path / "run")[-1] == f"{CURVE} was not drawn: matplotlib is not installed"
 
 
@@ -110,8 +110,8 @@ def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.M
         drawn.append(now[0])
         now[0] += 0.05
 
-    monkeypatch.setattr(run_summary, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(run_summary, "write_curve", draw)
+    monkeypatch.setattr(report, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(report, "write_curve", draw)
     keep = CurveUpdater(tmp_path)
     for second in range(51):
         now[0] = float(second)

@@ -17,7 +17,7 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.training.run import checkpoint as checkpoints
-from stga_addon.training.run import loop as run_module
+from stga_addon.training.run import session as run_module
 from stga_addon.training.run.folder import Run
 
 ITERATIONS = 24
@@ -31,7 +31,7 @@ def main(disk: Path, root: Path) -> dict[str, Any]:
     run = Run(capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, lattice=1))
 
     def fill(progress: run_module.Progress) -> bool:
-        if progress.iteration == FULL_AT:
+        if progress.figures().get("iteration", 0) == FULL_AT:
             with open(filler, "wb", buffering=0) as file:
                 try:
                     while True:

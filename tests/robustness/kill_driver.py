@@ -31,8 +31,8 @@ from stga_addon.training.optimize.precompile import precompile_kernels
 from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import checkpoint as checkpoints
 from stga_addon.training.run import folder as run_folder
-from stga_addon.training.run import loop as run_module
 from stga_addon.training.run import metrics_log
+from stga_addon.training.run import session as run_module
 from stga_addon.training.run.folder import Run
 
 ITERATIONS = 250
@@ -60,7 +60,7 @@ class Driver:
         run_module.CHECKPOINT_S = INTERVAL
 
         def report(progress: run_module.Progress) -> bool:
-            self.reached[:] = struct.pack("q", progress.iteration)
+            self.reached[:] = struct.pack("q", int(progress.figures().get("iteration", 0)))
             return False
 
         run_module.train(self.capture, out, self.run, resume=resume, report=report)

@@ -16,12 +16,12 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
-from stga_addon.training.run import loop as run_module
+from stga_addon.progress import Progress
+from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, locked
-from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import append_metrics
-from stga_addon.training.run.progress import Progress
+from stga_addon.training.run.session import train
 
 from .disk_driver import FULL_AT, ITERATIONS
 
@@ -74,7 +74,7 @@ def test_no_room_for_a_checkpoint(root: Path, tmp_path: Path, monkeypatch: pytes
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def no_more(progress: Progress) -> bool:
-        if progress.iteration == FULL_AT:
+        if progress.figures().get("iteration", 0) == FULL_AT:
             resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
         return False
 

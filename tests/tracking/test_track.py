@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from stga_addon.perform.perform import perform
+from stga_addon.perform.tracking import STAGES
+from stga_addon.requests.values import Track
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity
@@ -21,9 +24,6 @@ from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward
 from stga_addon.flame.teeth import flame_model
-from stga_addon.perform.perform import perform
-from stga_addon.perform.tracking import STAGES
-from stga_addon.requests.values import Track
 from stga_addon.tracking.camera_scale import scale_warnings
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import HeadFit

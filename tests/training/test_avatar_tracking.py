@@ -26,10 +26,9 @@ from stga_addon.training.optimize.avatar_tracking import AvatarTracking, Refined
 from stga_addon.training.optimize.cpu_backend import frame_gradient
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
-from stga_addon.training.run.folder import Run, read_run
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.folder import Run, read_run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.tracking_file import with_refined_tracking
+from stga_addon.training.run.session import train
 from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import TrainingSettings
 
@@ -189,7 +188,7 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
 def test_stopped_and_resumed_is_the_unbroken_run(lost: Made, run_folder: Path, tmp_path: Path) -> None:
     """Catches anything of the tracking that a step depends on and a checkpoint does not hold."""
     capture, _ = lost
-    train(capture, tmp_path, make_run(capture), report=lambda progress: progress.iteration >= 31)
+    train(capture, tmp_path, make_run(capture), report=lambda progress: progress.figures().get("iteration", 0) >= 31)
     assert read_checkpoint(tmp_path).rounds == 1
     train(capture, tmp_path, make_run(capture), resume=True)
     ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))
@@ -317,7 +316,7 @@ def test_where_it_cannot_work(
         Trainer(lost[0], quick_settings("gaussian-avatars", tracking=True), {})
     with pytest.raises(StgaError, match=r"effect tracking=on: .* on the CPU only, not on gpu"):
         Trainer(lost[0], quick_settings("global", tracking=True), {}, device="gpu")
-    monkeypatch.setattr("stga_addon.perform.training.choose_device", lambda wanted: ("gpu:Card", "why"))
+    monkeypatch.setattr("stga_addon.jobs.train.choose_device", lambda wanted: ("gpu:Card", "why"))
     root = lost[0].root
     train_on = ["train", str(root), "--flame", str(root / "model.npz"), "--device", "gpu", "--iterations", "2"]
     assert main([*train_on, "--out", str(tmp_path / "run"), "--effect", "tracking=on"]) == 2

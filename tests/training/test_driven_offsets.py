@@ -20,7 +20,7 @@ from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import starting_state
 from stga_addon.training.run.folder import CHECKPOINT, Continuation, Run, read_run
 from stga_addon.training.run.identity import file_digest
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.session import train
 from stga_addon.training.run.strain_range import trained_strain_range
 
 from .toys import quick_settings
@@ -205,7 +205,7 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(toy: Capture, tmp_path: P
     whole = read_avatar(trained(capture, tmp_path / "whole") / "avatar.npz")
     settings = read_run(tmp_path / "whole").settings
     run = Run(capture.root, None, "vhap", settings)
-    train(capture, tmp_path / "parts", run, report=lambda progress: progress.iteration == 17)
+    train(capture, tmp_path / "parts", run, report=lambda progress: progress.figures().get("iteration", 0) == 17)
     assert read_checkpoint(tmp_path / "parts").iteration == 17
     train(capture, tmp_path / "parts", run, resume=True)
     parts = read_avatar(tmp_path / "parts" / "avatar.npz")

@@ -18,8 +18,8 @@ from stga_addon.training.evaluate.evaluation_views import (
 )
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.session import train
 
 from .toys import quick_settings
 

@@ -21,18 +21,14 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
-from stga_addon.perform.training import Prepared, prepare
-from stga_addon.progress import ignore
-from stga_addon.requests.values import Extend
+from stga_addon.jobs.train import Extend, Prepared, prepare
+from stga_addon.progress import Progress, ignore
 from stga_addon.training.optimize.strategies import EXTEND_LOCAL_SHARE, ExtendStrategy
 from stga_addon.training.run import continuation
-from stga_addon.training.run.continuation import START_SHARE
-from stga_addon.training.run.folder import Run, read_run
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.continuation import EXTEND_REPLAY_SHARE, START_SHARE, continued_order
+from stga_addon.training.run.folder import Run, open_run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.open_run import open_run
-from stga_addon.training.run.progress import Progress
-from stga_addon.training.run.replay import EXTEND_REPLAY_SHARE, continued_order
+from stga_addon.training.run.session import train
 from stga_addon.training.schedule import learning_rates
 
 from .test_run import assert_same_state
@@ -75,7 +71,7 @@ def extend(parent: Path, take: Path, out: Path, stop: int | None = None, growth:
     prepared = prepare_extension(parent, (take,), growth, iterations=ITERATIONS)
 
     def report(progress: Progress) -> bool:
-        return progress.iteration == stop
+        return progress.figures().get("iteration", 0) == stop
 
     train(prepared.capture, out, prepared.run, prepared.selection, report=report)
     return out
@@ -224,7 +220,7 @@ def test_takes_that_do_not_fit(
             return replace(capture, neutral=capture.neutral * 1.1)
         return replace(capture, views={}) if change == "images" else capture
 
-    monkeypatch.setattr("stga_addon.perform.training.open_capture", changed)
+    monkeypatch.setattr("stga_addon.jobs.train.open_capture", changed)
     sentences = {
         "shape": "must be of the same head",
         "images": "has no training views",

@@ -13,17 +13,17 @@ import pytest
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.progress import Progress
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.evaluator import EVALUATION_SHARE
 from stga_addon.training.evaluate.forecast import checked_forecasts
 from stga_addon.training.evaluate.metrics import Quality
-from stga_addon.training.run import loop as run_module
 from stga_addon.training.run import session
+from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.progress import Progress
+from stga_addon.training.run.session import train
 
 from .toys import quick_settings
 
@@ -87,7 +87,7 @@ def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock
     assert [line["iteration"] for line in lines if "forecast" in line] == [80, 100, 120, 140, 160, 180]
     hit, checked = checked_forecasts(lines)
     assert 0 < hit <= checked == 6
-    assert any("another" in progress.forecast_text for progress in told)
+    assert any("another" in progress.detail for progress in told)
 
 
 def test_a_reached_target_ends_the_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +120,7 @@ def test_a_target_out_of_sight_is_said_while_training(toy: Capture, tmp_path: Pa
     """Catches a person who waits to the end to learn that it was in vain."""
     told: list[str] = []
     run = run_of(toy, iterations=40, target_psnr=60.0)
-    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.forecast_text)))
+    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.detail)))
     assert any("60 dB is out of reach" in forecast_text for forecast_text in told)
     assert not any(forecast_text.startswith(";") for forecast_text in told)  # near the end there is nothing else to say
     assert read_checkpoint(tmp_path).iteration == 40
@@ -142,7 +142,7 @@ def test_a_run_that_no_longer_improves(
     monkeypatch.setattr(evaluator, "evaluate", scores(falling))
     told: list[str] = []
     run = run_of(toy, iterations=None, seconds=200.0, stop_when_flat=stop)
-    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.forecast_text)))
+    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.detail)))
     assert (read_checkpoint(tmp_path).iteration < 200) == stop
     if not stop:
         assert any(

@@ -23,8 +23,8 @@ from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
-from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.session import train
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import TrainingSettings
 
@@ -215,9 +215,7 @@ def test_a_lost_gpu_is_followed_by_the_cpu(
     assert read_checkpoint(tmp_path).iteration == 5
     done.clear()
     stages: list[str] = []
-    train(
-        toy, tmp_path, run, resume=True, report=lambda progress: bool(stages.append(progress.message)), falls_back=True
-    )
+    train(toy, tmp_path, run, resume=True, report=lambda progress: bool(stages.append(progress.stage)), falls_back=True)
     assert len(done) == 3
     assert "Continuing on the CPU" in stages
     assert "Card 9000 was lost; continuing on the CPU from the last checkpoint" in caplog.messages

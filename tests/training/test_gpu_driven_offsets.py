@@ -16,7 +16,7 @@ from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.state import OffsetState, TrainState, arrays_of, keep_rows
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.session import train
 from stga_addon.training.settings import TrainingSettings
 
 from .test_driven_offsets import squeezed

@@ -19,19 +19,18 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
-from stga_addon.perform.perform import perform
+from stga_addon.jobs.folder import request_folder, write_request
+from stga_addon.jobs.perform import perform
+from stga_addon.jobs.train import Resume
+from stga_addon.progress import Progress
 from stga_addon.render import device as device_choice
-from stga_addon.requests.folder import request_folder, write_request
-from stga_addon.requests.values import Resume
 from stga_addon.schema import to_json
 from stga_addon.training.optimize.state import arrays_of
-from stga_addon.training.run import open_run as open_run_module
+from stga_addon.training.run import folder as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.folder import Run, read_run, write_run
+from stga_addon.training.run.folder import Run, device_of, open_run, read_run, write_run
 from stga_addon.training.run.identity import RunIdentity, difference, identity_of
-from stga_addon.training.run.loop import train
-from stga_addon.training.run.open_run import device_of, open_run
-from stga_addon.training.run.progress import Progress
+from stga_addon.training.run.session import train
 from stga_addon.training.settings import TrainingSettings
 
 from .toys import quick_settings
@@ -45,7 +44,7 @@ def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run
 
 
 def stop_at(iteration: int) -> Callable[[Progress], bool]:
-    return lambda progress: progress.iteration >= iteration
+    return lambda progress: progress.figures().get("iteration", 0) >= iteration
 
 
 @pytest.fixture(scope="session")
@@ -233,15 +232,19 @@ def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Captur
     run = make_run(toy, seed=5)
 
     def die(progress: Progress) -> bool:
-        if progress.iteration:
+        if progress.figures().get("iteration", 0):
             raise OSError("died")
         return False
 
     with pytest.raises(OSError, match="died"):
         train(toy, copy, run, report=die)
     assert not (copy / "checkpoint.npz").exists()
-    reached: list[int] = []
-    train(toy, copy, run, resume=True, report=lambda progress: bool(reached.append(progress.iteration)))
+    reached: list[float] = []
+
+    def report(progress: Progress) -> bool:
+        return bool(reached.append(progress.figures().get("iteration", 0)))
+
+    train(toy, copy, run, resume=True, report=report)
     assert reached[:4] == [0, 0, 1, 2]
 
 
@@ -309,7 +312,7 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Pa
     """Catches Ctrl-C that loses what was trained since the last checkpoint, or saves half an iteration."""
 
     def interrupt(progress: Progress) -> bool:
-        if progress.iteration == 5 and progress.message == "Training":
+        if progress.figures().get("iteration", 0) == 5 and progress.stage == "Training":
             signal.raise_signal(signal.SIGINT)
         return False
 
@@ -330,7 +333,7 @@ def test_second_interrupt_quits_at_once(toy: Capture, tmp_path: Path) -> None:
     """Catches a training that cannot be ended while it saves."""
 
     def interrupt_twice(progress: Progress) -> bool:
-        if progress.iteration == 5:
+        if progress.figures().get("iteration", 0) == 5:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
         return False

@@ -16,7 +16,7 @@ from stga_addon.training.evaluate.residuals import Residuals
 from stga_addon.training.optimize.frames import CACHED_TIMESTEPS
 from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import session
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.session import train
 
 from .test_run import assert_same_state, make_run
 

@@ -20,8 +20,8 @@ from stga_addon.training.evaluate.evaluation_views import EvaluationView
 from stga_addon.training.evaluate.lpips import read_network
 from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.session import train
 
 from .toys import quick_settings
 
@@ -167,7 +167,7 @@ def test_only_the_final_evaluation_measures_lpips(
 ) -> None:
     """Catches slow evaluations during training, a canceled run that waits for LPIPS, and a missing final figure."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
-    train(toy, tmp_path / "run", run_of(toy), report=lambda progress: progress.iteration >= 11)
+    train(toy, tmp_path / "run", run_of(toy), report=lambda progress: progress.figures().get("iteration", 0) >= 11)
     assert not any("lpips" in line for line in read_metrics(tmp_path / "run"))
     train(toy, tmp_path / "run", run_of(toy), resume=True)
     *before, last = read_metrics(tmp_path / "run")

@@ -22,7 +22,7 @@ from numba.core.dispatcher import Dispatcher
 import stga_addon.raster.cpu as kernels
 from stga_addon.raster.cpu.precompile import compile_gradients, compile_rendering
 from stga_addon.training.optimize import precompile
-from stga_addon.training.run import loop as run_module
+from stga_addon.training.run import session as run_module
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings

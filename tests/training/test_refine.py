@@ -14,18 +14,22 @@ from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
-from stga_addon.perform.training import Prepared, prepare
-from stga_addon.progress import ignore
-from stga_addon.requests.values import Refine
+from stga_addon.jobs.train import Prepared, Refine, prepare
+from stga_addon.progress import Progress, ignore
 from stga_addon.training.optimize.state import TrainState, arrays_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import late_rates, starting_state
+from stga_addon.training.run.continuation import (
+    continued_order,
+    distinct_timesteps,
+    late_rates,
+    replayed_views,
+    starting_state,
+    views_of_region,
+)
 from stga_addon.training.run.folder import Continuation, Run, read_run
-from stga_addon.training.run.loop import train
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.progress import Progress
-from stga_addon.training.run.replay import continued_order, distinct_timesteps, replayed_views, views_of_region
+from stga_addon.training.run.session import train
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates
 
@@ -52,13 +56,13 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def parent(finished: Path, toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the finished run, whose density control comes often when it is refined."""
     monkeypatch.setattr(module, "DENSITY_INTERVAL", 4)
-    monkeypatch.setattr("stga_addon.perform.training.open_run", opening(toy))
+    monkeypatch.setattr("stga_addon.jobs.train.open_run", opening(toy))
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 def opening(toy: Capture) -> Callable[..., Any]:
     """`open_run` for the capture without held-out views, which is a file of its own to nobody but this test."""
-    from stga_addon.training.run.open_run import OpenedRun
+    from stga_addon.training.run.folder import OpenedRun
 
     capture = replace(toy, views={"train": toy.views["train"]})
     return lambda folder, flame=None: OpenedRun(read_run(folder), capture, (capture,))
@@ -73,7 +77,7 @@ def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> 
     prepared = prepare_refinement(parent, "mouth", **{"growth": 0.5, **changes})
 
     def report(progress: Progress) -> bool:
-        return progress.iteration == stop
+        return progress.figures().get("iteration", 0) == stop
 
     train(prepared.capture, out, prepared.run, prepared.selection, report=report)
     return out

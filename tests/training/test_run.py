@@ -13,17 +13,15 @@ import pytest
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.progress import Progress
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.optimize.state import arrays_of
-from stga_addon.training.run import loop as run_module
-from stga_addon.training.run import session as session_module
+from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
-from stga_addon.training.run.folder import Run, read_run
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.folder import Run, read_residuals, read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.progress import Progress
-from stga_addon.training.run.residual_file import read_residuals
+from stga_addon.training.run.session import train
 from stga_addon.training.settings import STRATEGIES
 
 from .toys import quick_settings
@@ -42,7 +40,7 @@ def make_run(capture: Capture, strategy: str = "selective", **changes: Any) -> R
 
 
 def stop_at(iteration: int) -> Callable[[Progress], bool]:
-    return lambda progress: progress.iteration >= iteration
+    return lambda progress: progress.figures().get("iteration", 0) >= iteration
 
 
 def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -121,8 +119,8 @@ def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
 
         def crash(progress: Progress) -> bool:
-            patch.setattr(run_module, "CHECKPOINT_S", 0.0 if progress.iteration == 7 else 1e9)
-            if progress.iteration == 13:
+            patch.setattr(run_module, "CHECKPOINT_S", 0.0 if progress.figures().get("iteration", 0) == 7 else 1e9)
+            if progress.figures().get("iteration", 0) == 13:
                 raise Crash
             return False
 
@@ -169,7 +167,7 @@ def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path)
     painted = {timestep: np.arange(len(toy.faces)) < 7 for timestep in toy.timesteps}
 
     def crash(progress: Progress) -> bool:
-        if progress.iteration == 2:
+        if progress.figures().get("iteration", 0) == 2:
             raise Crash
         return False
 
@@ -185,7 +183,7 @@ def test_resuming_before_the_first_checkpoint_begins_anew(toy: Capture, unbroken
     """Catches a run that can neither be resumed nor started again because it was killed early."""
 
     def crash(progress: Progress) -> bool:
-        if progress.iteration == 4:
+        if progress.figures().get("iteration", 0) == 4:
             raise Crash
         return False
 
@@ -214,7 +212,7 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
     for name in ("avatar.npz", "residuals.npz"):
         (out / name).unlink()
     told: list[str] = []
-    train(toy, out, make_run(toy), resume=True, report=lambda progress: bool(told.append(progress.message)))
+    train(toy, out, make_run(toy), resume=True, report=lambda progress: bool(told.append(progress.stage)))
     assert "Writing the missing avatar from the checkpoint" in told
     written = read_avatar(out / "avatar.npz").splats
     np.testing.assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
@@ -232,7 +230,7 @@ def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, cha
     out, moved = tmp_path / "run", tmp_path / "moved"
 
     def move(progress: Progress) -> bool:
-        if progress.iteration == 7:
+        if progress.figures().get("iteration", 0) == 7:
             out.rename(moved)
             if change == "emptied":
                 out.mkdir()
@@ -255,13 +253,13 @@ def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pyte
         written.append(avatar)
         run_module_write(path, avatar)
 
-    run_module_write = session_module.write_avatar
+    run_module_write = run_module.write_avatar
     monkeypatch.setattr(
         evaluator,
         "evaluate",
         lambda *args, **kwargs: Quality(30.0, 0.5, detail_difference=next(scores)),
     )
-    monkeypatch.setattr(session_module, "write_avatar", write)
+    monkeypatch.setattr(run_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))
     train(toy, tmp_path, make_run(toy), resume=True)
     assert len(written) == 2
@@ -312,7 +310,7 @@ def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.M
 
     def note(progress: Progress) -> bool:
         shares.append(progress.share)
-        return progress.iteration == 6
+        return progress.figures().get("iteration", 0) == 6
 
     run = make_run(toy, iterations=None, seconds=0.6)
     train(toy, tmp_path, run, report=note)
@@ -358,19 +356,22 @@ def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path
     """Catches shares that do not end at one, speeds or losses that are never filled in, and a wait for kernels with
     nothing to look at."""
     told: list[Progress] = []
+    figures: list[dict[str, float]] = []
     first: list[int] = []
 
     def report(progress: Progress) -> bool:
-        if progress.message == "Compiling kernels" and progress.avatar is not None:
-            first.append(len(progress.avatar().splats))
+        figures.append(dict(progress.figures()))
+        if progress.stage == "Compiling kernels" and progress.preview is not None:
+            progress.preview(tmp_path / "first.npz")
+            first.append(len(read_avatar(tmp_path / "first.npz").splats))
         return bool(told.append(progress))
 
     train(toy, tmp_path, make_run(toy), report=report)
-    training = [p for p in told if p.message == "Training"]
-    assert [p.iteration for p in training] == list(range(1, ITERATIONS + 1))
-    assert training[-1].share == 1.0
-    assert training[-1].left_s == 0.0
-    assert all(p.per_second > 0 and np.isfinite(p.loss) for p in training)
-    assert told[-1].message == "Finished"
-    assert told[-1].psnr is not None
-    assert first == [training[0].splats]
+    training = [found for found, p in zip(figures, told, strict=True) if p.stage == "Training"]
+    assert [found["iteration"] for found in training] == list(range(1, ITERATIONS + 1))
+    assert [p.share for p in told if p.stage == "Training"][-1] == 1.0
+    assert training[-1]["left_s"] == 0.0
+    assert all(found["per_second"] > 0 and np.isfinite(found["loss"]) for found in training)
+    assert told[-1].stage == "Finished"
+    assert "psnr" in figures[-1]
+    assert first == [training[0]["splats"]]

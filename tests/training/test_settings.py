@@ -48,7 +48,7 @@ def test_unknown_or_missing_fields(change: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"strategy": "best", "iterations": 5}, "setting strategy: expected one of selective, global"),
+        ({"strategy": "best", "iterations": 5}, "setting strategy: expected one of global, selective"),
         ({"schedule": "fast", "iterations": 5}, "setting schedule: expected one of default, paper"),
         ({"preset": "best", "iterations": 5}, "setting preset: expected one of draft, standard, final, got 'best'"),
         ({"preset": [], "iterations": 5}, "setting preset: "),

@@ -4,7 +4,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from stga_addon.worker.requirements import GPU_REQUIREMENT, REQUIREMENTS, package_name
+from stga_addon.worker.training_python import GPU_REQUIREMENT, REQUIREMENTS, package_name
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
 

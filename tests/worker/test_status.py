@@ -23,7 +23,6 @@ from stga_addon.worker.launch import (
     start_worker,
     worker_environment,
 )
-from stga_addon.worker.own_python import own_python
 from stga_addon.worker.status import (
     CANCEL_FILE,
     LOG_FILE,
@@ -41,6 +40,7 @@ from stga_addon.worker.status import (
     request_cancel,
     status_writer,
 )
+from stga_addon.worker.training_python import own_python
 
 ROOT = Path(__file__).resolve().parents[2]
 # A worker that reports progress until it is cancelled, or does what its argument says.

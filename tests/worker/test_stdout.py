@@ -8,7 +8,7 @@ import pytest
 SCRIPT = """
 import os, sys
 if {closed}: os.close(2)
-from stga_addon.worker.stdout import claim_stdout
+from stga_addon.worker.helpers import claim_stdout
 messages = claim_stdout()
 os.write(1, b"from C")
 if not {closed}: print("from Python")

@@ -7,11 +7,11 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ...requests.folder import worker_arguments
+from ...jobs.folder import worker_arguments
 from ...worker.helpers import processors
 from ...worker.launch import start_worker
 from ...worker.status import inspect_worker
-from ..job import Ended, Job, training_python
+from ..plan import Ended, Job, training_python
 
 MEMORY_SHARE = 0.9
 """Share of the memory that is free at the start that workers may use."""

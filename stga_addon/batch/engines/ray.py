@@ -16,7 +16,7 @@ from ...worker.helpers import processors
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, inspect_worker, read_status
 from ...worker.training_python import PYTHON_VARIABLE
-from ..job import Ended, Job, job_command
+from ..plan import Ended, Job, job_command
 
 MAX_WAITING = 1000
 """Tasks that are submitted at once: more wait here, not in Ray's memory."""

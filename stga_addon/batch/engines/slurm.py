@@ -18,7 +18,7 @@ from ...errors import StgaError
 from ...files import read_json, replacing, write_json
 from ...worker.launch import PACKAGES_FOLDER
 from ...worker.status import LOG_FILE, WorkerState, inspect_worker
-from ..job import Ended, Job, Resources, job_command, kind_name
+from ..plan import Ended, Job, Resources, job_command, kind_name
 
 TIMEOUT_S = 60.0
 MAX_ARRAY = 1000

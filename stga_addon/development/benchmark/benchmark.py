@@ -12,9 +12,8 @@ from ...batch.plan import Plan
 from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
-from ...report.charts import finish_axes, psnr_axes
-from ...report.run_summary import evaluation_share
-from ...requests.values import Benchmark
+from ...jobs.table import Benchmark
+from ...report import evaluation_share, finish_axes, psnr_axes
 from ...schema import to_json
 from .statistics import (
     MeanCurve,

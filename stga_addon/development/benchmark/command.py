@@ -1,54 +1,63 @@
-"""Train variants for the same time in turns, and print how they compare.
+"""The command `benchmark`. Each seed is a job of a batch (docs/batch.md): one after another on this machine, at once on
+several."""
 
-Each seed is a job of a batch (docs/batch.md): one after another on this machine, at once on several.
-"""
-
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
+from dataclasses import dataclass
 from pathlib import Path
 
 from ...batch.plan import make_plan
-from ...cli.arguments import add_capture, duration, usable_path, whole_number
-from ...cli.batch import add_engine, carry_out_plan, print_plan, with_threads
-from ...cli.inputs import open_named_capture, principal_point_of
+from ...capture.open import open_capture
+from ...cli.batch import EngineOptions, carry_out_plan, print_plan, with_threads
+from ...cli.commands import Command
 from ...errors import StgaError
-from ...requests.open_head import OpenHead
-from ...requests.values import Benchmark
+from ...jobs.table import Benchmark
+from ...jobs.train import Train
+from ...options import duration, given_options, like, option
 from ...worker.helpers import processors
 
-NAME, HELP = "benchmark", "compare accuracy and training time of strategies and presets on the CPU"
 SLICES = "benchmark"
 """How the names of the jobs, and of their folders, begin."""
 
 
-def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
-    add_capture(parser, head)
-    parser.add_argument("--budget", type=duration, default=180.0, metavar="TIME", help="of each run (default 3m)")
-    parser.add_argument("--seeds", type=whole_number(1), default=3, help="runs of each variant (default 3)")
-    parser.add_argument("--knobs", action="store_true", help="compare single settings instead")
-    parser.add_argument("--only", nargs="+", metavar="VARIANT", help="some of the variants")
-    parser.add_argument(
-        "--out", type=usable_path, default=Path("out/benchmark"), metavar="DIR", help="keeps the runs, to be continued"
-    )
-    add_engine(parser)
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    capture: Path = like(Train, "capture")
+    flame: Path | None = like(Train, "flame")
+    principal_point: str = like(Train, "principal_point")
+    seconds: float = option("of each run (default 3m)", 180.0, flag="--budget", metavar="TIME", parse=duration)
+    seeds: int = option("runs of each variant", 3, 1)
+    knobs: bool = like(Benchmark, "knobs")
+    only: tuple[str, ...] = option("one of the variants; may be repeated", (), metavar="VARIANT")
+    out: Path = option("keeps the runs, to be continued", Path("out/benchmark"), metavar="DIR")
 
 
-def run(options: Namespace) -> None:
+def run(options: Namespace, head: object) -> None:
     from .benchmark import benchmark_jobs, slices_of, write_report
 
-    capture = open_named_capture(options)
+    given = BenchmarkOptions(**given_options(options, BenchmarkOptions))
+    engine = EngineOptions(**given_options(options, EngineOptions))
+    capture = open_capture(given.capture, given.flame, given.principal_point)
     for split, purpose in (("train", "train on"), ("val", "measure with")):
         if not capture.views.get(split):
             raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
-    flame = None if options.flame is None else options.flame.resolve()
-    out, root, only = options.out.resolve(), options.capture.resolve(), tuple(options.only or ())
-    request = Benchmark(out, root, options.budget, flame, principal_point_of(options), knobs=options.knobs, only=only)
-    values = {"out": str(out), "job": benchmark_jobs(SLICES, request, options.seeds)}
-    plan = with_threads(make_plan(values, out, "stga benchmark"), options.threads or processors())
-    if options.dry_run:
+    flame = None if given.flame is None else given.flame.resolve()
+    out, root = given.out.resolve(), given.capture.resolve()
+    request = Benchmark(
+        out, root, given.seconds, flame, given.principal_point, knobs=given.knobs, only=given.only
+    )  # fmt: skip
+    values = {"out": str(out), "job": benchmark_jobs(SLICES, request, given.seeds)}
+    plan = with_threads(make_plan(values, out, "stga benchmark"), engine.threads or processors())
+    if engine.dry_run:
         print_plan(plan)
         return
     try:
-        carry_out_plan(plan, options.engine, options.address)
+        carry_out_plan(plan, engine.engine, engine.address)
     finally:
         report = write_report(slices_of(plan, SLICES), out)
     print(report)
+
+
+COMMAND = Command(
+    "Compare accuracy and training time of strategies and presets on the CPU. Variants train in turns.",
+    run, (BenchmarkOptions, EngineOptions), uses_head=True,
+)  # fmt: skip

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import StgaError
+from ...jobs.folder import request_folder, write_request
+from ...jobs.train import Train
 from ...progress import Cancelled, Progress, Report, Say, ignore
 from ...raster.cpu.threads import threads
-from ...requests.folder import request_folder, write_request
-from ...requests.values import Train
 from ...training.run.folder import has_run, read_run
 from ...worker.launch import same_interpreter_environment
 from .variants import without_choices

@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from ...errors import StgaError
-from ...perform.training import prepare
+from ...jobs.results import Written
+from ...jobs.table import Benchmark
+from ...jobs.train import Train, prepare
 from ...progress import Progress, Report, Say, ignore
-from ...requests.results import Written
-from ...requests.values import Benchmark, Train
 from ...training.settings import TrainingSettings
 from .scheduler import BenchmarkRun, train_in_turns
 from .variants import settings_of, variants_of, without_choices

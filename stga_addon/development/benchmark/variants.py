@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from ...errors import StgaError
-from ...requests.values import Benchmark
+from ...jobs.table import Benchmark
 from ...selection import SelectionOptions
 from ...training.settings import PRESETS, STRATEGIES, TrainingSettings, make_settings
 

@@ -2,7 +2,7 @@
 
     python -m stga_addon.development.benchmark.worker FOLDER --threads=N [--fit-exposure]
 
-Trains as the request in FOLDER asks (`requests.folder`), or resumes the run in FOLDER. Each line on stdin is a share
+Trains as the request in FOLDER asks (`jobs.folder`), or resumes the run in FOLDER. Each line on stdin is a share
 of the budget to train up to; the end of stdin means save and end. Each line, and the start, is answered by a line of
 JSON on stdout: {"share": …, "iteration": …} when ready for the next, {"done": …} at the end, or {"error": …}.
 """
@@ -16,14 +16,14 @@ from typing import IO, TYPE_CHECKING, Any
 
 from ...errors import StgaError
 from ...files import write_json
+from ...jobs.folder import read_request, request_folder
+from ...jobs.train import Resume, Train
 from ...progress import ignore
-from ...requests.folder import read_request, request_folder
-from ...requests.values import Resume, Train
 from ...training.run.folder import has_run
-from ...worker.stdout import claim_stdout
+from ...worker.helpers import claim_stdout
 
 if TYPE_CHECKING:
-    from ...training.run.progress import Progress
+    from ...progress import Progress
 
 WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
@@ -45,9 +45,12 @@ class Turns:
 
     def report(self, progress: "Progress") -> bool:
         """Call after every iteration; True where the run is to stop."""
-        if progress.iteration == 0 or self._until > progress.share or progress.share >= 1:
+        if self._until > progress.share or progress.share >= 1:
             return False
-        self.reply({"share": progress.share, "iteration": progress.iteration})
+        iteration = int(progress.figures().get("iteration", 0))
+        if iteration == 0:
+            return False
+        self.reply({"share": progress.share, "iteration": iteration})
         request = self._requests.readline()
         self.stopped = not request
         self._until = float(request or 1)
@@ -61,10 +64,10 @@ class Turns:
 def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool = False) -> None:
     """Train the folder's run in turns and measure its avatar, with fitted exposure of cameras that were not trained."""
     from ...avatar.file import read_avatar
-    from ...perform.training import prepare
+    from ...jobs.train import prepare
     from ...training.evaluate.metrics import evaluate_avatar
     from ...training.preset_timing import seconds_per_iteration
-    from ...training.run.tracking_file import with_refined_tracking
+    from ...training.run.folder import with_refined_tracking
 
     turns = Turns(requests, replies)
     try:

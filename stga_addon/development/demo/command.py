@@ -1,32 +1,40 @@
-"""Make a synthetic capture, train an avatar on it and show it in Blender."""
+"""The command `demo`."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
+from dataclasses import dataclass
 from pathlib import Path
 
-from ...cli.arguments import add_device, duration, usable_path, whole_number
-from ...requests.open_head import OpenHead
+from ...cli.commands import Command
+from ...jobs.train import Train
+from ...options import given_options, like, option
+from ...training.settings import TrainingSettings
 
-NAME, HELP = "demo", "make a synthetic capture, train an avatar on it and show it in Blender"
+SECONDS = 40.0
 
 
-def add_arguments(parser: ArgumentParser, head: OpenHead | None) -> None:
-    parser.add_argument("--out", type=usable_path, default=Path("out/demo"))
-    budget = parser.add_mutually_exclusive_group()
-    budget.add_argument("--budget", type=duration, default=40.0, metavar="TIME")
-    budget.add_argument(
-        "--iterations", type=whole_number(1), help="number of iterations instead, of the first training"
+@dataclass(frozen=True)
+class DemoOptions:
+    out: Path = option("folder of what is made", Path("out/demo"), metavar="DIR")
+    seconds: float | None = like(TrainingSettings, "seconds", help="training time (default 40s)")
+    iterations: int | None = like(
+        TrainingSettings, "iterations", help="number of iterations instead, of the first training"
     )
-    add_device(parser)
-    parser.add_argument("--footage", action="store_true", help="make an avatar from the capture's images alone as well")
+    device: str = like(Train, "device")
+    footage: bool = option("make an avatar from the capture's images alone as well", False)
 
 
-def run(options: Namespace) -> None:
+def run(options: Namespace, head: object) -> None:
     from ...render.device import choose_device
     from .run import avatar_from_footage, run_demo
 
-    device, why = choose_device(options.device)
+    given = DemoOptions(**given_options(options, DemoOptions))
+    device, why = choose_device(given.device)
     print(why)
-    budget = {"seconds": options.budget} if options.iterations is None else {"iterations": options.iterations}
-    run_demo(options.out, budget, device=device)
-    if options.footage:
-        avatar_from_footage(options.out, options.budget, options.device)
+    seconds = given.seconds or SECONDS
+    budget = {"seconds": seconds} if given.iterations is None else {"iterations": given.iterations}
+    run_demo(given.out, budget, device=device)
+    if given.footage:
+        avatar_from_footage(given.out, seconds, given.device)
+
+
+COMMAND = Command("Make a synthetic capture, train an avatar on it and show it in Blender.", run, (DemoOptions,))

@@ -1,6 +1,6 @@
 """Demo: make a synthetic capture, train an avatar on it, show it in Blender and compare the pictures."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +23,9 @@ from ...errors import StgaError
 from ...export.formats import export_avatar
 from ...export.playback import Playback
 from ...files import replacing, write_json
-from ...perform.export_web import capture_views
+from ...jobs.export import capture_views
+from ...jobs.train import Train
 from ...render.render import render_avatar, to_uint8
-from ...requests.values import Train
 from ...selection import SelectionOptions, select_capture
 from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import AVATAR, RUN
@@ -74,13 +74,13 @@ def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
 
     Raises StgaError.
     """
-    from ...cli import avatar
+    from ...cli.commands import COMMANDS
 
     model = ["--model", str(out / "capture/flame_model.npz"), "--cameras", str(out / "capture/transforms.json")]
     more = ["--out", str(out / "footage"), "--budget", f"{seconds}s", "--seed", str(SEED), "--device", device]
     parser = ArgumentParser()
-    avatar.add_arguments(parser, None)
-    avatar.run(parser.parse_args([str(out / "capture"), *model, *more], Namespace(head=None)))
+    COMMANDS["avatar"].add_arguments(parser, None)
+    COMMANDS["avatar"].carry_out(parser.parse_args([str(out / "capture"), *model, *more]), None)
 
 
 def _advance(bar: "tqdm[None]", done: int, total: int) -> None:

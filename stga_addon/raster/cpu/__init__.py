@@ -13,7 +13,7 @@ from typing import Any
 import numba
 from numba.core import config
 
-from ...worker.cache import BUNDLED, KERNELS, cache_folder
+from ...worker.launch import BUNDLED, KERNELS, cache_folder
 from .bundled import kernel_folder
 
 # Reassociation and contraction let reductions vectorize; NaN and infinity keep their meaning, because a broken

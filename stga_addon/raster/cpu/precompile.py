@@ -12,8 +12,7 @@ import numpy as np
 
 from ...avatar.embedding import WORLD
 from ...capture.camera import Camera
-from ...worker.cache import is_preparing
-from ...worker.launch import end_with_this_process, same_interpreter_environment
+from ...worker.launch import end_with_this_process, is_preparing, same_interpreter_environment
 from ..kernel_cache import has_kernels
 from . import KERNEL_CACHE_FOLDER
 from .blend import blend_backward, blend_forward

@@ -17,7 +17,7 @@ from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
 from ...raster.cpu.threads import start_threads
 from ...render.device import adapter_name
-from ...worker.cache import is_preparing
+from ...worker.launch import is_preparing
 from . import adam, driven_offsets
 from .losses import image_gradient, whole_image
 from .state import TrainState, new_state, with_offsets
@@ -32,7 +32,7 @@ def precompile_kernels(device: str = "cpu") -> None:
 
     Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
     second process compiles rendering at the same time (`raster.cpu.precompile`). While a process compiles
-    ahead (`perform.preparation`), this one waits for it, unless it has kernels that are bundled (`raster.cpu.bundled`).
+    ahead (`jobs.preparation`), this one waits for it, unless it has kernels that are bundled (`raster.cpu.bundled`).
     """
     if not USES_BUNDLED_KERNELS:
         _await_preparation()

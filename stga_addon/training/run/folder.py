@@ -1,4 +1,4 @@
-"""Folder of a training run: run.json, and the lock of the process that trains.
+"""Folder of a training run: its run.json, lock and smaller files, and the capture that it was trained on.
 
 run.json        what is trained, with which settings
 selection.npz   timestep -> selected triangles
@@ -14,24 +14,30 @@ world.ply       what stands still behind the person, in world space; only where 
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
+from ...capture.model import Capture, join_takes
+from ...capture.open import open_capture, with_sequence
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError, shorten
-from ...files import read_json, remove_leftovers, write_json
-from ...render.device import EXPECTED_DEVICE, is_device
-from ...schema import complaint, from_json, setting, to_json
+from ...files import read_json, read_npz, remove_leftovers, write_json, write_npz
+from ...flame.forward import FlameFrame, frame_of
+from ...flame.sequence import FRAME_FIELDS, FlameSequence, read_motion
+from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
+from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_lock, lock_owner
 from ..effect_decisions import EffectDecision
 from ..settings import TrainingSettings
-from .identity import LATER_SETTINGS, RunIdentity
+from .identity import LATER_SETTINGS, RunIdentity, difference, identity_of, version_4_identity
 
 FORMAT, VERSION = "stga-run", 5
 OLDEST_VERSION = 4
 """Read as well: LATER_SETTINGS are all that it lacks."""
 RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
-WORLD_FILE = "world.ply"
+WORLD_FILE, TRACKING, RESIDUALS = "world.ply", "tracking.npz", "residuals.npz"
 
 
 @dataclass(frozen=True)
@@ -81,19 +87,13 @@ class Run:
 
     capture: Path
     flame: Path | None
-    principal_point: str
-    settings: TrainingSettings
+    principal_point: str = setting(choices=PRINCIPAL_POINTS)
+    settings: TrainingSettings = setting()
     effect_plan: tuple[EffectDecision, ...] = ()
     device: str = setting("cpu", accepts=is_device, expected=EXPECTED_DEVICE)
     identity: RunIdentity | None = field(default=None, compare=False)
     takes: tuple[Take, ...] = ()
     continuation: Continuation | None = None
-
-    def check(self) -> None:
-        """Raise StgaError for a convention of principal points that is none."""
-        if self.principal_point not in PRINCIPAL_POINTS:
-            expected = f"one of {', '.join(PRINCIPAL_POINTS)}"
-            raise StgaError(complaint("principal_point", expected, self.principal_point))
 
 
 def write_run(folder: Path, run: Run) -> None:
@@ -154,3 +154,164 @@ def locked(folder: Path) -> Iterator[None]:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         remove_leftovers(folder)
         yield
+
+
+# A run with its capture
+
+
+@dataclass(frozen=True)
+class OpenedRun:
+    """A run and its capture. `run` has the paths of `capture` and FLAME model that were opened.
+
+    takes  the captures that `capture` is joined from
+    """
+
+    run: Run
+    capture: Capture
+    takes: tuple[Capture, ...]
+
+
+def open_run(
+    folder: Path, capture: Path | None = None, flame: Path | None = None, principal_point: str | None = None
+) -> OpenedRun:
+    """Open the run in `folder`; the other arguments stand in for what it was trained with.
+
+    A capture or a FLAME model may have moved, but not changed; tracked meshes may be refined.
+    Raises StgaError in one sentence where the folder holds no run or anything differs from what it was trained with.
+    """
+    run = read_run(folder)
+    if principal_point not in (None, run.principal_point):
+        raise StgaError(f"{folder}: was trained with principal point '{run.principal_point}', not '{principal_point}'")
+    flame = run.flame if flame is None else flame.resolve()
+    first = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
+    run = replace(run, capture=first.root, flame=flame)
+    takes = (first, *(_open_take(folder, run, take) for take in run.takes))
+    opened = join_takes(takes)
+    check_identity(folder, run, opened)
+    if run.continuation is not None:  # it was trained on the meshes that the run before has refined
+        opened = with_refined_tracking(opened, folder)
+    return OpenedRun(run, opened, takes)
+
+
+def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
+    """The capture of a run, with the FLAME parameters that the run refined. Errors as of `open_run`."""
+    if not folder.is_dir():
+        raise StgaError(f"{folder}: is not a folder; expected that of a run")
+    return with_refined_tracking(open_run(folder, capture, flame).capture, folder)
+
+
+def _open_take(folder: Path, run: Run, take: Take) -> Capture:
+    """A capture that joined the run. Raises StgaError where it is missing or has changed."""
+    capture = open_capture(take.capture, run.flame, run.principal_point)
+    changed = difference(take.identity, identity_of(capture, run.principal_point, run.settings))
+    if changed is not None:
+        raise StgaError(f"{folder}: was extended with {take.capture} ({take.identity.summary}), but it now {changed}")
+    return capture
+
+
+def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
+    """The identity of `run` on `capture`, as the folder's files carry it.
+
+    Raises StgaError where the folder holds a run that was begun with another one; the sentence names both sides.
+    """
+    given = identity_of(capture, run.principal_point, run.settings)
+    if not has_run(folder):
+        return given
+    stored = read_run(folder)
+    trained = stored.identity
+    if trained is None or trained == given:  # None: the run was prepared, but has not begun
+        return given
+    if trained == version_4_identity(given, run.settings):
+        return trained
+    if trained.principal_point != given.principal_point:
+        wanted = f"principal point '{trained.principal_point}', not '{given.principal_point}'"
+        raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
+    if "" not in (trained.flame, given.flame) and trained.flame != given.flame:
+        wanted = f"FLAME model {stored.flame}, but {run.flame} has other content"
+        raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
+    changed = difference(trained, given)
+    if changed is not None:
+        where = "it now" if capture.root == stored.capture else f"{capture.root} ({given.summary})"
+        wanted = f"{stored.capture} ({trained.summary}), but {where} {changed}"
+        raise StgaError(f"{folder}: was trained on {wanted}; train into another folder")
+    raise StgaError(f"{folder}: was begun with other settings; restore them in run.json, or train into another folder")
+
+
+def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
+    """The device to continue a run on, and why: its own, unless `requested` names another (`choose_device`).
+
+    A run of a GPU that this machine lacks continues on the first one.
+    Raises StgaError where that device does not work or cannot train this run.
+    """
+    trained_on = run.device if _has(run.device) else run.device.partition(":")[0]
+    try:
+        device, reason = choose_device(trained_on if requested == "auto" else requested)
+    except StgaError as error:
+        if requested != "auto":
+            raise
+        raise StgaError(
+            f"this run was trained on {trained_on}: {error}; give --device cpu to continue on the CPU"
+        ) from error
+    if run.settings.tracking and device != "cpu":
+        raise StgaError(f"--device {requested}: this run refines the tracking, which works on the CPU only")
+    return device, reason
+
+
+def _has(device: str) -> bool:
+    """Whether a device is a GPU by the name of an adapter of this machine."""
+    try:
+        return device.startswith(GPU) and device.removeprefix(GPU) in adapter_names()
+    except StgaError:  # no GPU at all
+        return False
+
+
+# Smaller files
+
+
+def write_tracking(folder: Path, sequence: FlameSequence, refined: np.ndarray, tracked: np.ndarray) -> None:
+    """Write refined and tracked `FlameFrame.parameters` (T, P) of the timesteps of a sequence."""
+    frame = frame_of(refined.T)
+    arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
+    arrays["shape"] = sequence.shape
+    if sequence.static_offset is not None:
+        arrays["static_offset"] = sequence.static_offset
+    arrays["timesteps"], arrays["tracked"] = np.array(sequence.timesteps), tracked
+    write_npz(folder / TRACKING, arrays, compressed=True)
+
+
+def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
+    """The capture with the parameters that the run in `folder` refined; unchanged if it refined none.
+
+    A timestep is replaced only if the capture's tracked parameters are those that the run started from, so that
+    another capture stays unchanged. Raises StgaError if the run's file is damaged.
+    """
+    path, sequence = folder / TRACKING, capture.flame
+    if sequence is None or not path.exists():
+        return capture
+    motion, tracked = read_motion(path, sequence.model), read_npz(path).get("tracked", np.zeros(0))
+    if len(tracked) != len(motion.timesteps):
+        raise StgaError(f"{path}: tracked has shape {tracked.shape}, expected {len(motion.timesteps)} timesteps first")
+    before = dict(zip(motion.timesteps, tracked, strict=True))
+
+    def frame(timestep: int) -> FlameFrame:
+        found = sequence.frame(timestep)
+        if timestep not in before or not np.array_equal(found.parameters, before[timestep]):
+            return found
+        return replace(motion.frame(timestep), dynamic_offset=found.dynamic_offset)
+
+    return with_sequence(capture, replace(sequence, frame=frame))
+
+
+def write_residuals(folder: Path, mean: np.ndarray) -> None:
+    """Write mean (F,): mean absolute error (0…1) of what each triangle's splats show, NaN where that is unknown."""
+    write_npz(folder / RESIDUALS, {"residual": mean.astype(np.float32)}, compressed=True)
+
+
+def read_residuals(folder: Path, faces: int) -> np.ndarray:
+    """(F,) float32 as written. Raises StgaError where there is no such file, or it is of another mesh."""
+    path = folder / RESIDUALS
+    residual = read_npz(path).get("residual")
+    if residual is None or residual.dtype != np.float32 or residual.shape != (faces,):
+        found = "no such array" if residual is None else f"{residual.dtype} {residual.shape}"
+        raise StgaError(f"{path}: expected 'residual', float32 ({faces},), found {found}")
+    return residual

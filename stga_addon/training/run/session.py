@@ -1,11 +1,17 @@
-"""Session of a run in its folder: begun or resumed, trained step by step, and written."""
+"""Training of a run in its folder: begun or resumed, then steps, evaluations and checkpoints in turn."""
 
+import logging
 import math
+import os
+import signal
+import threading
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shutil import copyfile
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -14,31 +20,51 @@ from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...avatar.splats import ADDED
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture, ViewExposure, evenly_spread
-from ...errors import StgaError
+from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
-from ...progress import Cancelled
+from ...progress import Cancelled, Progress, Report, ignore
 from ...schema import to_json
 from ...selection import select_capture
+from ..evaluate import lpips
 from ..evaluate.evaluation_views import EvaluationView, choose_evaluation_views, read_evaluation_view
 from ..evaluate.evaluator import Evaluation, Evaluator, Spent
 from ..evaluate.match_exposure import known_exposure
+from ..evaluate.metrics import peak_memory_mb
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.avatar_tracking import track_by_avatar
 from ..optimize.image_preparation import image_preparation
+from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import TrainingSettings
 from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
-from .continuation import continued_evaluation_views, starting_state
-from .folder import AVATAR, CHECKPOINT, RUN, WORLD_FILE, Run, read_run, write_run
-from .metrics_log import METRICS, cut_metrics, read_metrics
-from .progress import Progress, Report
-from .replay import continued_order
-from .residual_file import write_residuals
+from .continuation import continued_evaluation_views, continued_order, starting_state
+from .folder import (
+    AVATAR,
+    CHECKPOINT,
+    RUN,
+    SELECTION,
+    TRACKING,
+    WORLD_FILE,
+    Run,
+    check_identity,
+    has_run,
+    locked,
+    read_run,
+    with_refined_tracking,
+    write_residuals,
+    write_run,
+    write_tracking,
+)  # fmt: skip
+from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
 from .strain_range import STRAIN_RANGE, require_color_range, strain_range_of, trained_strain_range
-from .tracking_file import TRACKING, with_refined_tracking, write_tracking
 
+_log = logging.getLogger(__name__)
+CHECKPOINT_S = 30.0
+"""Seconds of training between checkpoints: what a crash may cost."""
+CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
+"""Environment variable that replaces it, for machines that are taken away often."""
 TRACKING_START_SHARE, TRACKING_TIME_SHARE = 0.5, 0.2
 """Of the budget, after which the avatar tracks its head; and of a budget in seconds, what that may take."""
 RECENT_LOSSES = 100
@@ -230,13 +256,13 @@ class Session:
 
 
 def begin_session(
-    capture: Capture, folder: Path, run: Run, selection: dict[int, np.ndarray] | None, report: Report
+    capture: Capture, folder: Path, run: Run, selection: Mapping[int, np.ndarray] | None, report: Report
 ) -> tuple[Session, Evaluator]:
     """Start a new run: select triangles, place splats, and write the run's files.
 
     selection: timestep -> (F,) bool to train; None: by the rule.
     """
-    report(Progress(message="Placing splats"))
+    report(Progress(stage="Placing splats"))
     settings, continuation, state = run.settings, run.continuation, None
     if selection is None:
         selection = select_capture(capture, settings.selection) if settings.strategy == "selective" else {}
@@ -261,7 +287,7 @@ def begin_session(
 
 def resume_session(capture: Capture, folder: Path, run: Run, report: Report) -> tuple[Session, Evaluator]:
     """Continue from the folder's checkpoint. Raises StgaError where it does not fit the capture or the settings."""
-    report(Progress(message="Reading the checkpoint"))
+    report(Progress(stage="Reading the checkpoint"))
     assert run.identity is not None
     checkpoint = read_checkpoint(folder)
     if checkpoint.identity != run.identity.digest:
@@ -297,7 +323,7 @@ def _restore(folder: Path, trainer: Trainer, checkpoint: Checkpoint) -> None:
 
 def _strain_range(folder: Path, capture: Capture, run: Run, report: Report) -> np.ndarray | None:
     if run.settings.follows_strain:
-        report(Progress(message="Measuring strain"))
+        report(Progress(stage="Measuring strain"))
     return strain_range_of(folder, capture, run)
 
 
@@ -334,3 +360,212 @@ def _check_state(folder: Path, capture: Capture, settings: TrainingSettings, sta
         found = len(offset.steps)
         if found != faces:
             raise StgaError(f"{folder}: its {name} is of {found} triangles, {capture.root} has {faces}")
+
+
+# Training
+
+
+def train(
+    capture: Capture,
+    out: Path,
+    run: Run,
+    selection: Mapping[int, np.ndarray] | None = None,
+    resume: bool = False,
+    report: Report = ignore,
+    falls_back: bool = False,
+) -> Path:
+    """Train a capture into the folder `out` and return the path of the avatar file.
+
+    selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
+    checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
+    falls_back: where a GPU fails, continue from the last checkpoint on the CPU.
+    Raises StgaError where the capture has nothing to train on, the folder is in use, is the capture's or holds another
+    run or one that cannot be continued (`require_color_range`), or STGA_LPIPS names a file without its weights. A first
+    Ctrl-C raises KeyboardInterrupt when avatar and checkpoint are saved, a second one at once.
+    """
+    try:
+        return _train(capture, out, run, selection, resume, report)
+    except DeviceError as error:
+        if not falls_back:
+            raise
+        _log.warning("%s; continuing on the CPU from the last checkpoint", error.cause)
+    # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
+    report(Progress(stage="Continuing on the CPU"))
+    return _train(capture, out, replace(run, device="cpu"), selection, True, report)
+
+
+def _train(
+    capture: Capture, out: Path, run: Run, selection: Mapping[int, np.ndarray] | None, resume: bool, report: Report
+) -> Path:
+    """`train` on the device of the run."""
+    lpips.load_network()  # read now, because it is needed only when everything is trained
+    if not capture.views.get("train"):
+        raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
+    if run.settings.target_psnr is not None and not capture.views.get("val"):
+        raise StgaError(f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on")
+    if out.resolve() == capture.root:
+        raise StgaError(f"{out}: is the folder of the capture; train into another one")
+    with locked(out):
+        exists = has_run(out)
+        if exists and not resume:
+            raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
+        has_begun = exists and read_run(out).identity is not None
+        identity = check_identity(out, run, capture)
+        run = replace(run, identity=identity)
+        if has_begun and (out / CHECKPOINT).exists():
+            session, evaluator = resume_session(capture, out, run, report)
+        else:
+            if has_begun and selection is None and (out / SELECTION).exists():
+                selection = read_selection(out, len(capture.faces), identity.digest)
+            session, evaluator = begin_session(capture, out, run, selection, report)
+        _Loop(session, evaluator, report).work()
+    return out / AVATAR
+
+
+def _asked_interval_s() -> float | None:
+    """Seconds between checkpoints by the environment variable; None without it. Raises StgaError for no such number."""
+    text = os.environ.get(CHECKPOINT_VARIABLE, "")
+    if not text:
+        return None
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds < math.inf:
+        raise StgaError(f"{CHECKPOINT_VARIABLE}: expected seconds between checkpoints, got {shorten(text)}")
+    return seconds
+
+
+@dataclass
+class _Loop:
+    """Steps, evaluations and checkpoints of a session in turn.
+
+    began  the clock at which the run would have begun, had it never been interrupted
+    speed  iterations per second since this process began to train
+    """
+
+    session: Session
+    evaluator: Evaluator
+    report: Report
+    began: float = 0.0
+    speed: float = 0.0
+
+    def work(self) -> None:
+        """Train until the budget is spent, a goal of the settings is reached or the report asks to stop."""
+        self.report(self._progress("Compiling kernels"))  # meanwhile, the splats are shown as they begin
+        precompile_kernels(self.session.run.device)
+        self.began = perf_counter() - (self.evaluator.lines[-1]["wall_s"] if self.evaluator.lines else 0.0)
+        if self._is_finished():  # a finished run was resumed
+            self._restore_avatar()
+            return
+        with interrupt_requests() as interrupts:
+            if self.session.run.continuation is not None and not self.evaluator.lines:
+                self._evaluate()  # the avatar before, which the others are compared with
+            self._train(interrupts)
+            if self._is_finished():
+                self.session.track_unseen(self._tracks(interrupts))
+            self._evaluate(perceptual=self._is_finished())  # LPIPS takes long, so a run that is stopped goes without
+            self.session.write_checkpoint(self.evaluator)
+            if self._is_finished():
+                self.report(self._progress("Measuring residuals"))
+                self.session.write_residuals()
+        self.report(self._progress("Interrupted" if interrupts else "Finished"))
+        if interrupts:
+            raise KeyboardInterrupt
+
+    def _restore_avatar(self) -> None:
+        """Write a finished run's avatar where it is missing."""
+        path = self.session.folder / AVATAR
+        if path.exists():
+            return
+        _log.warning("%s was missing; it is written anew from the checkpoint, the last state of training", path)
+        self.report(self._progress("Writing the missing avatar from the checkpoint"))
+        self.session.write_avatar()
+        self.session.write_residuals()
+
+    def _train(self, interrupts: list[int]) -> None:
+        session = self.session
+        saved, started, first = session.elapsed_s, session.elapsed_s, session.trainer.iteration
+        asked_s = _asked_interval_s()
+        with session.loader() as loader:
+            while not session.spent().share >= 1:
+                session.step(loader, perf_counter)
+                if session.tracking_is_due and not session.track(perf_counter, self._tracks(interrupts)):
+                    break
+                if self.evaluator.is_due(session.spent()):
+                    self._evaluate()
+                    if self._is_finished():
+                        break
+                if session.elapsed_s - saved > (CHECKPOINT_S if asked_s is None else asked_s):
+                    session.write_checkpoint(self.evaluator)
+                    saved = session.elapsed_s
+                self.speed = (session.trainer.iteration - first) / max(session.elapsed_s - started, 1e-9)
+                if self.report(self._progress("Training")) or interrupts:
+                    break
+
+    def _tracks(self, interrupts: list[int]) -> Callable[[int, int], bool]:
+        """What tracking by the avatar reports to."""
+        return lambda done, total: (
+            self.report(self._progress(f"Tracking by the avatar: {done} of {total}")) or bool(interrupts)
+        )
+
+    def _evaluate(self, perceptual: bool = False) -> None:
+        """Evaluate, keep the avatar where that says so, and append a line of metrics."""
+        begin, session = perf_counter(), self.session
+        evaluation = session.evaluate(self.evaluator, perceptual)
+        session.require_folder()
+        if evaluation.is_kept:
+            session.write_avatar()
+        now = perf_counter()
+        line = {
+            **session.figures(),
+            **evaluation.quality,
+            "evaluation_s": round(now - begin, 3),
+            "wall_s": round(now - self.began, 3),
+            "peak_memory_mb": peak_memory_mb(),
+        }
+        append_metrics(session.folder, self.evaluator.record(evaluation, line, session.spent()))
+
+    def _is_finished(self) -> bool:
+        return self.evaluator.is_finished(self.session.spent())
+
+    def _progress(self, stage: str) -> Progress:
+        session, spent, evaluator = self.session, self.session.spent(), self.evaluator
+        figures = {
+            "iteration": spent.iterations, "per_second": self.speed, "left_s": spent.left_s, "loss": session.loss,
+            "psnr": evaluator.psnr, "psnr_unmatched": evaluator.psnr_unmatched, "splats": len(session.trainer),
+        }  # fmt: skip
+
+        def known() -> dict[str, float]:
+            values = {**figures, "memory_mb": peak_memory_mb()}
+            return {name: float(value) for name, value in values.items() if value is not None}
+
+        def preview(path: Path) -> None:
+            with suppress(StgaError):  # training continues without one, and reports a full disk itself
+                write_avatar(path, session.avatar())
+
+        return Progress(min(1.0, spent.share), stage, evaluator.forecast_text, known, preview)
+
+
+@contextmanager
+def interrupt_requests() -> Iterator[list[int]]:
+    """A list that receives the first Ctrl-C; the second one raises KeyboardInterrupt.
+
+    Without effect off the main thread and in Blender, which handles Ctrl-C itself.
+    """
+    requests: list[int] = []
+
+    def request(number: int, _frame: object) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield requests
+        return
+    signal.signal(signal.SIGINT, request)
+    try:
+        yield requests
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

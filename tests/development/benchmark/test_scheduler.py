@@ -18,15 +18,15 @@ from stga_addon.development.benchmark.slice import runs_of
 from stga_addon.development.benchmark.variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
-from stga_addon.perform.perform import perform
-from stga_addon.progress import Cancelled
+from stga_addon.jobs.folder import request_folder, write_request
+from stga_addon.jobs.perform import perform
+from stga_addon.jobs.table import Benchmark
+from stga_addon.jobs.train import Train
+from stga_addon.progress import Cancelled, Progress
 from stga_addon.progress import Progress as WorkProgress
-from stga_addon.requests.folder import request_folder, write_request
-from stga_addon.requests.values import Benchmark, Train
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.progress import Progress
 from stga_addon.training.settings import make_settings
 
 TINY = {"lattice": 0, "hull_points": False, "sh_degree": 0, "sh_steps": (), "density_interval": 0}
@@ -38,7 +38,7 @@ def run_in(capture: Capture, out: Path, **changes: Any) -> BenchmarkRun:
 
 
 def progress(share: float, iteration: int = 1) -> Progress:
-    return Progress(share, iteration, 1.0, 0.0, None, 1, 1.0)
+    return Progress(share, figures=lambda: {"iteration": iteration})
 
 
 def test_turns() -> None:

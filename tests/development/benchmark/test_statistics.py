@@ -17,7 +17,7 @@ from stga_addon.development.benchmark.statistics import (
     summarize,
     within_spread,
 )
-from stga_addon.report.run_summary import evaluation_share
+from stga_addon.report import evaluation_share
 
 
 def line(seconds: float, psnr: float, iteration: int = 0, **more: Any) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, strategies, trainer
 from stga_addon.training.optimize.image_preparation import exposure_correction
-from stga_addon.training.run import loop, session
+from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings
@@ -45,7 +45,7 @@ def train(capture, folder, monkeypatch, choice):
     calls: Counter[str] = Counter()
     for effect, (module, name) in CALLS.items():
         monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
-    loop.train(capture, folder, Run(capture.root, None, "vhap", settings, plan))
+    session.train(capture, folder, Run(capture.root, None, "vhap", settings, plan))
     return calls, read_checkpoint(folder).state.splats()
 
 
@@ -83,7 +83,7 @@ def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
     calls: Counter[str] = Counter()
     for module, name in ((trainer, "RefinedTracking"), (cpu_backend, "frame_backward"), (session, "write_tracking")):
         monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
-    loop.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
+    session.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
     if choice == "off":
         assert calls == {}
         assert read_checkpoint(tmp_path / "run").tracking is None

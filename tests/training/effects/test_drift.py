@@ -10,7 +10,7 @@ from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.image_preparation import view_exposure
 from stga_addon.training.run.folder import Run
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.session import train
 from stga_addon.training.settings import make_settings
 
 from .scenes import Scene, photograph

@@ -23,7 +23,7 @@ from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import starting_state
 from stga_addon.training.run.folder import Continuation, Run
 from stga_addon.training.run.identity import file_digest
-from stga_addon.training.run.loop import train
+from stga_addon.training.run.session import train
 
 from ..test_driven_offsets import squeezed
 from ..toys import bits, quick_settings
@@ -74,7 +74,7 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture: Capture, tm
     assert run.settings.driven_offsets == (NAME,)
     assert dict(describe_effects(run.effect_plan))["toy-growth"] == "on: the head grows [6 numbers]"
     train(capture, tmp_path / "whole", run)
-    train(capture, tmp_path / "parts", run, report=lambda progress: progress.iteration == 13)
+    train(capture, tmp_path / "parts", run, report=lambda progress: progress.figures().get("iteration", 0) == 13)
     assert read_checkpoint(tmp_path / "parts").iteration == 13
     train(capture, tmp_path / "parts", run, resume=True)
     whole, parts = (read_checkpoint(tmp_path / name).state for name in ("whole", "parts"))

@@ -60,7 +60,7 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
 
 def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     """Catches a run that goes on with other effects than it began with."""
-    monkeypatch.setattr("stga_addon.perform.training.plan_effects", None)
+    monkeypatch.setattr("stga_addon.training.effects.plan.plan_effects", None)
     before = read_run(trained)
     train = ["train", str(root), "--out", str(trained), "--resume"]
     assert main([*train, "--effect", "strain-color=on"]) == 0

@@ -13,7 +13,7 @@ from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
 from stga_addon.training.effect_catalog import EFFECTS, RELIGHT
-from stga_addon.training.effect_decisions import parse_choices
+from stga_addon.training.effect_decisions import parse_choice
 from stga_addon.training.effects import rules
 from stga_addon.training.effects.evidence import Evidence, fit_cameras, stable_colors
 from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
@@ -392,10 +392,10 @@ def test_a_report_that_does_not_tell_how_the_torso_moves(tmp_path, change):
 def test_names():
     """Catches an effect without a rule, and a rule without an effect."""
     assert list(rules.RULES) == list(EFFECTS)
-    assert parse_choices(["jaw=off", "hull-points=on"]) == {"jaw": "off", "hull-points": "on"}
+    assert parse_choice("jaw=off") == ("jaw", "off")
     for wrong in ("jaws=on", "jaw", "jaw=maybe"):
         with pytest.raises(StgaError, match=f"'{wrong}' is not NAME=on"):
-            parse_choices([wrong])
+            parse_choice(wrong)
 
 
 def test_samples(painted):

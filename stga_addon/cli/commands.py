@@ -1,0 +1,384 @@
+"""The commands: for each the dataclasses whose fields are its options, and what it does with them."""
+
+import json
+import os
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ..avatar.file import read_avatar
+from ..capture.model import Capture, summarize_capture
+from ..capture.open import open_capture
+from ..errors import StgaError
+from ..export.formats import FORMATS
+from ..export.ply import is_ply
+from ..files import write_npz
+from ..format import format_table
+from ..jobs.analyze import Analyze, Select, TimePresets
+from ..jobs.avatar_source import OpenHead, avatar_path
+from ..jobs.convert_motion import ConvertMotion
+from ..jobs.export import Export
+from ..jobs.finished_run import Evaluate, Relight
+from ..jobs.render import Render
+from ..jobs.results import Selected
+from ..jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track, read_inputs
+from ..jobs.train import Extend, Refine, Resume, SelectForTake, Train
+from ..options import add_options, flag_of, given_options, like, option, option_fields
+from ..progress import ignore
+from ..schema import to_json
+from ..selection import SelectionOptions
+from ..training.run.folder import AVATAR, RUN, Run, has_run, next_folder, read_run
+from ..training.settings import TrainingSettings, make_settings
+from .batch import BatchOptions, EngineOptions, run_batch_command
+from .carry_out import ProgressBar, carry_out
+
+BLEND = "avatar.blend"
+TRAIN_SECONDS, REFINE_SECONDS, EXTEND_SECONDS = 120.0, 20.0, 60.0
+"""Budgets where none is given."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    about      what it does; the first sentence is its line in the list of commands
+    run        carries it out, with the head of the open .blend file where it stands in for what is not named
+    options    dataclasses whose fields are its options; a tuple: and which of them
+    may_lack   fields without a default that need not be given
+    uses_head  whether the open file's capture and avatar stand in for those that are not named
+    """
+
+    about: str
+    run: Callable[[Namespace, OpenHead | None], object]
+    options: tuple[Any, ...]
+    may_lack: tuple[str, ...] = ()
+    uses_head: bool = False
+
+    def add_arguments(self, parser: ArgumentParser, head: OpenHead | None) -> None:
+        may_lack = [*self.may_lack]
+        if self.uses_head and head is not None:
+            may_lack += ["capture"] if head.avatar is None else ["capture", "source"]
+        for item in self.options:
+            kind, *names = item if isinstance(item, tuple) else (item,)
+            add_options(parser, kind, *names, may_lack=may_lack)
+
+    def carry_out(self, options: Namespace, head: OpenHead | None) -> None:
+        """Run it. Where a head is open, what it holds stands in for what is not named."""
+        head = head if self.uses_head else None
+        if head is not None and getattr(options, "source", "") is None:
+            options.source = head.avatar
+        if head is not None and options.capture is not None:
+            head = None
+        elif head is not None:
+            options.capture, options.flame = head.capture, options.flame or head.flame
+            if "source" not in options:  # of an avatar's cameras: as in its training
+                options.principal_point = options.principal_point or head.principal_point
+        self.run(options, head)
+
+
+def _about(kind: Any) -> str:
+    """A request's docstring without its fields."""
+    return str(kind.__doc__).partition("\n\n")[0].partition("; other fields")[0]
+
+
+def _asking(kind: Any, with_bar: bool = True, **more: Any) -> Command:
+    """A command that makes a request of a kind from its options, and carries it out."""
+    missing = dict.fromkeys(more.get("may_lack", ()))
+
+    def run(options: Namespace, head: OpenHead | None) -> None:
+        carry_out(kind(**{**missing, **given_options(options, kind)}), with_bar)
+
+    return Command(_about(kind), run, (kind,), **more)
+
+
+# Training
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    resume: bool = option("continue the run in the folder", False)
+
+
+def _train(options: Namespace, head: OpenHead | None) -> None:
+    given = {**given_options(options, Train), "selection": None if head is None else head.selection()}
+    if options.resume:
+        _refuse_changes(options, read_run(options.run))
+        carry_out(Resume(**given))
+        return
+    if has_run(options.run):
+        raise StgaError(f"{options.run}: already holds a run; give --resume to continue it, or another --out")
+    carry_out(Train(settings=_settings(options), **given))
+
+
+def _settings(options: Namespace) -> TrainingSettings:
+    """The settings of a new run. Raises StgaError for options that do not go together, or would have no effect."""
+    given = given_options(options, TrainingSettings)
+    paper, other_method = given.get("schedule") == "paper", given.get("strategy") == "gaussian-avatars"
+    for named, is_replaced, by in (
+        ("--schedule paper", paper and other_method, "--strategy gaussian-avatars"),
+        ("--preset", "preset" in given and paper, "--schedule paper"),
+        ("--preset", "preset" in given and other_method, "--strategy gaussian-avatars"),
+    ):
+        if is_replaced:
+            raise StgaError(f"{named}: cannot be combined with {by}, which has settings of its own")
+    if not {"iterations", "seconds", "preset"} & given.keys():
+        given["seconds"] = TRAIN_SECONDS
+    if not (paper or other_method):
+        given.setdefault("effects", {})
+    settings, selection = make_settings(**given), given_options(options, SelectionOptions)
+    if selection and settings.strategy != "selective":
+        raise StgaError("--threshold: has no effect without --strategy selective, or --schedule paper")
+    return replace(settings, selection=replace(settings.selection, **selection))
+
+
+def _refuse_changes(options: Namespace, run: Run) -> None:
+    """Raise StgaError for an option that differs from what the run to be resumed began with."""
+    for kind, began_with in ((TrainingSettings, run.settings), (SelectionOptions, run.settings.selection)):
+        for spec in option_fields(kind):
+            value, given = getattr(began_with, spec.name), getattr(options, spec.name, None)
+            if given not in (None, value) and spec.name != "effects":
+                raise StgaError(f"{flag_of(spec)}: this run began with {value}, which cannot change; use another --out")
+    decided = {decision.effect: "on" if decision.on else "off" for decision in run.effect_plan}
+    for name, choice in options.effects or ():
+        if name not in decided or choice not in ("auto", decided[name]):
+            raise StgaError(f"--effect {name}={choice}: differs from what was decided for this run; use another --out")
+
+
+@dataclass(frozen=True)
+class AvatarOptions:
+    out: Path = option("folder of capture, run and file", flag="--out", metavar="DIR")
+    no_blend: bool = option("write no .blend file", False)
+
+
+def _avatar(options: Namespace, head: OpenHead | None) -> None:
+    settings, out, run = _settings(options), options.out, options.out / RUN_FOLDER
+    if has_run(run):
+        _refuse_changes(options, read_run(run))
+    track = Track(**{"model": None, **given_options(options, Track), "out": out / CAPTURE_FOLDER})
+    device = {} if options.device is None else {"device": options.device}
+    carry_out(MakeAvatar(track, Train(run, track.out, settings, **device)))
+    if options.no_blend:
+        return
+    if find_spec("bpy") is None:
+        print("warning: no .blend file: this Python has no bpy (install bpy, or run the command in Blender)")
+        return
+    from ..training.run.folder import with_refined_tracking
+
+    print(f"blender: {write_blend(out, lambda capture: with_refined_tracking(capture, run))}")
+
+
+def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callable[[Any], object] = bool) -> Path:
+    """Write the .blend file of what `stga avatar` left in `out`; needs bpy, whose open file it replaces.
+
+    refine: gives the capture's heads as training refined them; finish: called with the head before saving.
+    Raises StgaError.
+    """
+    from ..export.playback import playback_fps
+    from ..scene.avatar_scene import set_up_head, show_on_head, show_world
+    from ..scene.blend_file import empty_file, save_file
+    from ..tracking.folder import is_flame
+
+    inputs, run = read_inputs(out), out / RUN_FOLDER
+    flame = Path(inputs["model"]) if inputs["model"] and is_flame(out / CAPTURE_FOLDER) else None
+    capture, avatar = open_capture(out / CAPTURE_FOLDER, flame), read_avatar(run / AVATAR)
+    empty_file()
+    head = set_up_head(refine(capture))
+    show_on_head(avatar, head, f"//{RUN_FOLDER}/{AVATAR}", playback_fps(capture, numbered=True))
+    show_world(run / AVATAR, head)
+    finish(head)
+    save_file(out / BLEND)
+    return Path(out / BLEND)
+
+
+# Continuing a finished run
+
+
+@dataclass(frozen=True)
+class ContinueOptions:
+    resume: bool = option("RUN was stopped: continue it", False)
+
+
+@dataclass(frozen=True)
+class SelectOptions:
+    select_only: Path | None = option(
+        "only write which triangles it would train: timestep of the take -> triangles", None, metavar="NPZ"
+    )
+
+
+def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
+    """A command that continues a finished run in one of its own, or resumes such a run."""
+
+    def run(options: Namespace, head: OpenHead | None) -> None:
+        given = given_options(options, kind)
+        takes, only = given.get("captures"), getattr(options, "select_only", None)
+        if options.resume:
+            _resume(kind, given, only)
+        elif takes and only:
+            if len(takes) != 1:
+                raise StgaError(f"--select-only: expected one CAPTURE, got {len(takes)}")
+            _write_selection(SelectForTake(options.parent, takes[0], options.flame), only)
+        else:
+            folder = given.setdefault("run", next_folder(options.parent))
+            if has_run(folder):
+                raise StgaError(
+                    f"{folder}: already holds a run; choose another --out, or give --resume and this folder"
+                )
+            if not {"seconds", "iterations"} & given.keys():
+                given["seconds"] = seconds
+            carry_out(kind(**given))
+
+    return Command(_about(kind), run, (kind, ContinueOptions, *more), may_lack=("run", "captures"))
+
+
+def _resume(kind: Any, given: dict[str, Any], select_only: Path | None) -> None:
+    """Raises StgaError for an option that would have no effect, or a run that continues none."""
+    flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
+    flags += ["--select-only"] if select_only else []
+    useless = next((flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None)
+    if useless is not None:
+        raise StgaError(f"{useless}: cannot be combined with --resume, which continues the run in RUN as it began")
+    if read_run(given["parent"]).continuation is None:
+        raise StgaError(f"{given['parent']}: does not continue another run; resume it with `stga train --resume`")
+    carry_out(Resume(given["parent"], **{name: given[name] for name in ("flame", "device") if name in given}))
+
+
+# Captures
+
+
+@dataclass(frozen=True)
+class SelectOutput:
+    out: Path | None = option("also write timestep -> triangles", None, metavar="NPZ")
+
+
+def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
+    """Carry out the request, and write timestep -> triangles into an .npz file where there is a path."""
+    found = carry_out(request, with_bar=False)
+    assert isinstance(found, Selected)
+    if path is not None:
+        write_npz(path, {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}, compressed=True)
+
+
+@dataclass(frozen=True)
+class InfoOptions:
+    json: bool = option("print the effects alone, as JSON", False)
+
+
+def _info(options: Namespace, head: OpenHead | None) -> None:
+    path = options.capture
+    if (path / RUN).exists() or path.suffix == ".npz":
+        from ..jobs.finished_run import describe_light
+
+        avatar = read_avatar(avatar_path(path))
+        light = describe_light(avatar.light) if avatar.light else ("light: unknown; `stga relight RUN` estimates it",)
+        rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
+        rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
+        print(*format_table(rows), sep="\n")
+        return
+    if options.timed and not options.json:
+        raise StgaError("--presets: has no effect without --json; `stga presets` prints them")
+    request = Analyze(**given_options(options, Analyze))
+    capture = None if options.json else open_capture(path, request.flame, request.principal_point)
+    found: Any = carry_out(request, with_bar=False)
+    if capture is None:
+        print(json.dumps(to_json(found)))
+        return
+    print(*format_table(summarize_capture(capture)), sep="\n")
+    if found.plan:
+        from ..training.effects.plan import describe_effects
+
+        print("", *format_table(describe_effects(found.plan)), sep="\n")
+
+
+# Avatars
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    out: Path | None = option("folder for PNGs", None, metavar="DIR", group="output")
+    video: Path | None = option("every timestep from one camera, as MP4", None, metavar="FILE.mp4", group="output")
+
+
+def _render(options: Namespace, head: OpenHead | None) -> None:
+    output = options.video or options.out
+    if output is None:
+        raise StgaError("--out: is missing; expected it, or --video")
+    given = {**given_options(options, Render), "output": output, "video": options.video is not None}
+    if head is not None and options.motion is None and not is_ply(options.source):
+        given["played"] = head.played()
+    carry_out(Render(**given))
+
+
+def _export(options: Namespace, head: OpenHead | None) -> None:
+    given = given_options(options, Export)
+    if head is not None:
+        given.setdefault("fps", head.fps)
+        if options.motion is None and (FORMATS[options.file_format].source != "frame" or options.timestep is not None):
+            given["played"] = head.played()
+    carry_out(Export(**given))
+
+
+# Requests in folders
+
+
+@dataclass(frozen=True)
+class PerformOptions:
+    folder: Path = option("folder that holds request.json", flag="FOLDER")
+    resume: bool = option("continue what this request began in its output folder, if it did", False)
+    threads: int | None = like(EngineOptions, "threads", help="threads to compute on (default: all processors)")
+
+
+def _perform(options: Namespace, head: OpenHead | None) -> None:
+    if options.threads is not None:
+        os.environ["OMP_NUM_THREADS"] = str(options.threads)  # for torch, which is not imported yet
+        if find_spec("numba") is not None:  # else it is work that needs no kernels
+            import_module("..raster.cpu.threads", __package__).set_threads(options.threads)
+    from ..jobs.perform import perform_in_folder
+
+    if not sys.stderr.isatty():  # started by Blender, which reads the status in the folder
+        perform_in_folder(options.folder, also=ignore, resume=bool(options.resume))
+        return
+    with ProgressBar() as bar:
+        perform_in_folder(options.folder, bar.say, bar.report, bool(options.resume))
+
+
+COMMANDS = {
+    "avatar": Command(
+        "Make an avatar from footage: track, train, and write a report and a .blend file. Called again with the same "
+        "arguments, it continues where it was interrupted.",
+        _avatar,
+        ((Track, *(spec.name for spec in option_fields(Track) if spec.name != "out")), AvatarOptions,
+         TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
+        may_lack=("model",),
+    ),
+    "track": _asking(Track, may_lack=("model",)),
+    "train": Command(
+        _about(Train), _train, (Train, TrainingSettings, (SelectionOptions, "threshold"), TrainOptions), uses_head=True
+    ),
+    "refine": _continuing(Refine, REFINE_SECONDS),
+    "extend": _continuing(Extend, EXTEND_SECONDS, SelectOptions),
+    "relight": _asking(Relight),
+    "perform": Command(
+        "Carry out the request that a folder holds, as a worker of Blender's panel or of a render farm does. The "
+        "folder holds request.json; status, previews and result are written beside it.",
+        _perform, (PerformOptions,),
+    ),
+    "batch": Command(
+        "Carry out a plan of many jobs, or train many captures, on this machine or on the engine that is there.",
+        run_batch_command, (BatchOptions, EngineOptions),
+    ),
+    "render": Command(_about(Render), _render, (RenderOutput, Render), uses_head=True),
+    "eval": _asking(Evaluate, with_bar=False),
+    "select": Command(
+        _about(Select), lambda options, head: _write_selection(Select(**given_options(options, Select)), options.out),
+        (Select, SelectOutput), uses_head=True,
+    ),
+    "export": Command(_about(Export), _export, (Export,), uses_head=True),
+    "drive": _asking(ConvertMotion),
+    "info": Command(_about(Analyze), _info, (Analyze, InfoOptions), uses_head=True),
+    "presets": _asking(TimePresets, with_bar=False, uses_head=True),
+}  # fmt: skip

@@ -1,0 +1,98 @@
+"""What a capture calls for before it is trained: effects, time, and the triangles that move."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..capture.open import open_capture
+from ..format import format_duration
+from ..options import like, option
+from ..progress import Progress, Report, Say
+from ..render.device import choose_device
+from ..selection import SelectionOptions, select_capture
+from ..training.settings import TrainingSettings, make_settings
+from .results import Analyzed, Selected
+from .train import Train
+
+
+@dataclass(frozen=True)
+class Analyze:
+    """Show what a capture holds, and which effects training on it would use; or what a run or avatar file holds.
+
+    timed: whether presets are timed as well, which takes longer.
+    """
+
+    capture: Path = like(Train, "capture")
+    flame: Path | None = like(Train, "flame")
+    principal_point: str = like(Train, "principal_point")
+    effects: Mapping[str, str] | None = like(TrainingSettings, "effects")
+    device: str = like(Train, "device")
+    timed: bool = option("with --json: also the presets and their times", False, flag="--presets")
+
+
+@dataclass(frozen=True)
+class TimePresets:
+    """Show the presets, and how long each would train on this machine."""
+
+    capture: Path = like(Train, "capture")
+    flame: Path | None = like(Train, "flame")
+    principal_point: str = like(Train, "principal_point")
+    device: str = like(Train, "device")
+
+
+@dataclass(frozen=True)
+class Select:
+    """Show which triangles each frame selects for training."""
+
+    capture: Path = like(Train, "capture")
+    flame: Path | None = like(Train, "flame")
+    principal_point: str = like(Train, "principal_point")
+    threshold: float = like(SelectionOptions, "threshold")
+    zero_pose: str | None = like(
+        SelectionOptions, "zero_pose", default=None, help="motion that does not count as expression (default head)"
+    )
+
+
+def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
+    """Decide the effects of a training on the capture, and time the presets where that is asked for. Raises
+    StgaError; a capture without training views calls for nothing."""
+    from ..training.effects.plan import plan_effects
+
+    report(Progress(stage="Analyzing the capture"))
+    capture = open_capture(request.capture, request.flame, request.principal_point)
+    if not capture.views.get("train"):
+        return Analyzed((), {})
+    device, _ = choose_device(request.device)
+    _, plan = plan_effects(capture, make_settings(iterations=1, effects=dict(request.effects or {})), device)
+    if not request.timed:
+        return Analyzed(plan, {})
+    from ..training.preset_timing import time_presets  # imports Numba, which deciding effects does without
+
+    report(Progress(0.5, "Timing the presets"))
+    return Analyzed(plan, {timing.preset: timing.seconds for timing in time_presets(capture, device=device)})
+
+
+def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:
+    """Time the presets; says what each is for. Raises StgaError."""
+    from ..training.preset_timing import time_presets
+
+    capture = open_capture(request.capture, request.flame, request.principal_point)
+    device, why = choose_device(request.device)
+    say(why)
+    timings = time_presets(capture, device=device)
+    for timing in timings:
+        time = f"about {format_duration(timing.seconds):<10}"
+        say(f"{timing.preset:<9} {timing.iterations:6d} iterations  {time}  {timing.purpose}")
+    return Analyzed((), {timing.preset: timing.seconds for timing in timings})
+
+
+def select(request: Select, report: Report, say: Say) -> Selected:
+    """Select by the rule; says how much each timestep selects, and which regions as a whole. Raises StgaError."""
+    capture = open_capture(request.capture, request.flame, request.principal_point)
+    options = SelectionOptions(request.threshold, request.zero_pose or SelectionOptions.zero_pose)
+    selection = select_capture(capture, options)
+    say(f"threshold {1000 * request.threshold:g} mm, {len(capture.faces)} triangles")
+    for timestep, faces in selection.items():
+        regions = [name for name, members in capture.regions.items() if members.any() and faces[members].all()]
+        say(f"{timestep:5d}  {faces.mean():6.1%}  {', '.join(regions)}")
+    return Selected(selection)

@@ -1,0 +1,192 @@
+"""Rendering for Blender: images that it has recorded, and frames of a .blend file by the Blender of this machine."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from ..errors import StgaError
+from ..options import like
+from ..progress import Cancelled, Progress, Report, Say, counted
+from ..render.compose import Composer
+from ..render.recording import finished, is_video, recorded_images
+from ..render.video import sequence_writer, video_writer
+from ..schema import MAX_COUNT, setting
+from ..worker.launch import end_with_this_process
+from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
+from .results import Written
+from .train import Train
+
+PARTIAL = ".rendering-"
+"""Start of the name of the folder that Blender writes into; a picture leaves it when it is whole."""
+SAVED = re.compile(r"Saved: '(?P<path>.+)'")
+"""What Blender prints when it has written a picture."""
+LAST_LINES = 30
+"""Lines of Blender's output that are searched for why it failed."""
+STOP_TIMEOUT_S = 10.0
+MAX_FRAME = 1_048_574
+"""Blender's last frame."""
+FRAME_DIGITS = 6
+"""Of the name of a frame's picture, as many as this at least."""
+
+
+@dataclass(frozen=True)
+class RenderRecording:
+    """Render the images that Blender has recorded, and encode them.
+
+    recording       file of the images (`render.recording`), removed afterwards
+    output          an .mp4 file, or a folder for PNGs
+    images          how many
+    background      sRGB in 0…1; None: transparent in PNGs, black in a video
+    """
+
+    recording: Path
+    output: Path
+    images: int = setting(minimum=0, maximum=MAX_COUNT)
+    fps: float = setting(above=0)
+    background: tuple[float, float, float] | None = setting(None, 0, 1)
+    device: str = like(Train, "device")
+
+
+def render_recording(request: RenderRecording, report: Report, say: Say) -> Written:
+    """Render the recorded images and write them; the recording is removed.
+
+    A cancelled video is not written; images of a sequence that are finished stay. Raises StgaError.
+    """
+    try:
+        composer = Composer(request.device)
+        output = request.output
+        with video_writer(output, request.fps) if is_video(output) else sequence_writer(output) as write:
+            images = recorded_images(request.recording, request.images, composer)
+            for image in counted(images, request.images, report, "Rendering", "Image"):
+                write(finished(image, request.background, is_video(request.output)))
+    finally:
+        request.recording.unlink(missing_ok=True)
+    return Written(request.output)
+
+
+@dataclass(frozen=True)
+class RenderBlend:
+    """Render frames of a .blend file with the Blender of the machine, as PNGs called by their numbers (000012.png).
+
+    output          folder; pictures that it holds already stay
+    frames          first and last
+    engine          as Blender's --engine takes it
+    """
+
+    blend: Path
+    output: Path
+    frames: tuple[int, int] = setting(minimum=0, maximum=MAX_FRAME)
+    engine: str = "STGA_SPLATS"
+
+    def check(self) -> None:
+        """Raise StgaError for a file of another name, and frames in the wrong order."""
+        if self.blend.suffix.lower() != ".blend":
+            raise StgaError(f"{self.blend}: expected a name that ends in .blend")
+        if self.frames[0] > self.frames[1]:
+            raise StgaError(f"frames: expected the first and then the last, got {self.frames[0]}, {self.frames[1]}")
+
+    @property
+    def pictures(self) -> dict[int, Path]:
+        """Frame -> its file."""
+        first, last = self.frames
+        return {frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in range(first, last + 1)}
+
+
+def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
+    """Render the frames that have no picture yet.
+
+    The add-on has to be enabled in that Blender; it renders with the Python of this process, unless
+    STGA_PYTHON names another. Raises StgaError where Blender is missing or fails, Cancelled between two pictures.
+    """
+    if not request.blend.is_file():
+        raise StgaError(f"{request.blend}: is not a file; expected a .blend file")
+    pictures = request.pictures
+    missing = [frame for frame, path in pictures.items() if not path.exists()]
+    done = len(pictures) - len(missing)
+    report(Progress(done / len(pictures), "Rendering"))
+    for _, numbered in groupby(enumerate(missing), lambda item: item[1] - item[0]):  # runs that follow each other
+        frames = [frame for _, frame in numbered]
+        for _ in _rendered(request, frames[0], frames[-1], say):
+            done += 1
+            detail = f"Frame {done} of {len(pictures)}"
+            if report(Progress(done / len(pictures), "Rendering", detail)) and done < len(pictures):
+                raise Cancelled
+    return Written(request.output)
+
+
+def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator[Path]:
+    """Let Blender render the frames; yields each picture when it is whole."""
+    request.output.mkdir(parents=True, exist_ok=True)
+    for left in request.output.glob(PARTIAL + "*"):  # of a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    with TemporaryDirectory(prefix=PARTIAL, dir=request.output) as partial:
+        process = _start(request, first, last, Path(partial))
+        printed: deque[str] = deque(maxlen=LAST_LINES)
+        pictures, expected = request.pictures, first
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                printed.append(line.strip())
+                say(line.rstrip())
+                picture, found = pictures[min(expected, last)], SAVED.search(line)
+                if found is not None and Path(found["path"]).name == picture.name:
+                    os.replace(Path(partial, picture.name), picture)
+                    expected += 1
+                    yield picture
+            code = process.wait()
+        finally:
+            _stop(process)
+    if expected <= last:
+        lines = [line for line in printed if line] or ["it printed nothing"]
+        said = ([line for line in lines if "error" in line.lower()] or lines)[-1]
+        ended = f"Blender ended with exit status {code}: {said}"
+        raise StgaError(f"{request.blend}: frame {expected} was not rendered: {ended}")
+
+
+def blender_command() -> list[str]:
+    """What starts this machine's Blender: the program or command in STGA_BLENDER, else the program `blender`."""
+    text = os.environ.get(BLENDER_VARIABLE, "")
+    if os.path.isfile(text):  # whose path may hold spaces
+        return [text]
+    return shlex.split(text, posix=os.name != "nt") or ["blender"]
+
+
+def _start(request: RenderBlend, first: int, last: int, folder: Path) -> subprocess.Popen[str]:
+    blend, names = str(request.blend.absolute()), str(folder.absolute() / ("#" * FRAME_DIGITS))
+    command = [
+        *blender_command(), "--background", blend, "--engine", request.engine,
+        "--render-output", names, "--render-format", "PNG", "--use-extension", "1",
+        "--frame-start", str(first), "--frame-end", str(last), "--frame-jump", "1", "--render-anim",
+    ]  # fmt: skip
+    # Without the variables of this Python, whose place the add-on is told.
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    try:
+        return subprocess.Popen(
+            command, env={PYTHON_VARIABLE: sys.executable, **kept}, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace", preexec_fn=end_with_this_process(),
+        )  # fmt: skip
+    except OSError as error:
+        expected = f"expected it on PATH, or the command that starts it in {BLENDER_VARIABLE}"
+        raise StgaError(f"{command[0]}: Blender cannot be started ({error.strerror or error}); {expected}") from error
+
+
+def _stop(process: subprocess.Popen[str]) -> None:
+    """End Blender, if it is still running."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    if process.stdout is not None:
+        process.stdout.close()

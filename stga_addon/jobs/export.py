@@ -1,0 +1,215 @@
+"""Export of an avatar in another format: one frame, a range of frames, or splats with their FLAME motion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..avatar.file import Avatar
+from ..capture.camera import Camera
+from ..capture.model import Capture
+from ..driving.head_map import page_controls
+from ..driving.open_motion import MotionOptions
+from ..errors import StgaError
+from ..export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar
+from ..export.playback import DEFAULT_FPS, MAX_VIEWS, Playback, playback_fps
+from ..export.web.page import flame_notice
+from ..flame.sequence import FlameSequence
+from ..format import format_bytes
+from ..light.relight import albedo_avatar
+from ..options import flag_of, like, option
+from ..progress import Report, Say, counted
+from ..selection import SelectionOptions, select_capture
+from ..training.run.folder import AVATAR, SELECTION
+from .avatar_source import (
+    Played,
+    motion_capture,
+    motion_field,
+    motion_options_field,
+    open_avatar,
+    open_avatar_motion,
+    required_capture,
+    timesteps_between,
+)  # fmt: skip
+from .results import Written
+from .train import Train
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write an avatar in another format, for other viewers and tools; other fields as of `avatar_source.Posed`."""
+
+    source: Path = option("folder of a run, or avatar file", flag="RUN|AVATAR")
+    output: Path = option("the file, or the folder of a format of several", flag="--out")
+    file_format: str = option(
+        "file format", flag="--format", choices={name: format.description for name, format in FORMATS.items()}
+    )
+    capture: Path | None = option("whose frames to bake (default: the run's)", None)
+    flame: Path | None = like(Train, "flame", help="FLAME model file of that capture, or of the motion")
+    played: Played | None = None
+    timestep: int | None = option("of a format that holds one frame (default: the neutral mesh)", None, 0)
+    frames: tuple[int, int] | None = option("of a format that holds several (default: all)", None, metavar="FIRST:LAST")
+    fps: float | None = option(
+        f"frames per second of usd and web (default: the scene's or the capture's, else {DEFAULT_FPS:g})", None, above=0
+    )
+    motion_only: bool = option(
+        "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take stay in the page, and "
+        "FLAME's licence decides who may receive it either way",
+        False,
+    )
+    motion: Path | None = motion_field()
+    motion_options: MotionOptions = motion_options_field("motion")
+    albedo: bool = option("leave out the capture's light: colors are the albedo (docs/light.md)", False)
+
+    def check(self) -> None:
+        """Raise StgaError for a file name of another format, and for what the format would leave out."""
+        held = {
+            "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
+            "frames": [name for name, format in FORMATS.items() if format.source == "range"],
+            "motion_only": [name for name, format in FORMATS.items() if format.is_page],
+        }
+        for name, formats in held.items():
+            if getattr(self, name) not in (None, False) and self.file_format not in formats:
+                flag = flag_of(type(self).__dataclass_fields__[name])
+                raise StgaError(
+                    f"{flag} cannot be combined with --format {self.file_format}, only with {', '.join(formats)}"
+                )
+        if self.motion is not None and self.file_format in held["timestep"] and self.timestep is None:
+            raise StgaError(f"--motion: has no effect with --format {self.file_format} without --timestep")
+        check_suffix(self.output, self.file_format)
+
+
+# Work
+
+
+def export(request: Export, report: Report, say: Say) -> Written:
+    """Write the file or the folder. Says how much room several frames take; raises StgaError."""
+    avatar, capture = open_avatar(request)
+    if request.albedo:
+        avatar = albedo_avatar(avatar)
+    if request.motion is not None:
+        capture = motion_capture(request, open_avatar_motion(request, avatar, say), capture)
+    fps = playback_fps(capture, request.fps, numbered=request.file_format == "usd")
+    format, playback = FORMATS[request.file_format], None
+    flame = None if capture is None else capture.flame
+    meshes: Meshes = ()
+    if format.is_page and capture is None and request.frames is None:
+        _say_size(request, avatar, 1, say)
+        playback = still_playback(request, avatar, fps, say)
+        meshes = [(0, avatar.neutral)]
+    elif format.source == "range":
+        capture = required_capture(capture)
+        timesteps = timesteps_between(capture, request.frames, say)
+        _say_size(request, avatar, len(timesteps), say)
+        if format.is_page:
+            playback, flame = capture_playback(request, avatar, capture, timesteps, fps, say)
+        posed = ((timestep, capture.mesh(timestep)) for timestep in timesteps)
+        meshes = counted(posed, len(timesteps), report, "Exporting", "Frame")
+    elif format.source == "frame":
+        meshes = [_frame(avatar, capture, request.timestep)]
+    export_avatar(request.output, avatar, request.file_format, meshes, flame, fps, playback)
+    return Written(request.output)
+
+
+def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> tuple[int, np.ndarray]:
+    """The mesh of one timestep, or the neutral mesh."""
+    if timestep is None:
+        return 0, avatar.neutral
+    capture = required_capture(capture)
+    if timestep not in capture.timesteps:
+        raise StgaError(f"{capture.root}: has no timestep {timestep}")
+    return timestep, capture.mesh(timestep)
+
+
+def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
+    """Say how large the file will be. Raises StgaError where the disk has too little free space."""
+    size = FORMATS[request.file_format].size(avatar, frames)
+    check_free_space(request.output, size)
+    plural = "" if frames == 1 else "s"
+    say(f"{frames} frame{plural} of {len(avatar.splats)} splats: about {format_bytes(size)}")
+
+
+# Web pages
+
+SPLITS = ("val", "train", "test")
+
+
+def still_playback(request: Export, avatar: Avatar, fps: float, say: Say) -> Playback:
+    """What a page of the neutral mesh alone shows. Says what it holds of a FLAME model."""
+    _say_licence(flame_notice(avatar, None, motion_only=True), say)
+    return Playback(title=_title(request), fps=fps, motion_only=True)
+
+
+def capture_playback(
+    request: Export, avatar: Avatar, capture: Capture, timesteps: tuple[int, ...], fps: float, say: Say
+) -> tuple[Playback, FlameSequence | None]:
+    """What a page of the capture's timesteps shows, and its FLAME motion. Says what it holds of a FLAME model."""
+    playback = Playback(
+        title=_title(request),
+        fps=fps,
+        views=capture_views(capture),
+        up=_up(capture),
+        selection=_selection(request, capture, timesteps),
+        motion_only=request.motion_only,
+        controls=None if request.motion_only else page_controls(capture.flame),
+    )
+    sequence = None if capture.flame is None else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
+    notice = flame_notice(avatar, sequence, request.motion_only)
+    has_rig = sequence is not None and not request.motion_only
+    _say_licence(f"{notice} --motion-only leaves them out, but not the meshes of the take." if has_rig else notice, say)
+    return playback, sequence
+
+
+def _say_licence(notice: str, say: Say) -> None:
+    if notice:
+        say(notice)
+
+
+def _title(request: Export) -> str:
+    path = request.source.resolve()
+    return str(path.parent.name if path.name == AVATAR else path.stem)
+
+
+def capture_views(capture: Capture) -> dict[str, Camera]:
+    """The first pose of each camera, a held-out one first."""
+    cameras: dict[int, Camera] = {}
+    for split in SPLITS:
+        for view in capture.views.get(split, ()):
+            cameras.setdefault(view.camera_index, view.camera)
+    held_out = [view.camera_index for view in capture.views.get("val", ())][:1]
+    order = [*held_out, *(index for index in sorted(cameras) if index not in held_out)]
+    return {f"Camera {index}": cameras[index] for index in order[:MAX_VIEWS]}
+
+
+def _up(capture: Capture) -> tuple[float, float, float]:
+    """The axis of the capture that its cameras hold upright; y without cameras."""
+    cameras = [view.camera for views in capture.views.values() for view in views]
+    if not cameras:
+        return (0.0, 1.0, 0.0)
+    mean = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
+    axis = np.zeros(3)
+    axis[np.abs(mean).argmax()] = np.sign(mean[np.abs(mean).argmax()])
+    return (float(axis[0]), float(axis[1]), float(axis[2]))
+
+
+def _selection(request: Export, capture: Capture, timesteps: tuple[int, ...]) -> list[np.ndarray] | None:
+    """What each timestep trains: the open file's or the run's selection, else by the rule."""
+    chosen: Mapping[int, np.ndarray] | None = None
+    if request.played is not None:
+        chosen = request.played.selection
+    elif (request.source / SELECTION).exists():
+        from ..training.run.checkpoint import read_selection  # imports torch, which Blender may lack
+
+        chosen = read_selection(request.source, len(capture.faces))
+    if not chosen and request.played is None:
+        chosen = select_capture(capture, SelectionOptions())
+    everything = np.ones(len(capture.faces), bool)
+    return [chosen.get(timestep, everything) for timestep in timesteps] if chosen else None
+
+
+def _flame_timesteps(capture: Capture, timesteps: tuple[int, ...]) -> tuple[int, ...]:
+    """The timesteps of `capture.flame` for those of the capture, which an open head numbers by the scene's frames."""
+    assert capture.flame is not None
+    numbered = dict(zip(capture.timesteps, capture.flame.timesteps, strict=True))
+    return tuple(numbered[timestep] for timestep in timesteps)

@@ -1,0 +1,164 @@
+"""What is found out about a finished run: the light of its capture, kept in its avatar, and its quality on a split."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..avatar.file import AvatarLight, read_avatar, write_avatar
+from ..capture.camera import central_camera
+from ..capture.color import srgb_to_linear
+from ..capture.model import Capture
+from ..errors import StgaError
+from ..export.ply import read_ply
+from ..files import write_json
+from ..light.environment import harmonics_of, read_hdr
+from ..options import like, option
+from ..progress import Progress, Report, Say, ignore
+from ..training.run.folder import AVATAR, WORLD_FILE, locked, open_refined, open_run, with_refined_tracking
+from .results import Written
+
+if TYPE_CHECKING:
+    from ..light.estimate import Known
+    from ..training.evaluate.metrics import Quality
+
+
+@dataclass(frozen=True)
+class Relight:
+    """Estimate the light of a run's capture, so that the lights of a scene can take its place."""
+
+    run: Path = option("folder of a run", flag="RUN")
+    light: Path | None = option("environment of the studio, instead of an estimate", None, metavar="FILE.hdr")
+    card: tuple[float, float, float] | None = option(
+        "sRGB in 0…1 of an 18 % gray card at the face that faces the central camera: level and white balance",
+        None, 0, 1, flag="--gray-card", metavar="R,G,B",
+    )  # fmt: skip
+    flame: Path | None = option("FLAME model file, if it has moved", None, metavar="FILE")
+    capture: Path | None = option("the run's capture, if it has moved", None)
+
+    def check(self) -> None:
+        """Raise StgaError where light and card say the same."""
+        if self.light is not None and self.card is not None:
+            raise StgaError("--gray-card: has no effect with --light, whose level is known")
+
+
+def relight(request: Relight, report: Report, say: Say) -> Written:
+    """Estimate the light, or take the known one, and write it into the run's avatar file. Raises StgaError."""
+    from ..light.estimate import Known
+
+    folder = request.run
+    capture = open_refined(folder, request.capture, request.flame)
+    known = Known()
+    if request.light is not None:
+        known = Known(radiance=harmonics_of(read_hdr(request.light)))
+    elif request.card is not None:
+        card = srgb_to_linear(np.array(request.card))
+        if not card.min() > 0:
+            raise StgaError(f"--gray-card: expected three numbers above 0, got {request.card}")
+        known = Known(card=card[None], toward=_toward_central_camera(capture)[None])
+    return Written(folder / AVATAR, add_light(folder / AVATAR, capture, known, report))
+
+
+def add_light(
+    avatar_file: Path, capture: Capture, known: "Known | None" = None, report: Report = ignore
+) -> tuple[str, ...]:
+    """Write the light of a capture into a run's avatar file; returns what there is to say.
+
+    Raises StgaError, also while another process trains or lights the run.
+    """
+    from ..light.estimate import Known, estimate_light
+    from ..training.evaluate.match_exposure import known_exposure
+
+    with locked(avatar_file.parent):
+        avatar = read_avatar(avatar_file)
+        exposure = known_exposure(avatar.settings.get("exposure") or (), ())
+        light = estimate_light(capture, replace(known or Known(), exposure=exposure), report)
+        write_avatar(avatar_file, replace(avatar, light=light))
+    return describe_light(light)
+
+
+def describe_light(light: AvatarLight) -> tuple[str, ...]:
+    """Lines about where a light is from and how well it explains the capture."""
+    source = {"estimated": "estimated", "gray_card": "estimated, level by a gray card", "file": "from a file"}
+    line = f"light: {source[light.source]}; recorded colors differ from it by {light.residual:.1%}"
+    if not light.damping:
+        return (line,)
+    damped = f"albedo is pulled to its mean by {light.damping:.0%} (docs/light.md)"
+    return line, f"warning: the capture's light is too hard to be taken away; {damped}"
+
+
+def _toward_central_camera(capture: Capture) -> np.ndarray:
+    """(3,) from the face to the camera that sees it from the front."""
+    first = {view.camera_index: view.camera for views in capture.views.values() for view in views}
+    if not first:
+        raise StgaError(f"{capture.root}: has no camera that a gray card could face")
+    cameras = list(first.values())
+    offset = cameras[central_camera(cameras)].position - capture.neutral.mean(0)
+    return np.asarray(offset / np.linalg.norm(offset))
+
+
+# Quality
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure PSNR, SSIM and LPIPS of a run's avatar on held-out views; they are written into the run's folder, too."""
+
+    run: Path = like(Relight, "run")
+    split: str = option("views to measure on", "val", choices=("train", "val", "test"))
+    flame: Path | None = like(Relight, "flame")
+    capture: Path | None = like(Relight, "capture")
+
+
+def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
+    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder; of timesteps without training views, also
+    with the heads as they were before the avatar tracked them. Raises StgaError."""
+    from ..training.evaluate.metrics import evaluate_avatar, psnr_recorded
+
+    folder, split = request.run, request.split
+    report(Progress(stage="Evaluating"))
+    tracked = open_run(folder, request.capture, request.flame).capture
+    capture = with_refined_tracking(tracked, folder)
+    views = capture.views.get(split, ())
+    if not views:
+        raise StgaError(f"{capture.root}: has no views in the split '{split}'")
+    avatar = read_avatar(folder / AVATAR)
+    quality = evaluate_avatar(avatar, capture, split, perceptual=True)
+    if (folder / WORLD_FILE).is_file():
+        recorded = psnr_recorded(avatar, read_ply(folder / WORLD_FILE), capture, split)
+        quality = replace(quality, psnr_recorded=recorded)
+    path = folder / f"quality_{split}.json"
+    write_json(path, {"views": len(views), **quality.as_json()})
+    lines = [f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)]
+    unseen = {view.timestep for view in views} - {view.timestep for view in capture.views.get("train", ())}
+    if unseen and capture is not tracked:
+        before = _describe(evaluate_avatar(avatar, tracked, split))
+        lines.insert(1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}")
+    return Written(path, tuple(lines))
+
+
+def _details(quality: "Quality") -> list[str]:
+    lines = [
+        f"  {name}: {_describe(quality.regions[region])}"
+        for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region"))
+        if region in quality.regions
+    ]
+    if quality.psnr_recorded is not None:
+        lines.append(f"  in front of its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB")
+    if quality.psnr_unmatched is not None:
+        lines.append(f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB")
+    if quality.lpips is None:
+        from ..training.evaluate.lpips import MIN_SIDE_PX
+
+        weights = "its weights, whose file STGA_LPIPS names (docs/dependencies.md),"
+        lines += [
+            f"LPIPS was not measured: it needs {weights}",
+            f"and images of at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels",
+        ]
+    return lines
+
+
+def _describe(quality: "Quality") -> str:
+    lpips = "" if quality.lpips is None else f", LPIPS {quality.lpips:.4f}"
+    return f"PSNR {quality.psnr:.3f} dB, SSIM {quality.ssim:.4f}{lpips}"

@@ -1,0 +1,327 @@
+"""State of a request that Blender follows, and its transitions, without Blender."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ..training.run.folder import AVATAR
+from ..worker.status import WorkerSnapshot, WorkerState
+from .folder import PREVIEW
+from .table import DISMISSIBLE, STORED, TRAINS, TRANSIENT, Kind
+from .track import CAPTURE_FOLDER, RUN_FOLDER
+
+CHECK_INTERVAL_S = 0.5
+SLICE_INTERVAL_S = 0.02
+"""While splats are built in slices, so that Blender never blocks for long."""
+
+Stamp = tuple[int, int]
+"""Modification time in nanoseconds and size in bytes of a file."""
+
+
+@dataclass(frozen=True)
+class RunFiles:
+    """Stamps of a run's files, and of the capture that is tracked for it; None: there is no such file."""
+
+    capture: Stamp | None = None
+    picture: Stamp | None = None
+    preview: Stamp | None = None
+    avatar: Stamp | None = None
+    metrics: Stamp | None = None
+    tracking: Stamp | None = None
+
+
+@dataclass(frozen=True)
+class RequestState:
+    """What is known of a scene's request of one kind.
+
+    subject         run, capture or video that the request is about, as the scene names it; None: none
+    folder          of the request, as found now: a run may have moved along with the .blend file
+    snapshot        the worker's status as last read
+    files           of a run, as last seen
+    result_shown    the result has reached the scene, or never will
+    shown_capture, shown_preview   stamps of the capture and the preview that were loaded last
+    loading         what is being read, or put into the scene: an avatar file, or the folder of the request
+    building        it is being built in slices
+    error           one sentence: a result that could not be shown, or why monitoring stopped
+    stopped         monitoring stopped after an unexpected error
+    """
+
+    kind: Kind
+    subject: Path | None = None
+    folder: Path | None = None
+    snapshot: WorkerSnapshot = field(default_factory=WorkerSnapshot)
+    files: RunFiles = field(default_factory=RunFiles)
+    result_shown: bool = False
+    shown_capture: Stamp | None = None
+    shown_preview: Stamp | None = None
+    loading: Path | None = None
+    building: bool = False
+    error: str = ""
+    stopped: bool = False
+
+    @property
+    def place(self) -> Path:
+        """Where what the request makes is now."""
+        assert self.folder is not None
+        return self.folder.parent
+
+    @property
+    def run(self) -> Path:
+        """Where the run of one that trains is now."""
+        return self.place / RUN_FOLDER if self.kind == Kind.AVATAR else self.place
+
+    @property
+    def interval_s(self) -> float | None:
+        """Seconds until the next check; None: nothing is expected any more, the timer can stop."""
+        if self.folder is None or self.stopped:
+            return None
+        if self.building:
+            return SLICE_INTERVAL_S
+        is_expected = self.snapshot.state.is_alive or self.loading is not None or self.has_result
+        return CHECK_INTERVAL_S if is_expected else None
+
+    @property
+    def has_result(self) -> bool:
+        """Whether the worker has ended with a result that is still to be shown."""
+        state = self.snapshot.state
+        ended = state == WorkerState.FINISHED or (state == WorkerState.CANCELLED and self.kind in TRAINS)
+        # An avatar's tracking may have been cancelled; a video changes nothing in the scene.
+        is_there = self.files.avatar is not None if self.kind == Kind.AVATAR else self.kind != Kind.VIDEO
+        return ended and is_there and not self.result_shown
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it can be cancelled, and another request of the kind has to wait."""
+        return self.snapshot.state.is_alive or (self.kind in TRANSIENT and self.folder is not None)
+
+    @property
+    def can_be_dismissed(self) -> bool:
+        return self.kind in DISMISSIBLE and self.subject is not None and not self.is_running
+
+
+# Events
+
+
+@dataclass(frozen=True)
+class Started:
+    """A worker was started for a request in this folder."""
+
+    subject: Path
+    folder: Path
+
+
+@dataclass(frozen=True)
+class CancelAsked:
+    """The user cancels the request."""
+
+
+@dataclass(frozen=True)
+class Dismissed:
+    """The user dismisses what is said about the request's end."""
+
+
+@dataclass(frozen=True)
+class SceneRead:
+    """What is stored in the scene now: an undo step may have taken it back."""
+
+    subject: Path | None
+    result_shown: bool
+
+
+@dataclass(frozen=True)
+class StatusRead:
+    """The request's folder was read. live_preview, show_result: what the user wants to see."""
+
+    folder: Path
+    snapshot: WorkerSnapshot
+    files: RunFiles = field(default_factory=RunFiles)
+    live_preview: bool = True
+    show_result: bool = True
+
+
+@dataclass(frozen=True)
+class SceneFree:
+    """What the result changes can be changed now: Blender does not render, and nothing of it is in Edit Mode."""
+
+
+@dataclass(frozen=True)
+class SliceBuilt:
+    """A slice of what is shown was built, others remain."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What was loaded is in the scene. undoable: with a change that deserves an undo step."""
+
+    undoable: bool = False
+
+
+@dataclass(frozen=True)
+class Failed:
+    """What was loaded cannot be shown; stops: nor can the request be monitored any more."""
+
+    sentence: str
+    stops: bool = False
+
+
+Event = Started | CancelAsked | Dismissed | SceneRead | StatusRead | SceneFree | SliceBuilt | Shown | Failed
+
+
+# Effects
+
+
+@dataclass(frozen=True)
+class Store:
+    """Store the subject, and whether its result was shown, in the scene."""
+
+    subject: Path | None
+    result_shown: bool
+
+
+@dataclass(frozen=True)
+class _OnPath:
+    """An effect on one file or folder."""
+
+    path: Path
+
+
+class StoreAvatar(_OnPath):
+    """Store the path of the trained avatar in the scene."""
+
+
+class LoadAvatar(_OnPath):
+    """Read an avatar file in a thread."""
+
+
+class Show(_OnPath):
+    """Put what was loaded into the scene, as far as it was read; answered by SliceBuilt, Shown or Failed."""
+
+
+class ReadCurve(_OnPath):
+    """Read the evaluations in the run for the panel's curve, or before the first ones the picture of the tracking."""
+
+
+class StopWorker(_OnPath):
+    """Ask the worker of the request in this folder to stop and to keep what it has."""
+
+
+class KillWorker(_OnPath):
+    """End the worker of the request in this folder at once."""
+
+
+class RemoveFiles(_OnPath):
+    """Remove the request's folder; what the request has made stays."""
+
+
+@dataclass(frozen=True)
+class PushUndo:
+    """Add an undo step."""
+
+
+@dataclass(frozen=True)
+class Redraw:
+    """Redraw the panels."""
+
+
+Effect = Store | StoreAvatar | LoadAvatar | Show | ReadCurve | StopWorker | KillWorker | RemoveFiles | PushUndo | Redraw
+Outcome = tuple[RequestState, tuple[Effect, ...]]
+
+
+def transition(state: RequestState, event: Event) -> Outcome:
+    """The state after an event, and the effects to carry out in this order."""
+    match event:
+        case Started(subject, folder):
+            return _started(state, subject, folder)
+        case CancelAsked() if state.kind in TRANSIENT:
+            return _forgotten(state, KillWorker(state.folder) if state.folder else None)
+        case CancelAsked():
+            return state, (StopWorker(state.folder),) if state.folder else ()
+        case Dismissed():
+            return _forgotten(state)
+        case SceneRead(subject, result_shown):
+            in_step = (subject, result_shown) == (state.subject, state.result_shown)
+            return state, () if in_step else _stored(state)
+        case StatusRead():
+            return _status_read(state, event)
+        case SceneFree():
+            return state, () if state.loading is None else (Show(state.loading),)
+        case SliceBuilt():
+            return replace(state, building=True), ()
+        case Shown(undoable):
+            return _loading_ended(state, undoable)
+        case Failed(sentence, stops=True):
+            return replace(state, error=sentence, stopped=True, loading=None, building=False), (Redraw(),)
+        case Failed(sentence):
+            return _loading_ended(state, error=sentence)
+
+
+def _stored(state: RequestState) -> tuple[Effect, ...]:
+    return (Store(state.subject, state.result_shown),) if state.kind in STORED else ()
+
+
+def _started(before: RequestState, subject: Path, folder: Path) -> Outcome:
+    state = RequestState(before.kind, subject, folder)
+    is_stale = before.kind == Kind.VIDEO and before.folder not in (None, folder)
+    stale = (RemoveFiles(before.folder),) if is_stale and before.folder else ()
+    curve = (ReadCurve(state.run),) if state.kind in TRAINS else ()
+    return state, (*stale, *_stored(state), *curve, Redraw())
+
+
+def _forgotten(state: RequestState, first: Effect | None = None, error: str = "") -> Outcome:
+    """The state without its request, whose folder is removed."""
+    empty = RequestState(state.kind, error=error)
+    removed = (RemoveFiles(state.folder),) if state.folder is not None else ()
+    return empty, (*((first,) if first else ()), *removed, *_stored(empty), Redraw())
+
+
+def _status_read(state: RequestState, event: StatusRead) -> Outcome:
+    effects: list[Effect] = []
+    before, worker = state, event.snapshot.state
+    error = "" if state.stopped else state.error
+    state = replace(state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error, stopped=False)
+    drawn, drawn_before = ((each.folder, each.files.metrics, each.files.picture) for each in (state, before))
+    if drawn != drawn_before and state.kind in (*TRAINS, Kind.TRACKING):
+        effects.append(ReadCurve(state.run))
+    if (state.folder, state.files, state.snapshot) != (before.folder, before.files, before.snapshot):
+        effects.append(Redraw())
+    if state.loading is not None:
+        return state, tuple(effects)
+    if state.kind in TRAINS:
+        return _load_avatar(state, event, effects)
+    if state.has_result:
+        state = replace(state, loading=state.folder)
+    elif state.kind in TRANSIENT and not worker.is_alive:
+        # The panel has no options of the command line.
+        return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
+    return state, tuple(effects)
+
+
+def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) -> Outcome:
+    """Load the tracked capture, the trained avatar, or a preview of it, once each."""
+    capture, preview = state.files.capture, state.files.preview
+    if capture not in (None, state.shown_capture) and (state.snapshot.state.is_alive or state.has_result):
+        return replace(state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture), tuple(effects)
+    if state.has_result:
+        effects.append(StoreAvatar(state.run / AVATAR))
+        if event.show_result:
+            state = replace(state, loading=state.run / AVATAR)
+        else:
+            state = replace(state, result_shown=True)
+            effects.extend(_stored(state))
+    elif state.snapshot.state.is_alive and event.live_preview and preview not in (None, state.shown_preview):
+        state = replace(state, loading=event.folder / PREVIEW, shown_preview=preview)
+    if state.loading is not None:
+        effects.append(LoadAvatar(state.loading))
+    return state, tuple(effects)
+
+
+def _loading_ended(state: RequestState, undoable: bool = False, error: str = "") -> Outcome:
+    loading = state.loading
+    was_result = loading is not None and (state.kind not in TRAINS or loading.name == AVATAR)
+    # Undo brings back what was shown before the training.
+    undoable = undoable or (state.kind in TRAINS and was_result and not error)
+    undo = (PushUndo(),) if undoable else ()
+    if state.kind in TRANSIENT:
+        forgotten, removed = _forgotten(state, error=error)
+        return forgotten, (*undo, *removed)
+    state = replace(state, loading=None, building=False, error=error, result_shown=state.result_shown or was_result)
+    return state, (*(_stored(state) if was_result else ()), *undo, Redraw())

@@ -1,0 +1,69 @@
+"""Whether an interpreter can track and train: `python_report` runs in it, and is judged here."""
+
+import json
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import StgaError
+from ..worker.launch import start_python
+from ..worker.training_python import REQUIREMENTS, package_name
+
+MIN_PYTHON = 3, 11
+CHECK_TIMEOUT_S = 180.0
+"""The first import of torch from a slow disk."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """An interpreter that can track and train.
+
+    line      its versions and device
+    adapters  the GPUs that it can train on, as `--device gpu:NAME` names them
+    """
+
+    line: str
+    adapters: tuple[str, ...]
+
+
+def start_check(python: str) -> "subprocess.Popen[str]":
+    """The process whose output `finish_check` judges. Raises StgaError where the interpreter cannot be started."""
+    return start_python(
+        python, ["stga_addon.jobs.python_report"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, errors="replace",
+    )  # fmt: skip
+
+
+def finish_check(python: str, process: "subprocess.Popen[str]", timeout_s: float = CHECK_TIMEOUT_S) -> Checked:
+    """Wait for a check that was started. Raises StgaError where the interpreter lacks something, which the sentence
+    names, or does not answer; it is ended then."""
+    with process:
+        try:
+            output, errors = process.communicate(timeout=timeout_s)
+        except subprocess.TimeoutExpired as error:
+            process.kill()
+            raise StgaError(f"{python}: did not answer within {CHECK_TIMEOUT_S:.0f} s") from error
+    try:
+        report = json.loads(output.strip().splitlines()[-1])
+        return Checked(describe_check(python, report), tuple(report["adapters"]))
+    except (ValueError, IndexError, KeyError, TypeError) as error:
+        with suppress(OSError):  # the stream may be closed
+            print(output + errors, file=sys.stderr, flush=True)
+        raise StgaError(
+            f"{python}: is not a Python that runs this add-on (exit status {process.returncode})"
+        ) from error
+
+
+def describe_check(python: str, report: dict[str, Any]) -> str:
+    """The line of a check from what python_report.py prints. Raises StgaError where something is missing."""
+    version, versions, failures = report["python"], report["versions"], report["failures"]
+    if tuple(int(part) for part in version.split(".")[:2]) < MIN_PYTHON:
+        raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
+    missing = [package_name(text) for module, text in REQUIREMENTS.items() if module in failures]
+    if missing:
+        why = next((text for text in failures.values() if not text.startswith("ModuleNotFoundError")), "")
+        failed = f" ({why})" if why else ""
+        raise StgaError(f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that there")
+    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"

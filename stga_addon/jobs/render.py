@@ -1,0 +1,328 @@
+"""Rendering of an avatar or a PLY: one PNG per camera entry, a video of its motion, or a turntable."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from ..avatar.file import Avatar, read_avatar
+from ..avatar.splats import Splats
+from ..capture.camera import TURNTABLE_S, central_camera, covered_angles, to_and_fro, turntable
+from ..capture.model import View
+from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
+from ..driving.open_motion import MotionOptions
+from ..errors import StgaError
+from ..export.playback import DEFAULT_FPS, playback_fps
+from ..export.ply import is_ply, read_ply
+from ..files import replacing
+from ..flame.sequence import sequence_mesh
+from ..light.environment import read_lighting, turned
+from ..light.relight import Relighter
+from ..options import like, option
+from ..progress import Report, Say, counted
+from ..render.compose import Composer
+from ..render.video import sequence_writer, video_writer
+from ..schema import setting
+from ..training.run.folder import WORLD_FILE
+from .avatar_source import (
+    Played,
+    avatar_path,
+    motion_field,
+    motion_options_field,
+    open_avatar,
+    open_avatar_motion,
+)  # fmt: skip
+from .results import Written
+from .train import Train
+
+MAX_TURNTABLE_IMAGES = 100_000
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render an avatar: one PNG per camera entry, a video of its motion, or a turntable.
+
+    output    an .mp4 file where `video` says so, else a folder for PNGs
+    others    as of `avatar_source.Posed`
+    """
+
+    source: Path = option("folder of a run, avatar file or PLY", flag="RUN|AVATAR|PLY")
+    output: Path = setting()
+    video: bool = False
+    cameras: Path | None = option(
+        "one PNG per entry; for a video, where its camera is from (default: the capture)",
+        None, metavar="TRANSFORMS.json",
+    )  # fmt: skip
+    turntable: float | None = option(
+        "move one camera around the head: 360 for a full turn, less to both sides (default: what cameras saw)",
+        None, 0, 360, metavar="DEGREES", bare=0.0,
+    )  # fmt: skip
+    camera: int | None = option(
+        "camera of the video (default: the central one)", None, 0, metavar="INDEX", needs=(("video", "turntable"),)
+    )
+    fps: float | None = option(
+        f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})", None, 0
+    )
+    seconds: float = option(
+        f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
+        TURNTABLE_S, 0, metavar="S",
+    )  # fmt: skip
+    frames: tuple[int, int] | None = option(
+        "timesteps to render (default: all), not of a turntable", None, 0, metavar="FIRST:LAST"
+    )
+    capture: Path | None = option("whose meshes drive the avatar (default: the run's)", None)
+    flame: Path | None = like(Train, "flame", help="FLAME model file of that capture, or of the motion")
+    motion: Path | None = motion_field()
+    played: Played | None = None
+    background: tuple[float, float, float] = option("white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1)
+    principal_point: str | None = like(
+        Train,
+        "principal_point",
+        default=None,
+        help="what cy means in the file of --cameras (default: as in training; of a PLY vhap)",
+        needs=("cameras",),
+    )
+    device: str = like(Train, "device")
+    motion_options: MotionOptions = motion_options_field("motion")
+    light: Path | None = option("environment (.hdr) or lights (.toml) that light the avatar", None, metavar="FILE")
+    light_turn: float = option(
+        "turn that light around the head during the video", 0.0, -36000, 36000,
+        metavar="DEGREES", needs=("light", ("video", "turntable")),
+    )  # fmt: skip
+    world: bool = option("put the run's world behind the avatar (train with --effect world=on)", False)
+
+    @property
+    def is_film(self) -> bool:
+        """Whether one camera sees the motion, instead of a picture per camera."""
+        return self.video or self.turntable is not None
+
+    def check(self) -> None:
+        """Raise StgaError for a video of another name, and where nothing says what to render."""
+        if self.video and self.output.suffix.lower() != ".mp4":
+            raise StgaError(f"{self.output}: a video's name ends in .mp4")
+        if self.cameras is None and not self.is_film:
+            raise StgaError("--out needs --cameras, which says what to render, or --turntable")
+        if self.frames is not None and self.turntable is not None:
+            raise StgaError("--frames: has no effect with --turntable, which plays all of the motion")
+
+
+# Work
+
+
+def render(request: Render, report: Report, say: Say) -> Written:
+    """Render the pictures or the video. A cancelled video is not written; pictures that are finished stay.
+
+    Raises StgaError.
+    """
+    if request.turntable is not None:
+        _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
+    views = None
+    if request.cameras is not None:
+        principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # a PLY has none
+        if request.principal_point is None and not is_ply(request.source):
+            principal_point = read_avatar(avatar_path(request.source)).principal_point
+        views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
+    composer = Composer(request.device)
+    composer.choose()
+    subject = _subject(request, composer) if request.motion is None else _reenacted(request, composer, say)
+    if request.is_film:
+        _film(request, subject, subject.views if views is None else views, report)
+    else:
+        assert views is not None
+        if request.motion is not None:  # each timestep as the first pose of each camera sees it
+            cameras = {view.camera_index: view for view in reversed(views)}
+            views = [
+                replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")
+                for timestep in subject.timesteps
+                for index in sorted(cameras)
+            ]
+        timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
+        _write_pictures(request.output, subject, [view for view in views if view.timestep in timesteps], report)
+    return Written(request.output)
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """What is rendered.
+
+    image      view and share of the film, 0 to 1 -> image (3, H, W)
+    timesteps  of its motion, ascending; none where nothing moves
+    center     of the head or splats at the first timestep, (3,) meters
+    fps        at which it plays
+    views      of its capture
+    """
+
+    image: Callable[[View, float], np.ndarray]
+    timesteps: tuple[int, ...]
+    center: Callable[[], np.ndarray]
+    fps: float
+    views: Sequence[View] = ()
+
+
+def _write_pictures(folder: Path, subject: _Subject, views: Sequence[View], report: Report) -> None:
+    from PIL import Image
+
+    from ..render.render import to_uint8
+
+    names = unique_names([view.name for view in views])
+    captured, target = {view.image for view in views}, folder.resolve()
+    overwritten = next((name for name in names if target / name in captured), None)
+    if overwritten is not None:
+        raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
+    for view, name in counted(zip(views, names, strict=True), len(views), report, "Rendering", "Image"):
+        with replacing(folder / name) as partial:
+            Image.fromarray(to_uint8(subject.image(view, 0.0))).save(partial, format="PNG")
+
+
+def _film(request: Render, subject: _Subject, views: Sequence[View], report: Report) -> None:
+    """Write the subject's motion as one camera sees it, which stands still or orbits."""
+    from ..render.render import to_uint8
+
+    start = _chosen_camera(request, views)
+    timesteps: Sequence[int] = _timesteps(request, subject.timesteps) or (0,)
+    path = [start] * len(timesteps)
+    if request.turntable is not None:
+        count = max(len(timesteps), _turntable_images(request, subject.fps), 1)
+        timesteps = to_and_fro(timesteps, count)
+        center, half = subject.center(), np.radians(request.turntable) / 2
+        angles = (-half, half) if half else covered_angles([view.camera for view in views], start.camera, center)
+        path = [replace(start, camera=camera) for camera in turntable(start.camera, center, count, angles)]
+    path = [replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)]
+    writer = video_writer(request.output, subject.fps) if request.video else sequence_writer(request.output)
+    with writer as write:
+        for n, view in enumerate(counted(path, len(path), report, "Rendering", "Image")):
+            write(to_uint8(subject.image(view, n / len(path))))
+
+
+def _timesteps(request: Render, timesteps: tuple[int, ...]) -> tuple[int, ...]:
+    """Those from the first to the last of `frames`. Raises StgaError where there is none."""
+    if request.frames is None:
+        return timesteps
+    first, last = request.frames
+    found = tuple(timestep for timestep in timesteps if first <= timestep <= last)
+    if not found:
+        raise StgaError(f"--frames {first}:{last}: there is no such timestep to render")
+    return found
+
+
+def _turntable_images(request: Render, fps: float) -> int:
+    """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
+    images = request.seconds * fps
+    if images > MAX_TURNTABLE_IMAGES:
+        asked = f"--seconds {request.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
+        raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
+    return round(images)
+
+
+def _chosen_camera(request: Render, views: Sequence[View]) -> View:
+    """The first view of the camera to film with."""
+    first = {view.camera_index: view for view in reversed(views)}
+    if not first:
+        raise StgaError(f"{request.source}: there is no camera to render from; give --cameras")
+    if request.camera is None:
+        indices = sorted(first)
+        return first[indices[central_camera([first[index].camera for index in indices])]]
+    if request.camera not in first:
+        raise StgaError(f"--camera {request.camera}: there are only {', '.join(map(str, sorted(first)))}")
+    return first[request.camera]
+
+
+def _subject(request: Render, composer: Composer) -> _Subject:
+    """An avatar with its capture, or a plain world-space PLY."""
+    if is_ply(request.source):
+        if request.light is not None:
+            raise StgaError(f"{request.source}: is a PLY, whose light is not known; --light needs an avatar")
+        if request.world:
+            raise StgaError(f"{request.source}: is a PLY; --world needs the folder of a run")
+        from ..render.render import render
+
+        splats = read_ply(request.source)
+        return _Subject(
+            lambda view, _: render(splats, view.camera, request.background, composer=composer),
+            (),
+            lambda: np.median(splats.xyz, axis=0),
+            playback_fps(None, request.fps),
+        )
+    avatar, capture = open_avatar(request)
+    if capture is None:
+        raise StgaError(f"{request.source}: an avatar needs the meshes of a capture to follow; give --capture")
+
+    def mesh(view: View) -> np.ndarray:
+        if view.timestep not in capture.timesteps:
+            raise StgaError(f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for")
+        return np.asarray(capture.mesh(view.timestep))
+
+    return _Subject(
+        _pictured(request, avatar, mesh, composer),
+        capture.timesteps,
+        lambda: _middle(capture.mesh(capture.timesteps[0])),
+        playback_fps(capture, request.fps),
+        [view for views in capture.views.values() for view in views],
+    )
+
+
+def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
+    """An avatar moved by another person's motion."""
+    if is_ply(request.source):
+        raise StgaError(f"{request.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
+    avatar = read_avatar(avatar_path(request.source))
+    motion = open_avatar_motion(request, avatar, say)
+    sequence = motion.sequence
+
+    def mesh(timestep: int) -> np.ndarray:
+        return sequence_mesh(sequence, timestep)
+
+    return _Subject(
+        _pictured(request, avatar, lambda view: mesh(view.timestep), composer),
+        tuple(sequence.timesteps),
+        lambda: _middle(mesh(sequence.timesteps[0])),
+        request.fps or motion.fps or DEFAULT_FPS,
+    )
+
+
+def _pictured(
+    request: Render, avatar: Avatar, mesh: Callable[[View], np.ndarray], composer: Composer
+) -> Callable[[View, float], np.ndarray]:
+    """The picture of an avatar on the mesh of a view, as it was recorded or under the light that is asked for."""
+    from ..render.render import render_avatar, render_colors
+
+    behind = _world(request.source) if request.world else None
+    if request.light is None:
+        return lambda view, _: render_avatar(avatar, mesh(view), view.camera, request.background, composer, behind)
+    relighter, lighting = Relighter(avatar), read_lighting(request.light)
+
+    def picture(view: View, share: float) -> np.ndarray:
+        posed = mesh(view)
+        light = turned(lighting, _middle(posed), request.light_turn * share) if request.light_turn else lighting
+        colors = relighter.colors(posed, view.camera.position, light)
+        return render_colors(avatar, posed, view.camera, colors, request.background, composer, behind)
+
+    return picture
+
+
+def _world(source: Path) -> Splats:
+    """Raises StgaError where the run of an avatar has no world."""
+    path = avatar_path(source).with_name(WORLD_FILE)
+    if not path.is_file():
+        raise StgaError(f"{path}: is missing; --world shows what a training with --effect world=on has written")
+    return read_ply(path)
+
+
+def _middle(vertices: np.ndarray) -> np.ndarray:
+    """(3,) center of the vertices' bounding box."""
+    return np.asarray((vertices.min(0) + vertices.max(0)) / 2)
+
+
+def unique_names(paths: list[str]) -> list[str]:
+    """File names with the suffix .png; where entries share one, their folders become part of it, then a number."""
+    pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
+    names = [png.name for png in pngs]
+    if len(set(names)) < len(names):
+        names = ["_".join(part for part in png.parts if part not in ("..", "/")) for png in pngs]
+    unique: dict[str, None] = {}
+    for name in names:
+        numbered = (f"{PurePosixPath(name).stem}_{n}.png" for n in itertools.count(2))
+        unique[next(c for c in itertools.chain((name,), numbered) if c not in unique)] = None
+    return list(unique)

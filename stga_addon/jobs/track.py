@@ -1,0 +1,307 @@
+"""Tracking: footage to a capture, solving one again around poses made by hand, and from footage to an avatar."""
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ..errors import StgaError, shorten
+from ..files import read_json, write_json
+from ..format import format_duration
+from ..options import option, usable_path
+from ..progress import Cancelled, Progress, Report, Say, TimeLeft
+from ..report import CURVE
+from ..tracking.folder import REPORT_FILE, SHEET_FILE, is_flame, is_written
+from ..training.run.folder import AVATAR, has_run
+from .results import Written
+from .train import Train, resumed, train
+
+WORLDS = {
+    "auto": "the cameras' own where they were exported from a Blender scene, else head",
+    "head": "in meters, y up, the head near the origin",
+    "keep": "that of the cameras",
+}
+SYNC = {
+    "none": "the given offsets alone",
+    "auto": "by the videos' sound where all have it, else by what moves",
+    "sound": "by the videos' sound",
+    "motion": "by what moves in them",
+}
+MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
+"""What `Track.mattes` may be but a folder of masks."""
+CAPTURE_FOLDER, RUN_FOLDER, INPUTS = "capture", "run", "inputs.json"
+"""In the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which alone continues."""
+
+
+def _parsed_mattes(text: str) -> str:
+    return text if text in MATTES else os.path.abspath(usable_path(text))
+
+
+def _parsed_offset(text: str) -> tuple[str, int]:
+    name, _, frames = text.rpartition("=")
+    if not name or not frames.removeprefix("-").isdecimal() or len(frames) > 9:
+        raise StgaError(f"expected a camera and a number of frames, as in left=-3, not {shorten(text)}")
+    return name, int(frames)
+
+
+@dataclass(frozen=True)
+class Track:
+    """Track a head through footage of one or more cameras, and write a capture."""
+
+    footage: Path = option("folder with a folder of images or a video for each camera, or one video", flag="FOOTAGE")
+    model: Path | None = option(
+        "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb) (default: the bundled head)",
+        flag="--model", metavar="HEAD",
+    )  # fmt: skip
+    out: Path = option("folder of the capture", flag="--out", metavar="CAPTURE")
+    cameras: Path | None = option(
+        "calibration: COLMAP, Metashape, RealityCapture or transforms.json (default: that in the footage's folder)",
+        None, metavar="FILE",
+    )  # fmt: skip
+    landmarks: Path | None = option("landmark files of another detector", None, metavar="FOLDER")
+    focal: float | None = option(
+        "focal length of a single camera without calibration, in pixels (default: as its file says, or from the head's "
+        "turns)", None, above=0, metavar="PIXELS",
+    )  # fmt: skip
+    start: int = option("first timestep of the footage, counted from 0", 0, 0)
+    stop: int | None = option("timestep to stop before (default: all)", None, 1)
+    step: int = option("use every nth timestep", 1, 1)
+    offset: Mapping[str, int] | None = option(
+        "frames by which a camera's recording is later; may be repeated",
+        None, metavar="CAMERA=FRAMES", parse=_parsed_offset,
+    )  # fmt: skip
+    meshes: bool = option("write an OBJ per timestep as well", False)
+    world: str = option(
+        "the capture's: in meters with the head near the origin, or the cameras' own (default: the cameras' where "
+        "they were exported from a Blender scene)", "auto", choices=WORLDS,
+    )  # fmt: skip
+    sync: str = option(
+        "find offsets that are not given by the videos' sound, or by what moves; auto: sound where all have it",
+        "none", choices=SYNC,
+    )  # fmt: skip
+    mattes: str = option(
+        "masks of the person: made where the footage has none (default), only the footage's, or a folder's",
+        "auto", is_path=lambda text: text not in MATTES, metavar="auto|none|FOLDER", parse=_parsed_mattes,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SolveAgain:
+    """Solve a tracked capture again around heads that were posed by hand.
+
+    keys    timestep -> parameters (E + 18,) as of `correct_capture`
+    """
+
+    capture: Path
+    model: Path
+    keys: Mapping[int, np.ndarray]
+
+
+@dataclass(frozen=True)
+class MakeAvatar:
+    """Make an avatar from footage: track the head, train, and write a report and a .blend file.
+
+    Called again with the same arguments, it continues where it was interrupted.
+
+    track, train    write to CAPTURE_FOLDER and RUN_FOLDER of one folder, `out`; the FLAME model is that of `track`
+    """
+
+    track: Track
+    train: Train
+
+    @property
+    def out(self) -> Path:
+        return self.track.out.parent
+
+    def check(self) -> None:
+        """Raise StgaError where the two do not belong together."""
+        wanted = self.out / CAPTURE_FOLDER, self.out / CAPTURE_FOLDER, self.out / RUN_FOLDER
+        if (self.track.out, self.train.capture, self.train.run) != wanted:
+            raise StgaError(f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}")
+
+
+# Work
+
+
+STAGES = {
+    "Opening the footage": (0.0, 0.0),
+    "Head model": (0.0, 0.01),
+    "Landmarks": (0.01, 0.06),
+    "Focal length": (0.06, 0.07),
+    "Fit": (0.07, 0.12),
+    "Dense tracking": (0.12, 0.3),
+    "Surface": (0.3, 0.34),
+    "Refinement": (0.34, 0.51),
+    "Mattes": (0.51, 0.64),
+    "Torso": (0.64, 0.97),
+    "Contact sheet": (0.97, 0.985),
+    "Images": (0.985, 0.99),
+    "Heads": (0.99, 1.0),
+}
+"""Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its share of the time on
+two processors where one camera recorded a video of 1080p."""
+FOCAL_SOURCES = {
+    "given": "as given",
+    "file": "as the file says",
+    "solved": "solved from the turns of the head",
+    "usual": "a guess, that of a phone",
+}
+"""What a person reads of where a focal length is from (`Footage.focal`)."""
+
+
+def track(request: Track, report: Report, say: Say) -> Written:
+    """Track the head into a capture. Raises StgaError; cancelled, it leaves what was found so far, from which the same
+    request continues."""
+    from ..tracking.footage.open import open_footage
+    from ..tracking.footage.sequences import FrameRange
+    from ..tracking.track import track as track_footage
+
+    steps = _Steps(report)
+    steps.report("Opening the footage", 0, 1)
+    frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}), request.sync)
+    given = None if request.mattes in MATTES else Path(request.mattes)
+    footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
+    found = track_footage(
+        footage, request.model, request.out, request.landmarks, request.meshes, request.world,
+        request.mattes == "auto", steps.report, steps.show,
+    )  # fmt: skip
+    error = f"Reprojection error {found.median_px:.1f} px (median)"
+    report(Progress(1.0, "Tracked", error))
+    lines = [
+        *(f"warning: {warning}" for warning in found.warnings),
+        f"reprojection error: {found.median_px:.2f} px (median); by camera and timestep in tracking.json",
+        *([] if found.focal_px is None else [f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}"]),
+        *([] if found.torso is None else [f"torso: {found.torso.description}"]),
+        f"capture: {request.out}",
+    ]
+    return Written(request.out, tuple(lines))
+
+
+def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
+    """Solve the capture again around the keys. Raises StgaError."""
+    from ..tracking.correct import correct_capture
+
+    correct_capture(request.capture, request.model, request.keys, report=_Steps(report).report)
+    return Written(request.capture)
+
+
+class _Steps:
+    """A tracking's steps as progress, with the time that is left and how well the head fits."""
+
+    def __init__(self, report: Report) -> None:
+        self._report, self._time_left = report, TimeLeft()
+        self._now, self._quality = Progress(), dict[str, float]()
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        """Raises Cancelled where the report says to stop."""
+        begin, end = STAGES.get(stage, (0.0, 0.9))
+        share = begin + (end - begin) * done / max(total, 1)
+        figures = {"left_s": self._time_left.after(share), **self._quality}
+        self._now = Progress(share, stage, f"{done} of {total}" if total > 1 else "", lambda: figures)
+        if self._report(self._now):
+            raise Cancelled
+
+    def show(self, draw: Callable[[], np.ndarray | None], quality: Mapping[str, float]) -> None:
+        self._quality = dict(quality)
+        self._report(replace(self._now, picture=draw))
+
+
+# From footage to an avatar
+
+
+TRACKING_SHARE = 0.5
+"""Of the progress."""
+
+
+def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
+    """Track unless that was done, and train or continue the run. Raises StgaError where the folder began with other
+    inputs, and as both do."""
+
+    def report_tracking(progress: Progress) -> bool:
+        share, stage = TRACKING_SHARE * progress.share, f"Tracking: {progress.stage}"
+        figures = dict(progress.figures())
+        figures["left_s"] = figures.get("left_s", math.nan) + (request.train.settings.seconds or 0.0)
+        return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
+
+    def report_training(progress: Progress) -> bool:
+        return report(replace(progress, share=TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share))
+
+    begin = perf_counter()
+    _track(request.track, report_tracking, say)
+    tracked = perf_counter()
+    flame = request.track.model if is_flame(request.track.out) else None
+    new = replace(request.train, flame=flame)
+    trained = train(resumed(new) if has_run(new.run) else new, report_training, say)
+    end = perf_counter()
+    times = f"tracking {format_duration(tracked - begin)}, training {format_duration(end - tracked)}"
+    lines = ["", *_tracking_lines(request), *trained.lines, f"time: {times}, in all {format_duration(end - begin)}"]
+    return Written(request.train.run / AVATAR, tuple(lines))
+
+
+def _track(request: Track, report: Report, say: Say) -> None:
+    check_inputs(request)
+    if is_written(request.out):
+        return
+    out = request.out.parent
+    new = not out.exists()
+    write_json(out / INPUTS, _inputs(request))
+    try:
+        for line in track(request, report, say).lines:
+            say(line)
+    except StgaError:
+        if not request.out.exists():  # nothing was tracked yet, so that the inputs may be mended
+            (out / INPUTS).unlink()
+            if new:
+                out.rmdir()
+        raise
+
+
+def _tracking_lines(request: MakeAvatar) -> list[str]:
+    """What the capture's report says. Raises StgaError where it is another file."""
+    capture = request.track.out
+    report = read_json(capture / REPORT_FILE)
+    try:
+        errors = report["reprojection_px"]
+        timesteps = {timestep for by_timestep in errors.values() for timestep in by_timestep} | set(
+            map(str, report["interpolated"])
+        )
+        lines = [f"warning: {warning}" for warning in report["warnings"]]
+        lines += [f"footage: cameras {len(errors)}, timesteps {len(timesteps)}"]
+        lines += [f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise StgaError(f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})") from error
+    files = [capture / SHEET_FILE, capture / REPORT_FILE, request.train.run / CURVE]
+    return [*lines, f"report: {', '.join(str(path) for path in files if path.exists())}"]
+
+
+def check_inputs(track: Track) -> None:
+    """Raise StgaError where the folder began with other inputs, or holds something else."""
+    out, inputs = track.out.parent, _inputs(track)
+    if (out / INPUTS).exists():
+        stored = read_inputs(out)
+        before = {name: stored.get(name, getattr(Track, name, None)) for name in inputs}  # an older version noted less
+        changed = next((name for name in inputs if before[name] != inputs[name]), None)
+        if changed is not None:
+            raise StgaError(f"{changed}: {out} began with {shorten(before[changed])}; give another --out")
+    elif is_written(track.out) or (out / RUN_FOLDER).exists():
+        raise StgaError(f"{out}: holds something else ({INPUTS} is missing); give another --out")
+
+
+def read_inputs(out: Path) -> dict[str, Any]:
+    """Raises StgaError where inputs.json is missing or malformed."""
+    values = read_json(out / INPUTS)
+    if not isinstance(values, dict) or not isinstance(values.get("model", 0), str | None):
+        raise StgaError(f"{out / INPUTS}: has no model; expected what `stga avatar` wrote")
+    return values
+
+
+def _inputs(track: Track) -> dict[str, Any]:
+    """What decides how it is tracked, as JSON: the fields of `Track` but its folder; paths are absolute."""
+    values = {spec.name: getattr(track, spec.name) for spec in fields(Track) if spec.name != "out"}
+    values["offset"] = dict(sorted((track.offset or {}).items()))
+    return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in values.items()}

@@ -1,0 +1,401 @@
+"""Training: a new run, one that is resumed, and one that refines or extends a finished run."""
+
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..avatar.file import read_avatar
+from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
+from ..capture.model import Capture, first_timesteps, join_takes, require_same_head, require_same_scale
+from ..capture.open import open_capture
+from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
+from ..errors import StgaError
+from ..export.ply import write_ply
+from ..format import format_table
+from ..options import like, option
+from ..progress import Cancelled, Progress, Report, Say
+from ..render.device import EXPECTED_DEVICE, choose_device, is_device
+from ..report import CurveUpdater, report_run
+from ..schema import setting
+from ..training.effect_catalog import RELIGHT, WORLD
+from ..training.run.folder import (
+    AVATAR,
+    TRACKING,
+    WORLD_FILE,
+    Continuation,
+    OpenedRun,
+    Run,
+    Take,
+    device_of,
+    has_run,
+    open_run,
+    read_run,
+    with_refined_tracking,
+)
+from ..training.run.identity import file_digest, identity_of
+from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
+from .results import Selected, Written
+
+MAX_NAMED_VIEWS = 6
+"""Views that a warning names."""
+Selection = Mapping[int, np.ndarray]
+"""timestep -> (F,) bool: triangles to train."""
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train an avatar from a capture, or continue a run.
+
+    selection: trained instead of what the rule selects.
+    """
+
+    run: Path = option("folder of the run", flag="--out", metavar="RUN")
+    capture: Path = option("folder of the capture", flag="CAPTURE")
+    settings: TrainingSettings = setting()
+    flame: Path | None = option("FLAME model file (.pkl or .npz)", None, metavar="FILE")
+    principal_point: str = option("what cy means in the capture", DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
+    device: str = option(
+        "gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto (default): that of the run, "
+        "else a GPU if it is right and faster than the CPU in a trial of a second, else the CPU",
+        "auto", accepts=is_device, expected=EXPECTED_DEVICE, metavar="{auto,cpu,gpu,gpu:NAME}",
+    )  # fmt: skip
+    selection: Selection | None = None
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Continue a run that was stopped.
+
+    capture, flame, principal_point   stand in for those that the run was begun with; None: these
+    selection       where training has not begun
+    """
+
+    run: Path
+    capture: Path | None = None
+    flame: Path | None = None
+    principal_point: str | None = setting(None, choices=PRINCIPAL_POINTS)
+    device: str = like(Train, "device")
+    selection: Selection | None = None
+
+
+def resumed(request: "Train | Refine | Extend") -> Resume:
+    """What continues the run of a request that was interrupted."""
+    if isinstance(request, Train):
+        return Resume(
+            request.run, request.capture, request.flame, request.principal_point, request.device, request.selection
+        )
+    return Resume(request.run, flame=request.flame, device=request.device)
+
+
+@dataclass(frozen=True)
+class _Continue:
+    """Continue a finished run in a run of its own. seconds, iterations: one of the two."""
+
+    run: Path = option("folder of the run that continues it (default: RUN_2, RUN_3, …)", flag="--out", metavar="NEW")
+    parent: Path = option("folder of a run", flag="RUN")
+    _: KW_ONLY
+    growth: float = option(
+        "splats to add, as a share of those on the triangles that are trained", 0.0, 0, MAX_GROWTH, metavar="SHARE"
+    )
+    seconds: float | None = like(
+        TrainingSettings, "seconds", help="training time (default 20s to refine, 1m to extend)"
+    )
+    iterations: int | None = like(TrainingSettings, "iterations")
+    seed: int = like(TrainingSettings, "seed")
+    flame: Path | None = like(Train, "flame", help="FLAME model file, if it has moved")
+    device: str = like(Train, "device")
+
+    def check(self) -> None:
+        """Raise StgaError unless there is one budget."""
+        if (self.seconds is None) == (self.iterations is None):
+            raise StgaError("the budget must be given either in seconds or in iterations")
+
+
+@dataclass(frozen=True)
+class Refine(_Continue):
+    """Train one region of a finished avatar further; every other splat stays as it is, and so does the run.
+
+    weights: (F,) of each triangle of a painted region, instead of `region`.
+    """
+
+    region: str = option(
+        "region of the capture, vertex mask of FLAME, or file of triangle weights (docs/formats.md)",
+        "", metavar="NAME|FILE", is_path=is_region_file,
+    )  # fmt: skip
+    weights: np.ndarray | None = None
+    frames: tuple[int, int] | None = option("timesteps to train on (default: all)", None, 0, metavar="FIRST-LAST")
+
+    def check(self) -> None:
+        """Raise StgaError unless there is one region and one budget."""
+        if not self.region and self.weights is None:
+            raise StgaError("--region: is missing; expected the name of a region or a file of triangle weights")
+        if self.region and self.weights is not None:
+            raise StgaError("region: expected its name, its file or painted weights")
+        super().check()
+
+
+@dataclass(frozen=True)
+class Extend(_Continue):
+    """Extend a finished avatar by further takes of the same head, in a run of its own."""
+
+    captures: tuple[Path, ...] = option("captures of the same head", flag="CAPTURE")
+
+    def check(self) -> None:
+        """Raise StgaError unless there is a take and one budget."""
+        if not self.captures:
+            raise StgaError("CAPTURE: is missing; expected one or more takes to extend the run by")
+        super().check()
+
+
+@dataclass(frozen=True)
+class SelectForTake:
+    """Find out which triangles extending a run by a take would train."""
+
+    parent: Path
+    capture: Path
+    flame: Path | None = None
+
+
+# Work
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that can be trained: its capture, of all its takes, and what each timestep trains, where that is given."""
+
+    request: Train | Resume | Refine | Extend
+    run: Run
+    capture: Capture
+    selection: Selection | None = None
+
+    def train(self, report: Report) -> Path:
+        """The path of the avatar. Raises as `training.run.session.train`."""
+        from ..training.run.session import train
+
+        folder, resumes, falls_back = self.request.run, isinstance(self.request, Resume), self.request.device == "auto"
+        return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
+
+
+def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Written:
+    """Train the run that is asked for; returns the path of its avatar and its summary.
+
+    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
+    """
+    from ..training.effects.plan import describe_effects
+
+    prepared, folder = prepare(request, report, say), request.run
+    for warning in prepared.capture.warnings:
+        say(f"warning: {warning}")
+    for line in format_table(describe_effects(prepared.run.effect_plan)):
+        say(line)
+    draw, latest, is_stopped = CurveUpdater(folder), Progress(), False
+
+    def report_training(progress: Progress) -> bool:
+        nonlocal latest, is_stopped
+        draw()
+        latest, is_stopped = progress, report(progress)
+        return is_stopped
+
+    def report_afterwards(progress: Progress) -> bool:
+        return report(replace(latest, stage=progress.stage, preview=None))  # with the figures of the training
+
+    avatar = prepared.train(report_training)
+    lines = report_run(folder)
+    if not is_stopped:  # whoever stops a training does not wait; `stga relight` finds the light out later
+        lines += [*_light_of(prepared, avatar, report_afterwards), *_world_of(prepared, report_afterwards)]
+    lines.append(f"avatar: {avatar}")
+    if prepared.run.settings.tracking:
+        lines.append(f"refined meshes: {folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
+    return Written(avatar, tuple(lines))
+
+
+def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ...]:
+    """Write the light of the capture into the avatar; what there is to say about it, or why there is none."""
+    if any(decision.effect == RELIGHT and not decision.on for decision in prepared.run.effect_plan):
+        return ("light: not estimated (the effect relight is off); `stga relight RUN` estimates it",)
+    from .finished_run import add_light
+
+    try:
+        return add_light(avatar, with_refined_tracking(prepared.capture, prepared.request.run), report=report)
+    except StgaError as error:  # an avatar without it is whole
+        return (f"light: not estimated ({error})",)
+
+
+def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
+    """Write what stands still behind the person into the run's folder, where its effect is on; what there is to say."""
+    if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
+        return ()
+    from ..training.world.world_splats import world_of
+
+    path = prepared.request.run / WORLD_FILE
+    try:
+        splats = world_of(prepared.capture, prepared.run.settings, report)
+    except Cancelled:
+        return ("world: not made (stopped)",)
+    write_ply(path, splats)
+    return (f"world: {path} ({len(splats)} splats)",)
+
+
+def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:
+    """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
+    if not isinstance(request, Resume) and has_run(request.run):
+        raise StgaError(f"{request.run}: already holds a run; resume it (--resume), or choose another folder (--out)")
+    match request:
+        case Train():
+            return _new_run(request, report, say)
+        case Resume():
+            return _resumed_run(request, say)
+        case Refine():
+            return _refinement(request, report, say)
+        case Extend():
+            return _extension(request, report, say)
+
+
+def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
+    """timestep of the take -> (F,) bool: what extending the run by it would train. Raises StgaError."""
+    report(Progress(stage="Comparing the avatar with the images"))
+    wanted = Extend(request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame)
+    _, _, selection, run = _joined_takes(wanted, say)
+    start = run.takes[-1].start
+    selection = {timestep - start: faces for timestep, faces in selection.items()}
+    for timestep, faces in selection.items():
+        say(f"{timestep:5d}  {faces.mean():6.1%}")
+    return Selected(selection)
+
+
+def _new_run(request: Train, report: Report, say: Say) -> Prepared:
+    from ..raster.cpu.precompile import begin_compiling
+    from ..training.effects.plan import plan_effects
+
+    if not request.capture.is_dir():
+        raise StgaError(f"{request.capture}: is not a folder; expected that of a capture")
+    begin_compiling()
+    device, why = choose_device(request.device)
+    capture = open_capture(request.capture, request.flame, request.principal_point)
+    report(Progress(stage="Analyzing the capture"))
+    settings, plan = plan_effects(capture, request.settings, device)
+    settings = with_budget(settings, len(capture.views.get("train", ())))
+    if settings.iterations != request.settings.iterations:
+        say(f"Preset {settings.preset}: {settings.iterations} iterations")
+    say(why)
+    flame = None if request.flame is None else request.flame.resolve()
+    run = Run(capture.root, flame, request.principal_point, settings, plan, device)
+    return Prepared(request, run, capture, request.selection)
+
+
+def _resumed_run(request: Resume, say: Say) -> Prepared:
+    opened = open_run(request.run, request.capture, request.flame, request.principal_point)
+    device, why = device_of(opened.run, request.device)
+    say(why)
+    return Prepared(request, replace(opened.run, device=device), opened.capture, request.selection)
+
+
+def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
+    """Raises StgaError where the run, the region or the frames do not exist, or no camera sees the region."""
+    from ..training.run.continuation import continued_settings, is_faced
+
+    device = _continuing_device(request, say)
+    report(Progress(stage="Opening the run"))
+    opened = open_run(request.parent, flame=request.flame)
+    capture = with_refined_tracking(opened.capture, request.parent)
+    if request.weights is None:
+        region, name = find_region(capture, request.region), request.region
+    elif request.weights.shape == (len(capture.faces),):
+        region, name = request.weights >= SELECTED_WEIGHT, "painted"
+    else:
+        found = request.weights.shape
+        raise StgaError(f"weights: expected one for each triangle ({len(capture.faces)},), got {found}")
+    face = read_avatar(request.parent / AVATAR).splats.face
+    count = int(region[face].sum())
+    if not count:
+        raise StgaError(f"region '{name}': the avatar has no splats there")
+    settings = continued_settings(
+        opened.run.settings, "refine", request.growth * count / len(face), request.seconds, request.iterations,
+        request.seed,
+    )  # fmt: skip
+    frames = request.frames or (min(capture.timesteps), max(capture.timesteps))
+    views = [view for view in capture.views.get("train", ()) if frames[0] <= view.timestep <= frames[1]]
+    between = f"from timestep {frames[0]} to {frames[1]}"
+    if not views:
+        raise StgaError(f"{request.parent}: its capture has no training views {between}")
+    if not is_faced(capture, views, region):
+        raise StgaError(f"region '{name}': faces no training camera {between}")
+    continuation = _continuation(request.parent, frames)
+    run = replace(opened.run, settings=settings, device=device, identity=None, continuation=continuation)
+    return Prepared(request, run, capture, {capture.timesteps[0]: region})
+
+
+def _extension(request: Extend, report: Report, say: Say) -> Prepared:
+    from ..training.effects.plan import add_effects
+    from ..training.run.continuation import continued_settings
+
+    device = _continuing_device(request, say)
+    report(Progress(stage="Comparing the avatar with the images"))
+    opened, capture, selection, run = _joined_takes(request, say)
+    needed = np.any(list(selection.values()), axis=0)
+    face = read_avatar(request.parent / AVATAR).splats.face
+    growth = request.growth * float(needed[face].mean())
+    settings = continued_settings(
+        opened.run.settings, "extend", growth, request.seconds, request.iterations, request.seed
+    )
+    say(f"takes: {1 + len(run.takes)}; the new ones need {needed.mean():.0%} of the triangles")
+    settings, plan = add_effects(capture, settings, run.effect_plan)
+    for old, new in zip(run.effect_plan, plan, strict=True):
+        if new.on != old.on:
+            say(f"{new.effect}  {new}")
+    run = replace(run, settings=settings, effect_plan=plan, device=device)
+    return Prepared(request, run, capture, selection)
+
+
+def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Selection, Run]:
+    """The run, its capture joined with the new takes, what these train, and the run with them.
+
+    Raises StgaError where the run or a take does not exist, or a take is of another head, has no training views or is
+    in the run already. Says which views do not show the head as the avatar does.
+    """
+    from ..training.run.continuation import select_for_takes
+
+    opened = open_run(request.parent, flame=request.flame)
+    run, new = opened.run, [_open_new_take(opened, path) for path in request.captures]
+    roots = [take.root for take in new]
+    twice = next((root for root in roots if roots.count(root) > 1), None)
+    if twice is not None:
+        raise StgaError(f"{twice}: is given twice; expected each take once")
+    everything = [*opened.takes, *new]
+    capture = with_refined_tracking(join_takes(everything), request.parent)
+    starts = first_timesteps(everything)[len(opened.takes) :]
+    added = [
+        Take(take.root, start, identity_of(take, run.principal_point, run.settings))
+        for take, start in zip(new, starts, strict=True)
+    ]
+    continuation = _continuation(request.parent, (starts[0], max(capture.timesteps)))
+    selection, unlike = select_for_takes(continuation, capture, run.settings, starts)
+    if unlike:
+        names = ", ".join(view.name for view in unlike[:MAX_NAMED_VIEWS])
+        say(f"warning: {names}: does not look like the head from this camera; are images swapped?")
+    run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
+    return opened, capture, selection, run
+
+
+def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
+    run = opened.run
+    take = open_capture(path, run.flame, run.principal_point)
+    require_same_head(opened.capture, take)
+    if not take.views.get("train"):
+        raise StgaError(f"{take.root}: has no training views, so there is nothing to extend the avatar with")
+    require_same_scale(opened.takes[0], take)
+    if any(take.root == old.root for old in opened.takes):
+        raise StgaError(f"{take.root}: is a take of this run already")
+    return take
+
+
+def _continuation(parent: Path, frames: tuple[int, int]) -> Continuation:
+    return Continuation(parent.resolve(), file_digest(parent / AVATAR), *frames)
+
+
+def _continuing_device(request: Refine | Extend, say: Say) -> str:
+    device, why = device_of(read_run(request.parent), request.device)
+    say(f"{why}\nrun: {request.run}")
+    return device

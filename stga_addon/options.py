@@ -1,0 +1,258 @@
+"""Fields of dataclasses as options: of the command line here, of Blender's operators in `operators/options.py`."""
+
+import dataclasses
+import errno
+import math
+import os
+import re
+from argparse import ArgumentTypeError, Namespace
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from types import NoneType
+from typing import Any, get_args, get_origin
+
+from .errors import StgaError, shorten
+from .schema import alternatives, expectation, setting, type_hints
+
+MAX_NAME_BYTES = 255
+"""Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
+MAX_DIGITS = 18
+"""Of a whole number on the command line, which fits 64 bits."""
+
+
+def option(
+    help: str,
+    default: Any = dataclasses.MISSING,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    *,
+    flag: str = "",
+    metavar: str = "",
+    parse: Callable[[str], Any] | None = None,
+    bare: Any = None,
+    offered: Collection[str] | None = None,
+    group: str = "",
+    needs: tuple[str | tuple[str, ...], ...] = (),
+    **limits: Any,
+) -> Any:
+    """A dataclass field that people choose, with its limits (`schema.setting`).
+
+    help     what it is, for command line and tooltip; of a field that is a dataclass, the title of its options
+    flag     its name on the command line, by default the field's; without dashes: it is given by position
+    parse    text -> value, and of a mapping a name and a value, where its type does not say how
+    bare     the value where the option is given alone
+    offered  those of the field's choices that people have
+    group    options of one group exclude each other
+    needs    fields that have to be given with it, else it has no effect; of a tuple, one
+    """
+    asked = {"help": help, "flag": flag, "metavar": metavar, "parse": parse, "bare": bare, "group": group}
+    asked |= {"needs": needs, "offered": offered or limits.get("choices")}
+    return setting(default, minimum, maximum, **limits, **asked)
+
+
+def like(kind: Any, name: str, **changes: Any) -> Any:
+    """A field as that of another dataclass; changes: of `default` and its metadata."""
+    spec = kind.__dataclass_fields__[name]
+    default = changes.pop("default", spec.default)
+    return dataclasses.field(default=default, metadata={**spec.metadata, **changes})
+
+
+def flag_of(spec: Any) -> str:
+    """How the command line calls a field."""
+    return str(spec.metadata.get("flag") or f"--{spec.name.replace('_', '-')}")
+
+
+def option_fields(kind: Any) -> Iterator[Any]:
+    """The fields of a dataclass that are options."""
+    return (spec for spec in dataclasses.fields(kind) if spec.metadata.get("help"))
+
+
+# The command line
+
+
+def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] = ()) -> None:
+    """Add an argument for each field of a dataclass that is an option, those of its dataclasses in groups.
+
+    names: some of the fields; none: all. may_lack: fields without a default that need not be given.
+    """
+    hints, groups = type_hints(kind), {"": parser}
+    for spec in option_fields(kind):
+        hint, asked = hints[spec.name], spec.metadata
+        if names and spec.name not in names:
+            continue
+        if dataclasses.is_dataclass(hint):
+            add_options(parser.add_argument_group(asked["help"]), hint)
+            continue
+        if asked["group"] not in groups:
+            groups[asked["group"]] = parser.add_mutually_exclusive_group()
+        is_required = not _has_default(spec) and spec.name not in may_lack
+        form = {"help": _help(spec), "default": None, **_form(spec, hint, is_required)}
+        groups[asked["group"]].add_argument(*form.pop("names"), **form)
+
+
+def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
+    """What `add_argument` takes for a field, by its type."""
+    (kind,), asked, flag = (k for k in alternatives(hint) if k is not NoneType), spec.metadata, flag_of(spec)
+    is_named = flag.startswith("-")
+    form: dict[str, Any] = {"names": (flag,), "dest": spec.name, "required": is_required}
+    if not is_named:
+        form = {"names": (spec.name,), "metavar": flag, **({} if is_required else {"nargs": "?"})}
+    if kind is bool:
+        return {**form, "action": "store_true"}
+    several = get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis
+    if get_origin(kind) is Mapping or (several and is_named):
+        form["action"] = "append"
+    elif several:
+        form["nargs"] = "+" if is_required else "*"
+    elif asked["bare"] is not None:
+        form |= {"nargs": "?", "const": asked["bare"]}
+    if asked["offered"] is not None:
+        return {**form, "choices": tuple(asked["offered"])}
+    form["type"] = _parser(get_args(kind)[0] if several else kind, asked)
+    return {**form, "metavar": asked["metavar"]} if asked["metavar"] else form
+
+
+def _has_default(spec: Any) -> bool:
+    return spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
+
+
+def _help(spec: Any) -> str:
+    help, default = str(spec.metadata["help"]), spec.default
+    if isinstance(default, str | int | float) and default and default is not True and "default" not in help:
+        help += f" (default {default})"
+    return help.replace("%", "%%")
+
+
+def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
+    """Field -> value of what was given on the command line."""
+    hints, found = type_hints(kind), dict[str, Any]()
+    for spec in option_fields(kind):
+        hint = hints[spec.name]
+        if dataclasses.is_dataclass(hint):
+            nested: Any = hint
+            found[spec.name] = nested(**given_options(options, nested))
+            continue
+        value = getattr(options, spec.name, None)
+        if value is None:
+            continue
+        if isinstance(value, list):
+            value = dict(value) if any(get_origin(part) is Mapping for part in alternatives(hint)) else tuple(value)
+        found[spec.name] = value
+    return found
+
+
+def refuse_useless(value: Any) -> None:
+    """Raise StgaError for the first option of a dataclass that has no effect without another (`needs`)."""
+    specs = {spec.name: spec for spec in dataclasses.fields(value)}
+    for spec in option_fields(type(value)):
+        for needed in spec.metadata["needs"] if _is_changed(value, spec) else ():
+            names = (needed,) if isinstance(needed, str) else needed
+            if not any(_is_changed(value, specs[name]) for name in names):
+                without = " or ".join(flag_of(specs[name]) for name in names)
+                raise StgaError(f"{_flag_of_change(value, spec)}: has no effect without {without}")
+
+
+def _is_changed(value: Any, spec: Any) -> bool:
+    factory = spec.default_factory
+    return bool(getattr(value, spec.name) != (spec.default if factory is dataclasses.MISSING else factory()))
+
+
+def _flag_of_change(value: Any, spec: Any) -> str:
+    nested = getattr(value, spec.name)
+    if not dataclasses.is_dataclass(nested):
+        return flag_of(spec)
+    return next(flag_of(inner) for inner in option_fields(type(nested)) if _is_changed(nested, inner))
+
+
+# Values on the command line
+
+
+def _parser(kind: Any, limits: Mapping[str, Any]) -> Callable[[str], Any]:
+    """The type of an argument: text -> value that the field allows."""
+    convert = limits["parse"] or _CONVERSIONS[kind]
+
+    def parse(text: str) -> Any:
+        try:
+            value = convert(text)
+        except StgaError as error:
+            raise ArgumentTypeError(str(error)) from error
+        wrong = None if get_origin(kind) is Mapping else expectation(value, kind, limits)
+        if wrong is not None:
+            raise ArgumentTypeError(f"expected {wrong}, got {shorten(text)}")
+        return value
+
+    return parse
+
+
+def usable_path(text: str) -> Path:
+    """Raises StgaError for a name that no file can have: empty, too long or with a NUL."""
+    try:
+        os.lstat(text)
+        too_long = False
+    except OSError as error:
+        too_long = error.errno == errno.ENAMETOOLONG
+    except ValueError as error:  # a NUL, or a character that file names cannot encode
+        raise StgaError(f"'{text}' is not a usable path ({error})") from error
+    # The system looks at names in turn and stops at the first that is missing.
+    if too_long or any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(text).parts):
+        raise StgaError(f"'{text}' is not a usable path (too long)")
+    if not text:
+        raise StgaError("the path is empty")
+    return Path(text)
+
+
+def _whole_number(text: str) -> Any:
+    return int(text) if re.fullmatch(rf"-?\d{{1,{MAX_DIGITS}}}", text, re.ASCII) else text
+
+
+def _number(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def frame_span(text: str) -> tuple[int, int]:
+    """ "10:20" or "10-20", both included. Raises StgaError for anything else."""
+    match = re.fullmatch(r"(\d{1,18})[:-](\d{1,18})", text, re.ASCII)
+    first, last = (int(part) for part in match.groups()) if match else (1, 0)
+    if first > last:
+        raise StgaError(f"'{text}' is not a range of frames such as 10:20 or 10-20")
+    return first, last
+
+
+def duration(text: str) -> float:
+    """Seconds in "90", "90s", "10m", "1h30m", more than 0. Raises StgaError for anything else."""
+    match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip(), re.ASCII)
+    if not match or not any(match.groups()):
+        raise StgaError(f"'{text}' is not a time such as 90s, 10m or 1h30m")
+    hours, minutes, seconds = (float(part or 0) for part in match.groups())
+    total = 3600 * hours + 60 * minutes + seconds
+    if not 0 < total < math.inf:
+        raise StgaError(f"'{text}' is not a positive time")
+    return total
+
+
+def color(text: str) -> tuple[float, float, float]:
+    """ "white", "black" or three numbers in 0…1. Raises StgaError for anything else."""
+    named = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+    if text in named:
+        return named[text]
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise StgaError(f"'{text}' is not white, black or R,G,B with numbers in 0…1")
+    return red, green, blue
+
+
+_CONVERSIONS: dict[Any, Callable[[str], Any]] = {
+    str: str,
+    Path: usable_path,
+    int: _whole_number,
+    float: _number,
+    tuple[int, int]: frame_span,
+    tuple[float, float, float]: color,
+}
+"""Type of a field -> what reads its values; what it cannot read, `schema.expectation` refuses."""

@@ -1,0 +1,304 @@
+"""What is shown of a run: the lines of its summary, and its accuracy curve by matplotlib and, for Blender, by numpy."""
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import StgaError
+from .files import replacing
+from .format import format_duration
+from .training.evaluate.forecast import (
+    DETAIL,
+    UNMATCHED,
+    checked_forecasts,
+    curve_of,
+    detail_curve,
+    explain_missed_target,
+    flat_since,
+    is_exposure_fitted,
+    saved_line,
+)  # fmt: skip
+from .training.run.folder import read_run
+from .training.run.metrics_log import METRICS, read_metrics
+
+if TYPE_CHECKING:  # imported when a chart is drawn: it takes half a second, and the command line starts without it
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CURVE = "curve.png"
+MAX_DRAWING_SHARE = 0.01
+"""Largest share of the time that drawing the curve may take while a run trains."""
+
+FIRST_DRAWING_S = 30.0
+"""Seconds until the first: loading the library takes a few, while the user waits for the first preview."""
+
+
+class CurveUpdater:
+    """Keeps the curve in a run's folder up to date; call it as often as convenient."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._drawn_size = folder, -1
+        self._next_update = perf_counter() + FIRST_DRAWING_S
+
+    def __call__(self) -> None:
+        now = perf_counter()
+        if now < self._next_update:
+            return
+        path = self._folder / METRICS
+        size = path.stat().st_size if path.exists() else 0
+        if size != self._drawn_size:
+            with suppress(StgaError):  # a curve that cannot be written must not end the training
+                write_curve(self._folder)
+            self._drawn_size = size
+        spent = perf_counter() - now
+        self._next_update = now + spent / MAX_DRAWING_SHARE
+
+
+def write_curve(folder: Path) -> None:
+    """Write curve.png of the run in `folder`, if there is an evaluation to draw and matplotlib to draw it."""
+    metrics = read_metrics(folder)
+    if curve_of(metrics) and find_spec("matplotlib") is not None:
+        with replacing(folder / CURVE) as partial:
+            run_chart(metrics).savefig(partial, format="png")
+
+
+def report_run(folder: Path) -> list[str]:
+    """Write the curve of a finished run and return the lines of its summary."""
+    write_curve(folder)
+    run, metrics = read_run(folder), read_metrics(folder)
+    continued = run.continuation is not None
+    lines = summarize_continuation(metrics) if continued else summarize_run(metrics, run.settings.target_psnr)
+    if (folder / CURVE).exists():
+        return lines
+    reason = "matplotlib is not installed" if curve_of(metrics) else "no held-out views (split 'val') were evaluated"
+    return [*lines, f"{CURVE} was not drawn: {reason}"]
+
+
+def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
+    """Lines on accuracy, the target (dB), checked forecasts, and the cost of evaluation and memory."""
+    if not metrics:
+        return []
+    lines, curve, last = [], curve_of(metrics), metrics[-1]
+    if curve:
+        evaluations = [line for line in metrics if "psnr" in line]
+        best = saved_line(evaluations, target)
+        fitted = f" (exposure fitted; {best[UNMATCHED]:.2f} dB without)" if UNMATCHED in best else ""
+        parts = [f"{best['psnr']:.2f} dB{fitted}", f"SSIM {best['ssim']:.4f}"]
+        named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
+        parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
+        parts += [f"detail difference {best[DETAIL]:.4f}"] if DETAIL in best else []
+        when = format_duration(best["seconds"])
+        lines.append(f"held-out views: {', '.join(parts)}, after {when} (the saved avatar)")
+    if target is not None and curve:
+        reached = any(psnr >= target for _, psnr in curve)
+        text = f"{target:g} dB was reached" if reached else explain_missed_target(curve, target)
+        lines.append(f"{text} (exposure fitted)" if is_exposure_fitted(metrics) else text)
+    plateau = flat_since(metrics)
+    if plateau is not None:
+        since = format_duration(plateau)
+        lines.append(f"nothing was gained after {since}: more time does not help with these settings")
+    held, checked = checked_forecasts(metrics)
+    if checked:
+        lines.append(f"forecasts: {held} of {checked} held within their error")
+    memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
+    lines.append(f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}")
+    return lines
+
+
+def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Lines on the accuracy of the avatar before and after, by region and group of held-out views."""
+    if not metrics:
+        return []
+    first, last = metrics[0], metrics[-1]
+    lines = [f"splats: {first['splats']} before, {last['splats']} after"]
+    for name, label in _labels(first).items():
+        before, after = first[name], last.get(name, math.nan)
+        lines.append(f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})")
+    return lines
+
+
+def _labels(line: Mapping[str, Any]) -> dict[str, str]:
+    """Each PSNR of a metrics line -> what it is called: of all held-out views, then by region and group."""
+    fitted = " (exposure fitted)" if UNMATCHED in line else ""
+    labels = {name: f"held-out views{fitted}" for name in ("psnr",) if name in line}
+    if UNMATCHED in line:
+        labels[UNMATCHED] = "held-out views (exposure not fitted)"
+    parts = [name.removeprefix("psnr_") for name in line if name.startswith("psnr_") and name != UNMATCHED]
+    return {**labels, **{f"psnr_{part}": part.replace("_", " ") + fitted for part in parts}}
+
+
+def evaluation_share(lines: Sequence[Mapping[str, Any]]) -> float:
+    """Seconds of evaluation during training over seconds of training; the final evaluation does not count."""
+    spent: float = sum(line["evaluation_s"] for line in lines[:-1])
+    return spent / max(float(lines[-1]["seconds"]), 1e-9)
+
+
+# Charts by matplotlib
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#785e3c", "#5a5a5a")
+"""Okabe and Ito's palette, which people with any color vision can tell apart."""
+
+
+def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
+    """PSNR of one run in the whole image, the head mask and the moving region, with the latest forecast; and the detail
+    difference, by which the avatar is kept, on an axis of its own with the best at the top."""
+    fitted = " (exposure fitted)" if is_exposure_fitted(metrics) else ""
+    figure, axes = psnr_axes(f"PSNR{fitted} and detail difference on held-out views")
+    keys = {"whole image": "psnr", "head mask": "psnr_mask", "moving region": "psnr_moving"}
+    for name, key in {**keys, "whole image, exposure not fitted": UNMATCHED}.items():
+        curve = curve_of(metrics, key)
+        if curve:
+            axes.plot(*np.array(curve).T, marker=".", label=name)
+    if metrics and "forecast" in metrics[-1]:
+        last, ahead = metrics[-1], metrics[-1]["forecast"]
+        seconds, psnr = [last["seconds"], ahead["seconds"]], np.array([last["psnr"], ahead["psnr"]])
+        error = np.array([0, ahead["error"]])
+        (line,) = axes.plot(seconds, psnr, linestyle="--", label="forecast")
+        axes.fill_between(seconds, psnr - error, psnr + error, color=line.get_color(), alpha=0.2, linewidth=0)
+    detail = np.array(curve_of(metrics, DETAIL)).reshape(-1, 2).T
+    if detail.size:
+        figure.subplots_adjust(right=0.9)
+        right = axes.twinx()
+        right.set(ylabel="detail difference (lower is better)", yscale="log")
+        right.yaxis.set_major_formatter("{x:g}")
+        right.yaxis.set_minor_formatter("{x:g}")
+        right.plot(*detail, color=COLORS[-1], linestyle=":", marker=".")
+        right.invert_yaxis()
+        axes.plot([], [], color=COLORS[-1], linestyle=":", marker=".", label="detail difference")
+    finish_axes(axes)
+    return figure
+
+
+def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
+    """An empty chart of 900 × 540 pixels; `Figure.savefig` renders it without a display."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 5.4), dpi=100)
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.1, top=0.93)  # `constrained` takes as long as the drawing
+    axes = figure.subplots()
+    axes.set(title=title, xlabel="training time [s]", ylabel="PSNR [dB]")
+    axes.set_prop_cycle(color=COLORS)
+    axes.grid(alpha=0.3)
+    return figure, axes
+
+
+def finish_axes(axes: "Axes") -> None:
+    """Add the legend and cut off the steep start: the axis begins at the lowest value after a tenth of the time."""
+    curves = [np.asarray(line.get_xydata()).T for line in axes.lines]
+    curves = [curve for curve in curves if curve.size]
+    if not curves:
+        return
+    tenth = max(x[-1] for x, _ in curves) / 10
+    lowest = min(min([float(np.interp(tenth, x, y)), *y[x >= tenth].tolist()]) for x, y in curves)
+    highest = max(float(y.max()) for _, y in curves)
+    axes.set_ylim(bottom=lowest - 0.05 * (highest - lowest) - 1e-3)
+    axes.set_xlim(left=0)
+    axes.legend(loc="lower right")
+
+
+# The curve in Blender's panel: its Python need not have matplotlib or Pillow
+
+SIZE = 256
+"""Width and height in pixels: Blender's icons are square."""
+MARGIN = 6.0
+LINE_WIDTH = 3.0
+BACKGROUND_COLOR, GRID_COLOR = (0.11, 0.11, 0.11), (0.25, 0.25, 0.25)
+CURVE_COLOR, FORECAST_COLOR, DETAIL_COLOR = (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45)
+BAND_OPACITY = 0.35
+"""Of the band that shows a forecast's error."""
+GRID_STEPS_DB = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+"""The first step is used that gives at most MAX_GRID_STEPS."""
+MAX_GRID_STEPS = 6
+
+Color = tuple[float, float, float]
+
+
+def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, str] | None:
+    """Held-out PSNR over training time, with the last forecast and its error; None before two evaluations.
+
+    The detail difference, by which the avatar is kept, is drawn in green over the whole height, the best at the top.
+    lines: of a metrics.jsonl. Returns (SIZE, SIZE, 4) float32 RGBA in 0…1, the bottom row first, and as texts the
+    ranges of the axes and of the detail difference (empty if it was not measured). The steep beginning is cut off: the
+    vertical axis starts at the PSNR of a tenth of the time.
+    """
+    curve = curve_of(lines)
+    if len(curve) < 2:
+        return None
+    seconds, psnr = np.array(curve, np.float64).T
+    forecast = lines[-1].get("forecast")
+    end, high = seconds[-1], psnr.max()
+    if forecast is not None:
+        end, high = forecast["seconds"], max(high, forecast["psnr"] + forecast["error"])
+    low = min(float(np.interp(end / 10, seconds, psnr)), psnr[-1])
+    step = next((step for step in GRID_STEPS_DB if (high - low) / step <= MAX_GRID_STEPS), GRID_STEPS_DB[-1])
+    low, high = step * np.floor(low / step), step * np.ceil(high / step + 1e-9)
+    plot = _Plot((0.0, end), (low, high))
+    plot.grid(np.arange(low, high + step / 2, step))
+    if forecast is not None:
+        x, y = np.array([seconds[-1], end]), np.array([psnr[-1], forecast["psnr"]])
+        error = np.array([0.0, forecast["error"]])
+        plot.band(x, y - error, y + error, FORECAST_COLOR)
+        plot.line(x, y, FORECAST_COLOR)
+    detail_range = _draw_detail(plot, lines, (low, high))
+    plot.line(seconds, psnr, CURVE_COLOR)
+    unmatched = lines[-1].get(UNMATCHED)
+    fitted = "" if unmatched is None else f" (exposure fitted; {unmatched:.1f} without)"
+    return plot.pixels, f"{low:g} to {high:g} dB{fitted}, 0 to {format_duration(end)}", detail_range
+
+
+def _draw_detail(plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]) -> str:
+    """Draw the detail difference, scaled to the height in dB from a tenth of the time on; returns its range as text."""
+    seconds, detail = np.array(detail_curve(lines), np.float64).reshape(-1, 2).T
+    if len(detail) < 2:
+        return ""
+    lowest, highest = float(np.interp(seconds[-1] / 10, seconds, detail)), float(detail.max())
+    lowest = min(lowest, float(detail[-1]))
+    share = (detail - lowest) / max(highest - lowest, 1e-9)
+    plot.line(seconds, height[0] + share * (height[1] - height[0]), DETAIL_COLOR)
+    worst, best = 10 ** (-lowest / 20), min(value for _, value in curve_of(lines, DETAIL))
+    return f"Detail difference {worst:.3f} to {best:.3f} (green)"
+
+
+class _Plot:
+    """An image with axes: x and y are the ranges of seconds and dB inside its margins."""
+
+    def __init__(self, x: tuple[float, float], y: tuple[float, float]) -> None:
+        self.pixels = np.ones((SIZE, SIZE, 4), np.float32)
+        self.pixels[..., :3] = BACKGROUND_COLOR
+        self._x, self._y = x, y
+
+    def grid(self, y: np.ndarray) -> None:
+        self.pixels[self._rows(y).astype(int), :, :3] = GRID_COLOR
+
+    def line(self, x: np.ndarray, y: np.ndarray, color: Color) -> None:
+        """Antialiased by the distance of each pixel's center to the line segment in the pixel's column."""
+        seconds, inside = self._columns(x)
+        height = np.interp(seconds, x, self._rows(y))
+        slope = np.gradient(height)
+        rows = np.arange(SIZE)[:, None] + 0.5
+        distance = np.abs(rows - height) / np.sqrt(1 + slope**2)
+        self._blend(np.clip(LINE_WIDTH / 2 + 0.5 - distance, 0, 1) * inside, color)
+
+    def band(self, x: np.ndarray, low: np.ndarray, high: np.ndarray, color: Color) -> None:
+        seconds, inside = self._columns(x)
+        rows = np.arange(SIZE)[:, None] + 0.5
+        bottom, top = (np.interp(seconds, x, self._rows(edge)) for edge in (low, high))
+        self._blend(BAND_OPACITY * ((rows >= bottom) & (rows <= top) & inside), color)
+
+    def _columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Seconds at each column's center, and whether they are in the range of x."""
+        columns = np.arange(SIZE) + 0.5
+        seconds = self._x[0] + (columns - MARGIN) / (SIZE - 2 * MARGIN) * (self._x[1] - self._x[0])
+        return seconds, (seconds >= x[0]) & (seconds <= x[-1])
+
+    def _rows(self, y: np.ndarray) -> np.ndarray:
+        return MARGIN + (y - self._y[0]) / (self._y[1] - self._y[0]) * (SIZE - 2 * MARGIN)
+
+    def _blend(self, opacity: np.ndarray, color: Color) -> None:
+        self.pixels[..., :3] += opacity[..., None] * (np.array(color, np.float32) - self.pixels[..., :3])

@@ -1,0 +1,371 @@
+"""State of a request that Blender follows: transitions without Blender."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stga_addon.jobs.monitor_state import (
+    CHECK_INTERVAL_S,
+    SLICE_INTERVAL_S,
+    CancelAsked,
+    Dismissed,
+    Effect,
+    Event,
+    Failed,
+    KillWorker,
+    LoadAvatar,
+    PushUndo,
+    ReadCurve,
+    Redraw,
+    RemoveFiles,
+    RequestState,
+    RunFiles,
+    SceneFree,
+    SceneRead,
+    Show,
+    Shown,
+    SliceBuilt,
+    Started,
+    StatusRead,
+    StopWorker,
+    Store,
+    StoreAvatar,
+    transition,
+)
+from stga_addon.jobs.table import DISMISSIBLE, JOBS, Kind
+from stga_addon.worker.status import WorkerSnapshot, WorkerState, WorkerStatus
+
+RUN = Path("run")
+JOB = RUN / "job"
+PREVIEW = JOB / "preview.npz"
+AVATAR = RUN / "avatar.npz"
+START = Started(RUN, JOB)
+TRANSIENT = Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE, Kind.LIGHT
+"""What leaves nothing but its result in the scene."""
+ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED, WorkerState.LOST)
+TRAINING = RequestState(Kind.TRAINING)
+
+
+def after(*events: Event, state: RequestState = TRAINING) -> tuple[RequestState, list[Effect]]:
+    """The state after the events, and the effects of the last one."""
+    effects: Sequence[Effect] = ()
+    for event in events:
+        state, effects = transition(state, event)
+    return state, list(effects)
+
+
+def status(state: WorkerState, preview: int = 0, folder: Path = JOB, error: str = "", **wanted: bool) -> StatusRead:
+    """A status that was read; preview: stamp of the preview file, 0: there is none."""
+    files = RunFiles(preview=(preview, 1) if preview else None)
+    return StatusRead(folder, WorkerSnapshot(state, WorkerStatus(error=error)), files, **wanted)
+
+
+def loads(effects: list[Effect]) -> list[Path]:
+    return [effect.path for effect in effects if isinstance(effect, LoadAvatar)]
+
+
+# Any request
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_a_running_request_of_any_kind(kind):
+    """Catches a kind whose progress is not seen, that no timer follows, or a second request beside a running one."""
+    state, effects = after(START, state=RequestState(kind, Path("old"), JOB, error="old", stopped=True))
+    assert state == RequestState(kind, RUN, JOB)
+    assert Redraw() in effects
+    assert (Store(RUN, False) in effects) == (kind in (Kind.TRAINING, Kind.TRACKING, Kind.AVATAR))
+    for worker in (WorkerState.STARTING, WorkerState.WORKING, WorkerState.CANCELLING):
+        state, effects = after(status(worker), state=state)
+        assert (state.is_running, state.interval_s, state.can_be_dismissed) == (True, CHECK_INTERVAL_S, False)
+        assert effects == [Redraw()]
+    assert after(status(WorkerState.CANCELLING), state=state) == (state, [])
+
+
+@pytest.mark.parametrize("kind", Kind)
+@pytest.mark.parametrize("end", ENDS)
+def test_any_end_of_any_kind_stops_the_timer(kind, end):
+    """Catches a timer that runs for ever, a result shown twice, and a failure or a cancelled request that is shown."""
+    state, _ = after(START, status(WorkerState.WORKING), status(end, error="why"), state=RequestState(kind))
+    shown = {Kind.TRAINING: ENDS[:2], Kind.VIDEO: (), Kind.AVATAR: ()}.get(kind, ENDS[:1])
+    assert (state.loading is not None) == (end in shown)
+    if state.loading is not None:
+        assert state.interval_s == CHECK_INTERVAL_S
+        assert after(SceneFree(), state=state) == (state, [Show(state.loading)])
+        state, _ = after(Shown(), state=state)
+    assert (state.interval_s, state.is_running, state.loading) == (None, False, None)
+    assert after(SceneFree(), state=state) == (state, [])
+    assert state.can_be_dismissed == (kind in DISMISSIBLE)
+    transient = kind in TRANSIENT
+    assert (state.error == "why") == (transient and end not in shown)
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_cancel(kind):
+    """Catches a cancel that throws work away, or that waits for what nobody needs; nothing is cancelled where nothing
+    is."""
+    idle, effects = after(CancelAsked(), state=RequestState(kind))
+    assert not {StopWorker(JOB), KillWorker(JOB), RemoveFiles(JOB)} & set(effects)
+    running, _ = after(START, status(WorkerState.WORKING), state=RequestState(kind))
+    state, effects = after(CancelAsked(), state=running)
+    if kind in TRANSIENT:
+        assert state == idle
+        assert effects == [KillWorker(JOB), RemoveFiles(JOB), Redraw()]
+    else:
+        assert (state, effects) == (running, [StopWorker(JOB)])
+
+
+@pytest.mark.parametrize("kind", sorted(DISMISSIBLE))
+def test_dismiss(kind):
+    """Catches files that stay behind, and a request that the .blend file still names."""
+    state, effects = after(START, status(WorkerState.FAILED), Dismissed(), state=RequestState(kind))
+    assert state == RequestState(kind)
+    stored = [] if kind == Kind.VIDEO else [Store(None, False)]
+    assert effects == [RemoveFiles(JOB), *stored, Redraw()]
+
+
+@pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
+def test_a_result_that_cannot_be_shown(kind):
+    """Catches a failure that nobody sees, and one that is tried again for ever."""
+    state, effects = after(START, status(WorkerState.FINISHED), Failed("no head"), state=RequestState(kind))
+    assert (state.error, state.interval_s, state.is_running) == ("no head", None, False)
+    assert PushUndo() not in effects
+    done = Store(RUN, True) if kind == Kind.TRACKING else RemoveFiles(JOB)
+    assert done in effects
+
+
+@pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
+def test_a_result_waits_until_the_scene_is_free(kind):
+    """Catches a mesh that is changed in Edit Mode, and a cancel that cannot stop what waits for its end."""
+    state, effects = after(START, status(WorkerState.FINISHED), state=RequestState(kind))
+    for _ in range(3):
+        assert not any(isinstance(effect, Show) for effect in effects)
+        state, effects = after(status(WorkerState.FINISHED), state=state)
+        assert state.interval_s == CHECK_INTERVAL_S
+    assert state.is_running == (kind != Kind.TRACKING)
+
+
+def test_the_option_of_the_command_line_is_not_named():
+    """Catches a panel that tells its user of an option which it has not."""
+    analysis = RequestState(Kind.ANALYSIS)
+    state, _ = after(START, status(WorkerState.FAILED, error="--effect jaw=on: is impossible"), state=analysis)
+    assert state.error == "jaw=on: is impossible"
+
+
+def test_an_undo_step_for_a_selection():
+    """Catches a selection that undo cannot take back."""
+    _, effects = after(START, status(WorkerState.FINISHED), Shown(undoable=True), state=RequestState(Kind.SELECTION))
+    assert effects == [PushUndo(), RemoveFiles(JOB), Redraw()]
+
+
+def test_the_next_video_replaces_the_last_one():
+    """Catches a temporary folder for each video, and a recording that is removed when its worker starts."""
+    first, _ = after(START, status(WorkerState.FINISHED), state=RequestState(Kind.VIDEO))
+    _, effects = after(Started(RUN, Path("next")), state=first)
+    assert RemoveFiles(JOB) in effects
+    _, effects = after(Started(RUN, JOB), state=first)
+    assert RemoveFiles(JOB) not in effects
+
+
+def test_every_request_of_blender_has_a_kind():
+    """Catches a field that a request does not have."""
+    for request, job in JOBS.items():
+        assert (job.kind is None) == (job.subject == "")
+        assert job.kind is None or job.subject in request.__dataclass_fields__ or hasattr(request, job.subject)
+
+
+# Trainings
+
+
+def test_start_is_stored_and_monitored():
+    """Catches a training that the .blend file forgets, or that keeps the state of the one before."""
+    assert after(START)[1] == [Store(RUN, False), ReadCurve(RUN), Redraw()]
+
+
+def test_each_preview_is_loaded_once():
+    """Catches previews that are read again at every check, and later ones that are not shown."""
+    state, effects = after(START, status(WorkerState.WORKING, preview=1))
+    assert loads(effects) == [PREVIEW]
+    state, effects = after(status(WorkerState.WORKING, preview=2), state=state)
+    assert not loads(effects), "the preview before is still being read"
+    state, effects = after(Shown(undoable=True), state=state)
+    assert effects == [PushUndo(), Redraw()]
+    state, effects = after(status(WorkerState.WORKING, preview=2), state=state)
+    assert loads(effects) == [PREVIEW]
+    state, effects = after(Shown(), status(WorkerState.WORKING, preview=2), state=state)
+    assert effects == []
+    assert state.interval_s == CHECK_INTERVAL_S
+
+
+def test_no_preview_unless_wanted():
+    """Catches splats that keep changing although live preview is off, and a preview that is lost by turning it on."""
+    state, effects = after(START, status(WorkerState.WORKING, preview=1, live_preview=False))
+    assert not loads(effects)
+    assert loads(after(status(WorkerState.WORKING, preview=1), state=state)[1]) == [PREVIEW]
+
+
+@pytest.mark.parametrize("end", [WorkerState.FINISHED, WorkerState.CANCELLED])
+def test_result_is_shown_once(end):
+    """Catches a result that is not shown, or shown again at every check, or that undo cannot take back."""
+    state, effects = after(START, status(end))
+    assert StoreAvatar(AVATAR) in effects
+    assert loads(effects) == [AVATAR]
+    state, effects = after(Shown(), state=state)
+    assert effects == [Store(RUN, True), PushUndo(), Redraw()]
+    assert state.interval_s is None
+    assert after(status(end), state=state) == (state, [])
+
+
+def test_result_that_is_not_wanted_is_only_stored():
+    """Catches splats that appear although the user turned that off."""
+    state, effects = after(START, status(WorkerState.FINISHED, show_result=False))
+    assert not loads(effects)
+    assert {StoreAvatar(AVATAR), Store(RUN, True)} <= set(effects)
+    assert state.result_shown
+    assert state.interval_s is None
+
+
+def test_result_waits_for_the_preview_that_is_being_built():
+    """Catches two avatars that are built at the same time."""
+    state, effects = after(
+        START, status(WorkerState.WORKING, preview=1), SliceBuilt(), status(WorkerState.FINISHED, preview=1)
+    )
+    assert not loads(effects)
+    assert state.interval_s == SLICE_INTERVAL_S
+    assert after(SceneFree(), state=state)[1] == [Show(PREVIEW)]
+    _, effects = after(Shown(undoable=True), status(WorkerState.FINISHED, preview=1), state=state)
+    assert loads(effects) == [AVATAR]
+
+
+def test_avatar_that_cannot_be_shown_is_reported():
+    """Catches a failure that nobody sees, and one that is tried again for ever."""
+    state, effects = after(START, status(WorkerState.FINISHED), Failed("no head"))
+    assert (state.error, state.result_shown, state.interval_s) == ("no head", True, None)
+    assert effects == [Store(RUN, True), Redraw()]
+    state, _ = after(START, status(WorkerState.WORKING, preview=1), Failed("no head"))
+    assert (state.error, state.result_shown, state.interval_s) == ("no head", False, CHECK_INTERVAL_S)
+
+
+@pytest.mark.parametrize("end", [WorkerState.FAILED, WorkerState.LOST, WorkerState.NONE])
+def test_failure_shows_no_avatar(end):
+    """Catches an avatar that is shown of a training that failed."""
+    state, effects = after(START, status(WorkerState.WORKING), status(end))
+    assert effects == [Redraw()]
+    assert not state.result_shown
+
+
+def test_undo_does_not_lose_the_request():
+    """Catches a training that nobody can cancel because an undo step took the scene back to before it began."""
+    state, _ = after(START, status(WorkerState.WORKING))
+    assert after(SceneRead(None, False), state=state) == (state, [Store(RUN, False)])
+    assert after(SceneRead(RUN, False), state=state) == (state, [])
+
+
+def test_undo_does_not_show_the_result_again():
+    """Catches an undo of the shown splats that the next check reverts."""
+    state, _ = after(START, status(WorkerState.FINISHED), Shown(undoable=True))
+    state, effects = after(SceneRead(RUN, False), state=state)
+    assert effects == [Store(RUN, True)]
+    assert after(status(WorkerState.FINISHED), state=state) == (state, [])
+
+
+def test_undo_does_not_bring_back_what_was_dismissed():
+    """Catches a dismissed training that returns as one whose folder is missing."""
+    state, _ = after(START, status(WorkerState.FINISHED), Dismissed())
+    assert state.interval_s is None
+    assert after(SceneRead(RUN, True), state=state)[1] == [Store(None, False)]
+
+
+def test_loaded_file_continues():
+    """Catches a worker that is not found again after reopening, and a result that is shown again then."""
+    loaded = RequestState(Kind.TRAINING, RUN, JOB)
+    assert after(status(WorkerState.WORKING), state=loaded)[0].interval_s == CHECK_INTERVAL_S
+    assert loads(after(status(WorkerState.FINISHED), state=loaded)[1]) == [AVATAR]
+    assert not loads(after(status(WorkerState.FINISHED), state=replace(loaded, result_shown=True))[1])
+    assert TRAINING.interval_s is None
+
+
+def test_moved_run_folder():
+    """Catches a result read from the old place, and splats that the scene no longer recognizes as this run's."""
+    moved = Path("elsewhere/run")
+    state, effects = after(START, status(WorkerState.FINISHED, folder=moved / "job"))
+    assert loads(effects) == [moved / "avatar.npz"]
+    assert ReadCurve(moved) in effects
+    assert (state.subject, state.place) == (RUN, moved)
+
+
+def test_curve_is_read_when_it_grows():
+    """Catches a curve that is read at every check, or never again."""
+    first = StatusRead(JOB, WorkerSnapshot(WorkerState.WORKING), RunFiles(metrics=(1, 1)))
+    second = StatusRead(JOB, WorkerSnapshot(WorkerState.WORKING), RunFiles(metrics=(2, 2)))
+    state, effects = after(START, first)
+    assert ReadCurve(RUN) in effects
+    assert after(first, state=state)[1] == []
+    assert ReadCurve(RUN) in after(second, state=state)[1]
+
+
+def test_unexpected_error_stops_until_the_next_start_or_check():
+    """Catches a timer that ends silently, one that repeats the same traceback, and one that never recovers."""
+    state, effects = after(START, status(WorkerState.WORKING, preview=1), Failed("a bug", stops=True))
+    assert (state.error, state.interval_s, effects) == ("a bug", None, [Redraw()])
+    for restart in (START, status(WorkerState.WORKING)):
+        restarted, _ = after(restart, status(WorkerState.WORKING), state=state)
+        assert (restarted.interval_s, restarted.error) == (CHECK_INTERVAL_S, "")
+
+
+def test_training_that_ends_while_a_preview_is_shown():
+    """Catches checks that end with the worker, so that its last avatar never reaches the scene."""
+    state, _ = after(START, status(WorkerState.WORKING, preview=1), status(WorkerState.CANCELLED, preview=1))
+    state, _ = after(Shown(), state=state)
+    assert state.interval_s == CHECK_INTERVAL_S
+    state, effects = after(status(WorkerState.CANCELLED, preview=1), state=state)
+    assert loads(effects) == [AVATAR]
+    state, _ = after(Shown(), state=state)
+    assert state.result_shown
+    assert state.interval_s is None
+
+
+# An avatar from footage
+
+
+def made(state: WorkerState, **files: int) -> StatusRead:
+    """A status of making an avatar; files: name -> stamp."""
+    stamps = {name: (stamp, 1) for name, stamp in files.items()}
+    return StatusRead(JOB, WorkerSnapshot(state), RunFiles(**stamps))
+
+
+def test_head_previews_and_avatar_appear_once_each():
+    """Catches a head that is imported anew at every look or never, a preview that has no head to be shown on, and an
+    avatar of another folder."""
+    making = RequestState(Kind.AVATAR)
+    state, _ = after(START, made(WorkerState.WORKING), state=making)
+    assert state.loading is None
+    state, effects = after(made(WorkerState.WORKING, capture=1, preview=1), state=state)
+    assert (state.loading, loads(effects)) == (RUN / "capture", [])
+    state, effects = after(Shown(), made(WorkerState.WORKING, capture=1, preview=1), state=state)
+    assert loads(effects) == [PREVIEW]
+    state, effects = after(Shown(), made(WorkerState.WORKING, capture=1, preview=1), state=state)
+    assert (state.loading, loads(effects)) == (None, [])
+    state, effects = after(made(WorkerState.FINISHED, capture=1, preview=1, avatar=1), state=state)
+    assert loads(effects) == [RUN / "run" / "avatar.npz"]
+    assert StoreAvatar(RUN / "run" / "avatar.npz") in effects
+    state, effects = after(Shown(), state=state)
+    assert (PushUndo() in effects, Store(RUN, True) in effects, state.interval_s) == (True, True, None)
+    assert after(made(WorkerState.FINISHED, capture=1, preview=1, avatar=1), state=state)[0].loading is None
+
+
+@pytest.mark.parametrize("end", [WorkerState.CANCELLED, WorkerState.FAILED])
+def test_what_was_never_made_is_not_shown(end):
+    """Catches an error about a missing avatar after the tracking was cancelled, and a head imported from an old one."""
+    state, effects = after(START, made(end, capture=1), state=RequestState(Kind.AVATAR))
+    assert (state.loading, loads(effects), state.interval_s) == (None, [], None)
+
+
+def test_the_tracking_is_drawn_before_there_is_a_curve():
+    """Catches a picture of the tracking that the panel never reads again."""
+    state, _ = after(START, made(WorkerState.WORKING), state=RequestState(Kind.AVATAR))
+    for stamp in (1, 2):
+        state, effects = after(made(WorkerState.WORKING, picture=stamp), state=state)
+        assert ReadCurve(RUN / "run") in effects
+    assert after(made(WorkerState.WORKING, picture=2), state=state)[1] == []

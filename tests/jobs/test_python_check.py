@@ -1,0 +1,81 @@
+"""The Python that tracks and trains: how it is chosen and checked."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.jobs.python_check import describe_check, finish_check, start_check
+from stga_addon.worker import training_python
+from stga_addon.worker.training_python import PYTHON_VARIABLE, REQUIREMENTS, find_training_python
+
+FOUND = {
+    "python": "3.11.7",
+    "versions": dict.fromkeys(REQUIREMENTS, "1.0"),
+    "failures": {},
+    "device": "CPU with 4 threads",
+    "adapters": ["Card (Vulkan)"],
+}
+
+
+def check(python: object, timeout_s: float = 120.0):
+    return finish_check(str(python), start_check(str(python)), timeout_s)
+
+
+def test_check_is_described():
+    """Catches an interpreter reported as usable that cannot train."""
+    assert describe_check("p", FOUND) == "Python 3.11.7, torch 1.0, numba 1.0, CPU with 4 threads"
+    old = {**FOUND, "python": "3.9.1"}
+    with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
+        describe_check("p", old)
+    bare = {**FOUND, "failures": {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}}
+    with pytest.raises(StgaError, match=r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"):
+        describe_check("p", bare)
+
+
+def test_bare_interpreter_is_checked(tmp_path):
+    """Catches a check that itself needs a package: this interpreter has none."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    python = next(path for path in (tmp_path / "venv").glob("*/python*") if path.stem == "python")
+    with pytest.raises(StgaError, match=r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"):
+        check(python)
+
+
+def test_other_programs_are_refused(tmp_path):
+    """Catches a traceback where the path is missing or that of another program, and a program that is waited for
+    for ever."""
+    with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
+        check(tmp_path / "python")
+    with pytest.raises(StgaError, match=r"is not a Python that runs this add-on \(exit status 1\)"):
+        check("false")
+    (tmp_path / "slow").write_text("#!/bin/sh\nexec sleep 60\n")
+    (tmp_path / "slow").chmod(0o755)
+    with pytest.raises(StgaError, match="slow: did not answer within"):
+        check(tmp_path / "slow", timeout_s=0.2)
+
+
+@pytest.mark.slow
+def test_this_interpreter_passes():
+    """Catches a check that misses installed packages, or the GPUs that training is given by name."""
+    pytest.importorskip("torch")
+    pytest.importorskip("wgpu")
+    from stga_addon.raster.gpu.adapters import adapters
+
+    found = check(sys.executable)
+    assert found.line.startswith(f"Python {sys.version.split()[0]}, torch ")
+    assert found.adapters == tuple(adapters())
+
+
+def test_order_of_choices(monkeypatch):
+    """Catches a farm's variable or the preferences overruled, and a missing Python without what to do."""
+    monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
+    monkeypatch.setattr(training_python, "missing_packages", lambda: ["torch"])
+    with pytest.raises(StgaError, match=rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"):
+        find_training_python()
+    assert find_training_python("/preferred/python") == "/preferred/python"
+    monkeypatch.setattr(training_python, "missing_packages", list)
+    assert Path(find_training_python()).samefile(sys.executable)
+    monkeypatch.setenv(PYTHON_VARIABLE, "/farm/python")
+    assert find_training_python("/preferred/python") == "/farm/python"

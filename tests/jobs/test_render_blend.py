@@ -1,0 +1,134 @@
+"""Rendering a .blend file's frames with a program in place of Blender; `tests/batch/test_blender.py` has a real one."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from stga_addon.errors import StgaError
+from stga_addon.jobs.blender import RenderBlend, blender_command
+from stga_addon.jobs.folder import worker_arguments, write_request
+from stga_addon.jobs.perform import perform
+from stga_addon.progress import Cancelled, Progress, ignore
+
+BLENDER = """
+import os, sys, time
+given = dict(zip(sys.argv[1:], sys.argv[2:]))
+first, last = int(given["--frame-start"]), int(given["--frame-end"])
+assert "PYTHONPATH" not in os.environ
+with open(os.environ["LOG"], "a") as log:
+    print(os.getpid(), first, last, given["--engine"], os.environ["STGA_PYTHON"], file=log)
+for frame in range(first, last + 1):
+    path = given["--render-output"].replace("######", f"{frame:06d}") + ".png"
+    if frame == int(os.environ.get("FAILS", -1)):
+        sys.exit("Error: Out of memory")
+    with open(path, "w") as picture:
+        picture.write("half")
+        picture.flush()
+        time.sleep(float(os.environ.get("PAUSE", 0)))
+        picture.write(f" {frame}")
+    print(f"00:01.0  render  | Saved: '{path}'", flush=True)
+"""
+
+
+@pytest.fixture
+def shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RenderBlend:
+    script = tmp_path / "blender.py"
+    script.write_text(BLENDER)
+    (tmp_path / "shot.blend").touch()
+    monkeypatch.setenv("STGA_BLENDER", f"{sys.executable} {script}")
+    monkeypatch.setenv("LOG", str(tmp_path / "log"))
+    monkeypatch.delenv("STGA_PYTHON", raising=False)
+    return RenderBlend(tmp_path / "shot.blend", tmp_path / "out", (8, 12))
+
+
+def pictures(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.glob("*.png")}
+
+
+def calls(folder: Path) -> list[list[str]]:
+    return [line.split()[1:] for line in (folder / "log").read_text().splitlines()]
+
+
+WHOLE = {f"{frame:06d}.png": f"half {frame}" for frame in range(8, 13)}
+
+
+def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> None:
+    """Catches frames that are rendered twice, left out, or by another engine or training Python."""
+    shot.output.mkdir()
+    (shot.output / "000010.png").write_text("half 10")
+    shares: list[float] = []
+    perform(shot, lambda progress: bool(shares.append(progress.share)), lambda line: None)
+    assert pictures(shot.output) == WHOLE
+    assert calls(tmp_path) == [[*span, "STGA_SPLATS", sys.executable] for span in (("8", "9"), ("11", "12"))]
+    assert shares == [0.2, 0.4, 0.6, 0.8, 1.0]
+    perform(shot, ignore, lambda line: None)
+    assert len(calls(tmp_path)) == 2
+
+
+def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Catches "C:/Program Files/…/blender.exe" that is taken apart, and a command that is not."""
+    program = tmp_path / "Blender Foundation" / "blender"
+    program.parent.mkdir()
+    program.touch()
+    for text, command in ((str(program), [str(program)]), ("xvfb-run -a blender", ["xvfb-run", "-a", "blender"])):
+        monkeypatch.setenv("STGA_BLENDER", text)
+        assert blender_command() == command
+    monkeypatch.delenv("STGA_BLENDER")
+    assert blender_command() == ["blender"]
+
+
+def test_what_went_wrong_is_a_sentence(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a film that counts as finished although frames are missing, and a Blender that is not there."""
+    monkeypatch.setenv("FAILS", "10")
+    with pytest.raises(
+        StgaError, match=r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"
+    ):
+        perform(shot, ignore, lambda line: None)
+    assert sorted(pictures(shot.output)) == ["000008.png", "000009.png"]
+    monkeypatch.setenv("STGA_BLENDER", str(tmp_path / "nowhere"))
+    with pytest.raises(StgaError, match=r"nowhere: Blender cannot be started .*; expected it on PATH"):
+        perform(shot, ignore, lambda line: None)
+
+
+def test_cancelling_ends_blender(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a Blender that goes on after Ctrl-C, and pictures of which only a part is written."""
+    monkeypatch.setenv("PAUSE", "0.3")
+
+    def report(progress: Progress) -> bool:
+        return progress.share >= 0.4
+
+    with pytest.raises(Cancelled):
+        perform(shot, report, lambda line: None)
+    assert pictures(shot.output) == {name: WHOLE[name] for name in ("000008.png", "000009.png")}
+    process = int((tmp_path / "log").read_text().split()[0])
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux ends a process with the one that started it")
+def test_blender_ends_with_a_killed_worker(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches two Blenders that render the same frames after a worker was killed, and half a picture among the rest."""
+    monkeypatch.setenv("PAUSE", "0.5")
+    write_request(tmp_path / "job", shot)
+    worker = subprocess.Popen([sys.executable, "-m", *worker_arguments(tmp_path / "job", resume=True)])
+    deadline = time.monotonic() + 60
+    while not pictures(shot.output) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    worker.kill()
+    worker.wait()
+    process = int((tmp_path / "log").read_text().split()[0])
+    while Path(f"/proc/{process}/stat").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, signal.SIGTERM)
+    kept = pictures(shot.output)
+    assert 0 < len(kept) < 5
+    assert kept.items() <= WHOLE.items()
+    perform(shot, ignore, lambda line: None)
+    assert pictures(shot.output) == WHOLE
+    assert not list(shot.output.glob(".rendering-*"))

@@ -1,0 +1,488 @@
+"""Requests: what is written down, what is refused, and that a worker does what the same process would."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from capture.factory import ball, edit, write_mesh_capture
+
+from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.open import open_capture
+from stga_addon.cli.main import main
+from stga_addon.errors import StgaError
+from stga_addon.files import read_npz, write_json
+from stga_addon.format import describe_figures
+from stga_addon.jobs import folder as folders
+from stga_addon.jobs import perform as performing
+from stga_addon.jobs.analyze import Select
+from stga_addon.jobs.avatar_source import FOLDER
+from stga_addon.jobs.export import Export
+from stga_addon.jobs.folder import (
+    FILES,
+    PREVIEW,
+    REQUEST,
+    check_request,
+    read_request,
+    read_result,
+    remove_request,
+    request_folder,
+    worker_arguments,
+    write_request,
+    write_result,
+)
+from stga_addon.jobs.perform import perform, perform_in_folder
+from stga_addon.jobs.render import Render
+from stga_addon.jobs.results import Result, Written
+from stga_addon.jobs.table import JOBS, Request
+from stga_addon.jobs.track import SolveAgain, Track
+from stga_addon.jobs.train import Refine, Resume, Train
+from stga_addon.progress import Progress, TimeLeft
+from stga_addon.training.run.folder import Run, write_run
+from stga_addon.training.settings import make_settings
+from stga_addon.worker.launch import start_worker
+from stga_addon.worker.status import (
+    CANCEL_FILE,
+    LOG_FILE,
+    STATUS_FILE,
+    WorkerState,
+    inspect_worker,
+    log_lines,
+    request_cancel,
+    status_writer,
+)
+
+from .tables import REQUESTS, RESULTS
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equality of plain values, types and arrays included."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b)
+    if isinstance(a, Mapping):
+        return dict(a).keys() == dict(b).keys() and all(same(a[key], b[key]) for key in a)
+    if hasattr(a, "__dataclass_fields__"):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    return type(a) is type(b) and bool(a == b)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return write_mesh_capture(tmp_path / "capture")
+
+
+def training(run: Path, capture: Path, **changes: Any) -> Train:
+    settings = make_settings("selective", **{"iterations": 12, "hull_points": False, "seed": 3, **changes})
+    return Train(run, capture, settings, principal_point="opencv", selection=painted())
+
+
+def painted() -> dict[int, np.ndarray]:
+    return {0: np.zeros(320, bool), 1: np.arange(320) < 40, 3: np.arange(320) % 2 == 0}
+
+
+def asked(request: Train | Resume | Refine) -> Path:
+    """The folder of a request that is written into it."""
+    folder = request_folder(request.run)
+    write_request(folder, request)
+    return folder
+
+
+def test_every_request_is_tried() -> None:
+    """Catches a request, or a result, that is added without being in the tables here or without work."""
+    assert {type(request) for request in REQUESTS} == set(get_args(Request)) == set(JOBS)
+    assert {type(result) for result in RESULTS} == set(get_args(Result))
+
+
+@pytest.mark.parametrize("request_", REQUESTS, ids=lambda request: type(request).__name__)
+def test_round_trip(tmp_path: Path, request_: Request) -> None:
+    """Catches a field that is lost, or changes its type, between the panel and the worker."""
+    write_request(tmp_path / "job", request_)
+    assert same(read_request(tmp_path / "job"), request_)
+
+
+@pytest.mark.parametrize("result", RESULTS, ids=lambda result: type(result).__name__)
+def test_results_round_trip(tmp_path: Path, result: Result) -> None:
+    """Catches what was found not reaching the panel."""
+    write_result(tmp_path, result)
+    assert same(read_result(tmp_path), result)
+
+
+def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> None:
+    """Catches yesterday's selection, preview, result or wish to cancel in today's work."""
+    folder = asked(training(tmp_path / "run", capture))
+    for name in (PREVIEW, CANCEL_FILE, STATUS_FILE):
+        (folder / name).write_text("{}")
+    write_result(folder, RESULTS[1])
+    write_request(folder, REQUESTS[-1])
+    assert sorted(path.name for path in folder.iterdir()) == [REQUEST, LOG_FILE]
+
+
+def test_refusals(tmp_path: Path, capture: Path) -> None:
+    """Catches a run that is overwritten, and one resumed that is not there: both before a worker is started."""
+    run = tmp_path / "run"
+    with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
+        check_request(Resume(run))
+    assert not run.exists()
+    write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
+    with pytest.raises(StgaError, match="already holds a run; resume it, or choose another folder"):
+        check_request(training(run, capture))
+    check_request(Resume(run))
+    folder = asked(Resume(run))
+    with status_writer(folder), pytest.raises(StgaError, match="another worker is running"):
+        write_request(folder, Resume(run))
+    with pytest.raises(StgaError, match="holds no tracked capture to solve again"):
+        check_request(SolveAgain(tmp_path / "nothing", Path("m"), {}))
+    with pytest.raises(StgaError, match="already holds a capture"):
+        check_request(Track(Path("f"), Path("m"), capture))
+
+
+def test_the_worker_refuses_another_run(tmp_path: Path, capture: Path) -> None:
+    """Catches a run continued with another principal point: reading the capture is left to the worker."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
+    folder = asked(Resume(run, principal_point="opencv"))
+    with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
+        perform_in_folder(folder)
+    assert inspect_worker(folder).status.error.startswith(f"{run}: was trained with principal point")
+    assert not (run / "avatar.npz").exists()
+
+
+DAMAGES: dict[str, Any] = {
+    "format": "stga-job", "version": 0, "kind": "Paint", "run": 5, "capture": None, "device": "toaster",
+    "settings": {}, "principal_point": "up", "selection": {"x": {"array": "selection.0"}},
+    "unknown": 1,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_requests(tmp_path: Path, name: str) -> None:
+    """Catches a traceback, or a guess, where a request was damaged or comes from another version."""
+    write_request(tmp_path, REQUESTS[0])
+    edit(tmp_path / REQUEST, lambda values: values.update({name: DAMAGES[name]}))
+    with pytest.raises(StgaError, match=r"request\.json: ") as caught:
+        read_request(tmp_path)
+    assert name in str(caught.value) or "not a request that this version reads" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["[]", "3", '{"format": "stga-request", "version": 1}', "[" * 100_000])
+def test_what_is_no_request(tmp_path: Path, text: str) -> None:
+    """Catches a traceback for JSON of another form."""
+    (tmp_path / REQUEST).write_text(text)
+    with pytest.raises(StgaError, match=r"request\.json"):
+        read_request(tmp_path)
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e400, -1, "3", True, None])
+def test_numbers_that_are_none(tmp_path: Path, value: Any) -> None:
+    """Catches an infinite or negative number that reaches the work."""
+    write_request(tmp_path, next(request for request in REQUESTS if isinstance(request, Track)))
+    values = json.loads((tmp_path / REQUEST).read_text())
+    write_json(tmp_path / REQUEST, {**values, "step": value})
+    with pytest.raises(StgaError, match="setting step: expected a whole number from 1"):
+        read_request(tmp_path)
+
+
+def test_a_missing_array(tmp_path: Path) -> None:
+    """Catches painted weights that are lost, so that something else is refined."""
+    write_request(tmp_path, REQUESTS[3])
+    (tmp_path / folders.REQUEST_ARRAYS).unlink()
+    with pytest.raises(StgaError, match="--region: is missing"):
+        read_request(tmp_path)
+
+
+def test_figures_in_short_lines() -> None:
+    """Catches a panel that shows what is not known yet, or numbers that nobody can read."""
+    assert describe_figures({}) == []
+    figures = {"iteration": 900, "per_second": 12.34, "left_s": 125.0, "splats": 61234.0, "psnr": 30.0}
+    assert describe_figures(figures) == ["12.3 it/s   2.1 min left", "PSNR 30.00 dB", "61\u202f234 splats"]
+    tracked = {"left_s": 31.0, "error_px": 1.92, "unexplained": 0.043}
+    assert describe_figures(tracked) == ["31 s left", "1.9 px off landmarks   4% of the face unexplained"]
+
+
+def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
+    """Catches a time left that is that of an average over slow and fast work, or of work that an interrupted call had
+    done before and that is only read now."""
+    now = 0.0
+    left = TimeLeft(lambda: now)
+    assert math.isnan(left.after(0.0))
+    left.after(0.5)  # done before
+    for share in np.linspace(0.51, 0.7, 20):
+        now += 3
+        told = left.after(share)
+    assert told == pytest.approx(0.3 * 300)
+    for share in np.linspace(0.71, 0.85, 15):
+        now += 1
+        told = left.after(share)
+    assert told == pytest.approx(0.15 * 100)
+
+
+@pytest.mark.slow
+def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path: Path, capture: Path) -> None:
+    """Catches a render farm whose pictures or files differ from those that were looked at before: option by option,
+    `stga render` and `stga export` ask for what the requests say."""
+    pytest.importorskip("numba")
+    ball = open_capture(capture)
+    splats = lattice_splats(ball.neutral, ball.faces, order=0)
+    splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
+    avatar, cameras = tmp_path / "a.npz", capture / "transforms_val.json"
+    write_avatar(avatar, Avatar(splats, "stga", ball.neutral.astype(np.float32), ball.faces))
+    given = [str(avatar), "--capture", str(capture)]
+    turned = ["--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1", "--device", "cpu"]
+    asked_for: dict[str, tuple[list[str], Request]] = {
+        "pictures": (
+            ["render", *given, "--cameras", str(cameras), "--background", "black", "--out"],
+            Render(avatar, tmp_path / "pictures", cameras=cameras, capture=capture, background=(0.0, 0.0, 0.0)),
+        ),
+        "film.mp4": (
+            ["render", *given, *turned, "--video"],
+            Render(avatar, tmp_path / "film.mp4", True, None, 120.0, 1, 8.0, 0.5, capture=capture, device="cpu"),
+        ),
+        "plys": (
+            ["export", *given, "--format", "ply-sequence", "--frames", "1:3", "--out"],
+            Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3)),
+        ),
+        "page.stga": (
+            ["export", *given, "--format", "web", "--fps", "30", "--out"],
+            Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0),
+        ),
+    }
+    for name, (words, request) in asked_for.items():
+        folder = tmp_path / f"{name}_job"
+        write_request(folder, request)
+        process = start_worker(folder, sys.executable, worker_arguments(folder))
+        assert process.wait(300) == 0, log_lines(folder, 50)
+        assert read_result(folder) == Written(tmp_path / name)
+        there = contents(tmp_path / name)
+        assert main([*words, str(tmp_path / "here" / name)]) == 0
+        assert contents(tmp_path / "here" / name) == there
+        assert there
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Name -> bytes of the files of a folder, or of one file."""
+    return {file.name: file.read_bytes() for file in (path.glob("[!.]*") if path.is_dir() else (path,))}
+
+
+@pytest.mark.slow
+def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Path) -> None:
+    """Catches a worker that renders a whole film after it was cancelled, or leaves half a video."""
+    pytest.importorskip("numba")
+    ball = open_capture(capture)
+    splats, avatar = lattice_splats(ball.neutral, ball.faces, order=0), tmp_path / "a.npz"
+    write_avatar(avatar, Avatar(splats, "stga", ball.neutral.astype(np.float32), ball.faces))
+    for name, kept in (("turn", 3), ("turn.mp4", 0)):
+        folder = tmp_path / f"{name}_job"
+        is_video = name.endswith(".mp4")
+        write_request(folder, Render(avatar, tmp_path / name, is_video, turntable=90.0, capture=capture, device="cpu"))
+
+        def cancel_at_the_second(progress: Progress, folder: Path = folder) -> bool:
+            if progress.detail.startswith("Image 2 of"):
+                request_cancel(folder)
+            return False
+
+        assert perform_in_folder(folder, also=cancel_at_the_second) is None
+        assert inspect_worker(folder).state == WorkerState.CANCELLED
+        assert len(list((tmp_path / name).glob("*.png"))) == kept
+        assert not (tmp_path / "turn.mp4").exists()
+
+
+@pytest.mark.slow
+def test_cancel_keeps_the_avatar_and_resume_goes_on(tmp_path: Path, capture: Path) -> None:
+    """Catches a cancel that throws work away, a resumed run that begins anew, and figures that the panel never gets."""
+    pytest.importorskip("torch")
+    run = tmp_path / "run"
+    folder = asked(training(run, capture, iterations=40))
+
+    def cancel(progress: Progress) -> bool:
+        if iteration_of(progress) == 5:
+            request_cancel(folder)
+        assert iteration_of(progress) <= 6
+        return False
+
+    perform_in_folder(folder, also=cancel)
+    assert inspect_worker(folder).state == WorkerState.CANCELLED
+    assert (run / "avatar.npz").exists()
+    asked(Resume(run, capture, principal_point="opencv"))
+    iterations = []
+    perform_in_folder(folder, also=lambda progress: iterations.append(iteration_of(progress)))
+    assert min(n for n in iterations if n) >= 5
+    assert max(iterations) == 40
+    seen, found = inspect_worker(folder), read_result(folder)
+    assert seen.state == WorkerState.FINISHED
+    assert seen.status.figures["splats"] > 0
+    assert {"psnr", "loss", "memory_mb", "per_second"} <= set(seen.status.figures)
+    assert isinstance(found, Written)
+    assert found.lines[-1] == f"avatar: {run / 'avatar.npz'}"
+
+
+@pytest.mark.slow
+def test_a_request_continues_what_it_began(tmp_path: Path, capture: Path) -> None:
+    """Catches a job of a farm that fails, or trains anew, when it is started again after a kill."""
+    pytest.importorskip("torch")
+    request = training(tmp_path / "run", capture, iterations=40)
+    folder = asked(request)
+
+    def cancel(progress: Progress) -> bool:
+        return iteration_of(progress) >= 5
+
+    perform_in_folder(folder, also=cancel, resume=True)
+    asked(request)
+    with pytest.raises(StgaError, match="already holds a run"):
+        perform_in_folder(folder)
+    asked(request)
+    iterations = []
+    perform_in_folder(folder, also=lambda progress: iterations.append(iteration_of(progress)), resume=True)
+    assert min(n for n in iterations if n) >= 5
+    assert max(iterations) == 40
+    tracked = Track(tmp_path, tmp_path / "head.npz", tmp_path / "tracked")
+    assert performing.remaining(tracked) == tracked
+    tracked.out.mkdir()
+    (tracked.out / "transforms_train.json").touch()
+    write_request(tracked.out / "job", tracked)
+    assert perform_in_folder(tracked.out / "job", resume=True) == Written(tracked.out)
+
+
+def iteration_of(progress: Progress) -> float:
+    return progress.figures().get("iteration", 0)
+
+
+@pytest.mark.slow
+def test_previews_while_it_trains(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a preview that never comes, cannot be read, or changes what is trained."""
+    pytest.importorskip("torch")
+    monkeypatch.setattr(performing, "PREVIEW_INTERVAL_S", 0.0)
+    run, quiet, previews = tmp_path / "run", tmp_path / "quiet", []
+    folder = asked(training(run, capture))
+
+    def look(progress: Progress) -> bool:
+        if (folder / PREVIEW).exists():
+            previews.append(len(read_avatar(folder / PREVIEW).splats))
+        return False
+
+    perform_in_folder(folder, also=look)
+    assert len(previews) > 5
+    monkeypatch.setattr(performing, "PREVIEW_INTERVAL_S", 1e9)
+    perform_in_folder(asked(training(quiet, capture)))
+    assert not (request_folder(quiet) / PREVIEW).exists()
+    np.testing.assert_array_equal(read_npz(run / "avatar.npz")["xyz"], read_npz(quiet / "avatar.npz")["xyz"])
+
+
+@pytest.mark.slow
+def test_a_full_disk_costs_only_the_preview(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a training that ends because its preview could not be written."""
+    pytest.importorskip("torch")
+
+    def full(path: Path, avatar: Avatar) -> None:
+        if path.name == folders.PREVIEW:
+            raise StgaError(f"{path}: cannot be written (No space left on device)")
+        write_avatar(path, avatar)
+
+    monkeypatch.setattr(performing, "PREVIEW_INTERVAL_S", 0.0)
+    monkeypatch.setattr("stga_addon.training.run.session.write_avatar", full)
+    perform_in_folder(asked(training(tmp_path / "run", capture)))
+    assert (tmp_path / "run/avatar.npz").exists()
+
+
+@pytest.mark.slow
+def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path: Path, capture: Path, capsys: Any) -> None:
+    """Catches a worker whose failure only its log shows, and a command that ends well although nothing was trained."""
+    pytest.importorskip("torch")
+    assert main(["perform", str(tmp_path / "nothing")]) == 2
+    assert "holds no request" in capsys.readouterr().err
+    assert not (tmp_path / "nothing").exists()
+    folder = asked(training(tmp_path / "run", capture))
+    (capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
+    assert main(["perform", str(folder)]) == 2
+    seen = inspect_worker(folder)
+    assert seen.state == WorkerState.FAILED
+    assert "00003.obj" in seen.status.error
+    assert seen.status.traceback == ""
+
+
+def test_closed_stderr_still_leaves_a_status(tmp_path: Path, capture: Path) -> None:
+    """Catches a worker without stderr that ends before it writes its status."""
+    folder = tmp_path / "job"
+    write_request(folder, Select(capture))
+    shell = f'"{sys.executable}" -m stga_addon perform "{folder}" 2>&-'
+    done = subprocess.run(["sh", "-c", shell], cwd=Path(__file__).parents[2], timeout=300)
+    assert done.returncode == 0
+    assert inspect_worker(folder).state == WorkerState.FINISHED
+
+
+@pytest.mark.slow
+def test_interrupted_work_is_cancelled(tmp_path: Path, capture: Path) -> None:
+    """Catches Ctrl-C in a worker that is reported as a failure with a traceback."""
+    pytest.importorskip("torch")
+    folder = asked(training(tmp_path / "run", capture))
+
+    def interrupt(progress: Progress) -> bool:
+        if iteration_of(progress) == 3 and progress.stage == "Training":
+            signal.raise_signal(signal.SIGINT)
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        perform_in_folder(folder, also=interrupt)
+    assert inspect_worker(folder).state == WorkerState.CANCELLED
+    assert (tmp_path / "run/checkpoint.npz").exists()
+
+
+def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path) -> None:
+    """Catches a traceback about imports where a sentence should say which Python lacks what."""
+    folder = asked(training(tmp_path / "run", capture))
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    python = tmp_path / "venv/bin/python"
+    process = start_worker(folder, str(python), worker_arguments(folder))
+    assert process.wait(60) == 2
+    seen = inspect_worker(folder, process)
+    assert seen.status.error == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
+
+
+def test_a_head_that_is_not_there_is_a_sentence(tmp_path: Path) -> None:
+    """Catches a traceback where a command is to be about a head whose folder has gone."""
+    environment = {**os.environ, FOLDER: str(tmp_path / "gone")}
+    command = [sys.executable, "-m", "stga_addon", "info"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert f"{tmp_path / 'gone' / 'head.json'}" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_removed_request_leaves_other_files(tmp_path: Path, capture: Path) -> None:
+    """Catches *Dismiss* removing a person's files along a path that a .blend file names."""
+    folder = request_folder(tmp_path / "run")
+    folder.mkdir(parents=True)
+    for name in (STATUS_FILE, LOG_FILE, "notes.txt"):
+        (folder / name).write_text("mine")
+    remove_request(folder)
+    assert len(list(folder.iterdir())) == 3  # no request
+    asked(training(tmp_path / "run", capture))
+    for name in FILES:
+        (folder / name).touch()
+    remove_request(folder)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.slow
+def test_a_worker_refines_and_resumes(tmp_path: Path, capture: Path) -> None:
+    """Catches a worker that trains anew, or ignores the painted region, where a run is to be continued."""
+    pytest.importorskip("torch")
+    perform(training(tmp_path / "run", capture))
+    weights = np.zeros(len(ball()[1]), np.float32)
+    weights[:40] = 1.0
+    refined = tmp_path / "run_2"
+    perform_in_folder(asked(Refine(refined, tmp_path / "run", weights=weights, iterations=4, device="cpu")))
+    before, after = (read_avatar(folder / "avatar.npz").splats for folder in (tmp_path / "run", refined))
+    unchanged = (before.sh == after.sh).all((1, 2))
+    assert unchanged[before.face >= 40].all()
+    assert not unchanged[before.face < 40].all()
+    perform_in_folder(asked(Resume(refined, capture, principal_point="opencv", device="cpu")))
