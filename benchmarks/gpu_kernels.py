@@ -8,10 +8,9 @@ import numpy as np
 
 from stga_addon.raster.cpu.layout import PROJECTED
 from stga_addon.raster.cpu.rasterize import tile_grid
-from stga_addon.raster.gpu.device import Device
+from stga_addon.raster.gpu.device import Device, KernelTimes
 from stga_addon.raster.gpu.layout import COUNTS, DIGIT_BITS, NEEDED
-from stga_addon.raster.gpu.tiles import counts_buffer
-from stga_addon.raster.gpu.timing import KernelTimes
+from stga_addon.raster.gpu.rasterize import counts_buffer
 from stga_addon.training.optimize.backend import Batch
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 
@@ -88,19 +87,19 @@ def least_bytes(splats: int, pixels: int, tiles: int, pairs: int) -> dict[str, i
     row, projected = 4 * SPLAT_WORDS, 4 * PROJECTED
     sorted_keys = splats * -(-32 // DIGIT_BITS) + pairs * -(-tiles.bit_length() // DIGIT_BITS)
     return {
-        "project.main": splats * (row + projected + 24),
+        "project.forward": splats * (row + projected + 24),
         "sort.count": 4 * sorted_keys,
         "sort.scatter": 16 * sorted_keys,
-        "count_pairs.count": splats * 24,
-        "fill_pairs.main": splats * 36 + pairs * 8,
-        "tile_lists.main": pairs * 4,
-        "blend_forward.main": pairs * (8 + projected) + pixels * 20,
+        "tiles.count_pairs": splats * 24,
+        "tiles.fill_pairs": splats * 36 + pairs * 8,
+        "tiles.find_ranges": pairs * 4,
+        "blend.forward": pairs * (8 + projected) + pixels * 20,
         "image_loss.gradient": pixels * 27,
-        "blend_backward.main": pairs * (8 + 2 * projected) + pixels * 20,
-        "project_backward.main": pairs * projected + splats * (2 * row + projected + 16),
-        "limits.measure": splats * 40,
-        "rows.main": splats * (row + 40),
-        "adam.main": splats * (9 * row + 20),
+        "blend.backward": pairs * (8 + 2 * projected) + pixels * 20,
+        "project.backward": pairs * projected + splats * (2 * row + projected + 16),
+        "optimizer.measure_excess": splats * 40,
+        "optimizer.prepare": splats * (row + 40),
+        "optimizer.adam": splats * (9 * row + 20),
     }
 
 
