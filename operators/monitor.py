@@ -34,7 +34,7 @@ from ..stga_addon.requests.monitor_state import (
 )
 from ..stga_addon.requests.values import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.viewports import open_sidebar
+from ..stga_addon.scene.avatar_scene import open_sidebar
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics

@@ -3,9 +3,8 @@
 import argparse
 from argparse import ArgumentParser, Namespace
 
-from ..driving.open_motion import MAX_FACTOR, MAX_SMOOTHING_S, MotionOptions, parsed_gain
+from ..driving.open_motion import MAX_FACTOR, MAX_SMOOTHING_S, NEUTRALS, MotionOptions, parsed_gain
 from ..driving.performance import EXCHANGEABLE
-from ..driving.transfer import NEUTRALS
 from ..errors import StgaError
 from .arguments import real_number
 

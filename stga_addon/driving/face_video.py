@@ -11,8 +11,7 @@ from ..progress import Cancelled, Progress, Report
 from ..tracking.face_networks import FaceNetworks
 from ..tracking.footage.video import VideoFrames, read_video
 from .inverse import head_angles
-from .names import COLUMN, COUNT, arkit_name
-from .performance import Performance
+from .performance import COLUMN, COUNT, Performance, arkit_name
 from .shapes import face_shapes
 
 CAMERA_FIELD_OF_VIEW_DEG = 63.0

@@ -14,8 +14,7 @@ from ..flame.model import JOINTS, FlameModel
 from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.posed_points import PosedPoints, SurfacePoints
-from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
-from .performance import Performance
+from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
 from .shapes import JAW_OPEN, MOUTH_CLOSE, effective_weights, face_points, face_shapes
 
 JAW_SHAPES = ("jawOpen", "jawLeft", "jawRight")

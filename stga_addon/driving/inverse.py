@@ -11,8 +11,7 @@ from ..flame.quaternions import from_axis_angle, to_matrices
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.posed_points import PosedPoints
 from .head_map import JAW_SHAPES, PRODUCTS, HeadMap, head_map
-from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
-from .performance import Performance
+from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
 from .shapes import JAW_OPEN, MOUTH_CLOSE
 
 MAX_SWEEPS = 60

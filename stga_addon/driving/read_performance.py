@@ -10,8 +10,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import file_size, read_json
-from .names import COLUMN, COUNT, MAX_WEIGHT, arkit_name, columns_of
-from .performance import FacePacket, Performance
+from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6}))?", re.ASCII)
 BASES = (24, 25, 30, 48, 50, 60, 100, 120)

@@ -13,7 +13,7 @@ from ..errors import StgaError
 from ..progress import Progress, Report, ignore
 from .harmonics import COUNT, LAMBERT, basis, uniform
 from .lamps import ShadowMap
-from .transfer import Bounce, transfer_of
+from .surface import Bounce, transfer_of
 from .values import Light
 
 MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800

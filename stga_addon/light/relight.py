@@ -14,8 +14,7 @@ from ..capture.mesh_geometry import vertex_normals, weighted_procrustes
 from ..errors import StgaError
 from .harmonics import COUNT, GLOSSY, LAMBERT, basis, even_directions, rotated, sh_color
 from .lamps import LIFT_M, Lamps, distant_light
-from .surface import Lashes, at_splats, find_lashes, surface_points
-from .transfer import Bounce
+from .surface import Bounce, Lashes, at_splats, find_lashes, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
 UNLIKE_LIGHT = 0.2

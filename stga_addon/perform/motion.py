@@ -8,8 +8,7 @@ import numpy as np
 from ..avatar.file import Avatar
 from ..capture.flame_capture import sequence_capture
 from ..capture.model import Capture
-from ..driving.open_motion import Motion, open_motion
-from ..driving.transfer import TrainedRange, trained_range
+from ..driving.open_motion import Motion, TrainedRange, open_motion, trained_range
 from ..errors import StgaError
 from ..progress import Say
 from ..requests.values import Export, Render

@@ -4,9 +4,8 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from ..progress import Report, Say, counted
-from ..render.compose import Composer
-from ..render.recording import finished, is_video, recorded_images
-from ..render.video import sequence_writer, video_writer
+from ..render.device import Composer
+from ..render.video import finished, is_video, recorded_images, sequence_writer, video_writer
 from ..requests.results import Written
 from ..requests.values import RenderRecording
 

@@ -21,7 +21,7 @@ from ..flame.sequence import sequence_mesh
 from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
 from ..progress import Report, Say, counted
-from ..render.compose import Composer
+from ..render.device import Composer
 from ..render.render import render as render_splats
 from ..render.render import render_avatar, render_colors, to_uint8
 from ..render.video import sequence_writer, video_writer

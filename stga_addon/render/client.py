@@ -17,8 +17,8 @@ from ..capture.camera import Camera
 from ..errors import StgaError
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..worker.launch import start_python
-from .compose import Composer
-from .protocol import pack_layers, receive, send
+from .device import Composer
+from .server import pack_layers, receive, send
 
 REQUIRED_PACKAGES = ("numba", "platformdirs")
 """What the kernels need beside numpy, by the names of the packages."""

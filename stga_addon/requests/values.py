@@ -392,7 +392,7 @@ class ConvertMotion:
 class RenderRecording:
     """Render the images that Blender has recorded, and encode them.
 
-    recording       file of the images (`render.recording`), removed afterwards
+    recording       file of the images (`render.video`), removed afterwards
     output          an .mp4 file, or a folder for PNGs
     images          how many
     background      sRGB in 0…1; None: transparent in PNGs, black in a video

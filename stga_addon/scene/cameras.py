@@ -1,5 +1,7 @@
-"""The capture's cameras as Blender cameras, with its images as backgrounds."""
+"""Blender's cameras: imported from captures with their images, exported, and as calibrated cameras."""
 
+from collections.abc import Iterable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -8,13 +10,82 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..capture.camera import Camera, most_central
+from ..capture.camera import Camera, camera_from_gl, covered_angles, most_central, turntable
 from ..capture.model import Capture, View
 from ..errors import StgaError
+from ..files import write_json
 from . import compat, tags
 from .animation import write_curve
+from .arrays import Z_UP_TO_Y_UP, evaluated_vertices, mesh_vertices
+from .blend_file import set_frames_per_second
 from .objects import Warn, log_warning, place, remove
-from .timeline import set_frames_per_second
+
+ORTHOGRAPHIC_DISTANCE = 1000.0
+"""An orthographic view is rendered in perspective from this many times its own width away."""
+
+
+def image_size(render: Any) -> tuple[int, int]:
+    """Width and height in pixels of final images by a scene's render settings."""
+    share = render.resolution_percentage / 100
+    return max(1, int(render.resolution_x * share)), max(1, int(render.resolution_y * share))
+
+
+def render_camera(camera: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int]) -> Camera:
+    """The scene's camera for a final image of width × height pixels.
+
+    camera: the evaluated camera object. border: x, y, width and height in pixels of the render region, from the bottom
+    left. Raises StgaError unless it is a perspective camera.
+    """
+    if camera is None or camera.type != "CAMERA":
+        raise StgaError("The scene has no camera to render through")
+    if camera.data.type != "PERSP":
+        raise StgaError(f"{camera.name}: is not a perspective camera; STGA Splats renders through no other type")
+    render = depsgraph.scene.render
+    projection = camera.calc_matrix_camera(
+        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+    )
+    whole = camera_of(np.array(camera.matrix_world.normalized(), np.float64), projection, width, height)
+    return _cropped(whole, border)
+
+
+def viewport_camera(region: Any, width: int, height: int) -> Camera:
+    """The view of a 3D viewport (a RegionView3D) for an image of width × height pixels."""
+    pose = np.array(region.view_matrix.inverted(), np.float64)
+    projection = np.array(region.window_matrix, np.float64)
+    if not region.is_perspective:
+        projection, distance = _perspective_of_orthographic(projection)
+        pose[:3, 3] += distance * pose[:3, 2]
+    return camera_of(pose, projection, width, height)
+
+
+def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Camera:
+    """Camera from a camera-to-world matrix with OpenGL axes and an OpenGL perspective projection, both (4, 4)."""
+    p = np.array(projection, np.float64)
+    return camera_from_gl(
+        pose,
+        width,
+        height,
+        fl_x=p[0, 0] * width / 2,
+        fl_y=p[1, 1] * height / 2,
+        cx=(1 - p[0, 2]) * width / 2,
+        cy=(1 + p[1, 2]) * height / 2,
+    )
+
+
+def _perspective_of_orthographic(projection: np.ndarray) -> tuple[np.ndarray, float]:
+    """A perspective projection (4, 4) that nearly equals an orthographic one, and how many meters to step back."""
+    distance = ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
+    perspective = np.zeros((4, 4))
+    perspective[0, 0], perspective[1, 1] = projection[0, 0] * distance, projection[1, 1] * distance
+    perspective[0, 2], perspective[1, 2] = -projection[0, 3], -projection[1, 3]
+    return perspective, distance
+
+
+def _cropped(camera: Camera, border: tuple[int, int, int, int]) -> Camera:
+    x, y, width, height = border
+    top = camera.height - y - height
+    return replace(camera, width=width, height=height, cx=camera.cx - x, cy=camera.cy - top)
+
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
 CLIP_START = 0.01  # meters
@@ -160,3 +231,77 @@ def _load_image(path: Path) -> Any:
         return bpy.data.images.load(str(path))
     except RuntimeError as error:
         raise StgaError(f"{path}: cannot be read as an image") from error
+
+
+def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
+    """Write the cameras at the current frame as transforms.json with pinholes; how many.
+
+    cameras: camera objects. Each is named after its object: footage has a folder, a video or an image of that name.
+    Axes are those of captures, y up, and the file says that a capture keeps this world: imported, it lies among the
+    cameras. Image size: the scene's resolution, or that of the capture that the camera was imported from.
+    Raises StgaError for a camera that is not perspective, is mirrored, or where there are none.
+    """
+    entries = [_entry(camera.name, _camera(camera.evaluated_get(depsgraph), depsgraph)) for camera in cameras]
+    if not entries:
+        raise StgaError("No cameras to export; add them, or select some")
+    write_json(path, {"camera_model": "PINHOLE", "world": "keep", "frames": entries})
+    return len(entries)
+
+
+def _camera(camera: Any, depsgraph: Any) -> Camera:
+    if np.linalg.det(np.array(camera.matrix_world.to_3x3())) < 0:
+        raise StgaError(f"{camera.name}: is mirrored by a negative scale; apply the scale")
+    size = camera.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
+    width, height = (int(pixels) for pixels in size)
+    return render_camera(camera, depsgraph, width, height, (0, 0, width, height))
+
+
+def _entry(name: str, camera: Camera) -> dict[str, Any]:
+    intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}
+    return {
+        "file_path": f"{name}.png",
+        "camera_id": name,
+        "w": camera.width,
+        "h": camera.height,
+        **{key: float(value) for key, value in intrinsics.items()},
+        "transform_matrix": (Z_UP_TO_Y_UP @ camera.camera_to_world_gl).tolist(),
+    }
+
+
+UP = (0.0, 0.0, 1.0)
+"""Blender's scenes are z-up."""
+
+
+def scene_camera(depsgraph: Any) -> Camera:
+    """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is perspective."""
+    scene = depsgraph.scene
+    width, height = image_size(scene.render)
+    camera = scene.camera.evaluated_get(depsgraph) if scene.camera else None
+    return render_camera(camera, depsgraph, width, height, (0, 0, width, height))
+
+
+def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
+    """`count` cameras that start as the scene's and orbit the object `subject`, a head or splats.
+
+    angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there are none.
+    """
+    start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
+    if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
+        middle = np.median(mesh_vertices(subject.data), axis=0)
+    else:
+        vertices = evaluated_vertices(subject)
+        middle = (vertices.min(0) + vertices.max(0)) / 2
+    center = matrix[:3, :3] @ middle + matrix[:3, 3]
+    angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)
+    cameras = _capture_cameras(subject)
+    if not angle and cameras:
+        angles = covered_angles(cameras, start, center, UP)
+    return turntable(start, center, count, angles, UP)
+
+
+def _capture_cameras(subject: Any) -> list[Camera]:
+    """The cameras of the capture that `subject` belongs to, for their positions."""
+    root = subject.parent
+    children = () if root is None else root.children_recursive
+    found = [child for child in children if child.get(tags.KIND) == tags.CAMERA]
+    return [camera_from_gl(np.array(camera.matrix_world, np.float64), 1, 1, 1, 1, 0, 0) for camera in found]

@@ -1,7 +1,7 @@
 """Camera-space frames and strain of a posed mesh's triangles, computed on the device, moved by driven offsets."""
 
 from collections.abc import Collection, Mapping
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -21,7 +21,7 @@ POSE = np.dtype(
 class Signal(Protocol):
     """Computes the signal of a driven offset of one mesh; kernels: what it dispatches."""
 
-    kernels: tuple[str, ...]
+    kernels: ClassVar[tuple[str, ...]]
 
     def __init__(self, device: Device, basis: StrainBasis) -> None: ...
 
@@ -32,7 +32,7 @@ class Signal(Protocol):
 class SmoothedStrain:
     """The signal of one mesh, whose neighborhood is uploaded once."""
 
-    kernels = ("frames.smooth_strain",)
+    kernels: ClassVar[tuple[str, ...]] = ("frames.smooth_strain",)
 
     def __init__(self, device: Device, basis: StrainBasis) -> None:
         self._count = len(basis.faces)

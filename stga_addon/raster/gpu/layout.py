@@ -87,10 +87,10 @@ _CPU = {
 CONSTANTS: dict[str, int | float] = {
     **{name: globals()[name] for name in _OWN.split()},
     **{name: getattr(module, name) for module, names in _CPU.items() for name in names.split()},
-    **{f"WINDOW_{k}": getattr(image_loss, f"W{5 - k}") for k in range(6)},
+    **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
     "DIGITS": 1 << DIGIT_BITS,
-    "SSIM_C1": image_loss.C1,
-    "SSIM_C2": image_loss.C2,
+    "SSIM_C1": float(image_loss.C1),
+    "SSIM_C2": float(image_loss.C2),
 }
 
 

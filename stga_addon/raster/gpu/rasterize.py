@@ -6,7 +6,7 @@ They share tables, by the names of `layout.py`; a function that records a stage 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +34,8 @@ DEPTH_BITS, MAX_TILE_BITS = 32, 22
 Tables = dict[str, Any]
 
 
-class SplatTable(NamedTuple):
+@dataclass(frozen=True)
+class SplatTable:
     """N splats on the device.
 
     rows, face  tables of `layout.py`: (N, stride) and the triangle (N,) of each

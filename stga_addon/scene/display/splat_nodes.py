@@ -13,13 +13,10 @@ from .. import tags
 from ..compat import NATIVE_SPLATS
 from ..layers import FROZEN_COLOR
 from .color_nodes import LINEAR_TO_SRGB, SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
-from .display_modes import AS_TRAINED, MODES, NATIVE_GROUPS, displayed
-from .frame_nodes import FRAMES, PLACED
-from .materials import DISPLAY_COLOR
+from .display_modes import AS_TRAINED, DISPLAY_COLOR, MODES, NATIVE_GROUPS, displayed
+from .frame_nodes import DEFORMED, FRAMES, PLACED, SAMPLED_STRAIN, SIGNALS, STRAIN, shifted
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
-from .offset_nodes import SIGNALS, shifted
 from .splat_attributes import COLOR, FACE, OPACITY, RELIT_COLOR
-from .strain_nodes import DEFORMED, SAMPLED_STRAIN, STRAIN
 
 # Inputs of the modifier, by their displayed names.
 HEAD = "Head"

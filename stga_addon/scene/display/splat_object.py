@@ -16,21 +16,45 @@ from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
-from .hints import use_transparent_bounces
+from .frame_nodes import displayed_offsets
 from .node_builder import is_splat_tree
-from .offset_nodes import displayed_offsets
 from .splat_attributes import (
     Attributes,
     SplatAttributes,
     avatar_attributes,
     read_driven_offsets,
+    read_light,
     read_splats,
     read_strain_range,
     splat_attributes,
     write_attributes,
+    write_light,
     write_splats,
 )
-from .stored_light import read_light, write_light
+
+TRANSPARENT_BOUNCES = 64
+"""Layers of overlapping splats that Cycles has to see through; behind its default of 8 is black."""
+
+
+def view_transform_hint(scene: bpy.types.Scene) -> str | None:
+    """A sentence where the view transform changes the colors of splats that EEVEE and Cycles render, else None."""
+    if scene.view_settings.view_transform == "Standard":
+        return None
+    return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"
+
+
+def shows_nodes(scene: bpy.types.Scene) -> bool:
+    """Whether the scene is rendered by EEVEE or Cycles, which show what geometry nodes make of splats."""
+    return scene.render.engine == "CYCLES" or scene.render.engine.startswith("BLENDER_EEVEE")
+
+
+def use_transparent_bounces(scene: bpy.types.Scene) -> None:
+    """Let Cycles, where its add-on is enabled, see through overlapping splats without ending rays between them at
+    random; limits that are higher stay."""
+    cycles = getattr(scene, "cycles", None)
+    for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
+        setattr(cycles, limit, max(getattr(cycles, limit), TRANSPARENT_BOUNCES))
+
 
 SETTING_NAMES = {
     splat_nodes.SIZE: "size",

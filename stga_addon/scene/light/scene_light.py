@@ -1,4 +1,4 @@
-"""The light of a Blender scene for each of its avatars."""
+"""The light of a Blender scene for each of its avatars, and heads' shadows onto the scene."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
@@ -15,9 +15,8 @@ from ..arrays import mesh_vertices, read_values
 from ..display import splat_nodes
 from ..display.splat_object import get_input
 from ..layers import Relit
-from .lights import in_avatar_space, is_linked, light_of
+from .lights import WorldLight, in_avatar_space, is_linked, light_of, split_world, world_light
 from .settings import current_settings, lighting_settings
-from .world import WorldLight, split_world, world_light
 
 MAX_KEPT = 64
 
@@ -174,3 +173,22 @@ def _read(owner: Any, matrix: Any, depsgraph: Any) -> Caster:
 
 def _moved(caster: Caster, matrix: np.ndarray) -> Caster:
     return Caster(caster.vertices @ matrix[:3, :3].T + matrix[:3, 3], caster.faces)
+
+
+HIDDEN_RAYS = ("camera", "diffuse", "glossy", "transmission", "volume_scatter")
+"""Rays that do not see a head which only throws shadows."""
+
+
+def throws_shadow(splat_object: Any) -> bool:
+    """Whether the head of a splat object is set up to throw its shadow, and nothing else, in images."""
+    head = get_input(splat_object, splat_nodes.HEAD)
+    return head is not None and not head.hide_render and not head.visible_camera and bool(head.visible_shadow)
+
+
+def throw_shadow(splat_object: Any, is_on: bool) -> None:
+    """Let the head's mesh throw its shadow onto the scene without being seen, or hide it from images again."""
+    head = get_input(splat_object, splat_nodes.HEAD)
+    head.hide_render = not is_on
+    head.visible_shadow = True
+    for ray in HIDDEN_RAYS:
+        setattr(head, f"visible_{ray}", not is_on)

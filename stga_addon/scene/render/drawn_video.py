@@ -13,7 +13,7 @@ import numpy as np
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...files import replacing
-from ...render.recording import finished, is_video
+from ...render.video import finished, is_video
 from ..compat import choose_video_file, sequencer_strips
 from ..layers import SceneLayer
 from .engine import draw_image

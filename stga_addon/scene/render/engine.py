@@ -16,18 +16,15 @@ from bpy.app.handlers import persistent
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...raster.posed_splats import ComposedImage
+from ..cameras import render_camera
 from ..gpu.context import has_gpu_context
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer
 from ..gpu.shaders import MIN_ALPHA
 from ..layers import SceneLayer
-from . import redraw
-from .camera import render_camera
-from .composite import combined, scene_background
-from .engine_viewport import EngineViewport
-from .rasterizer import Rasterizer
+from .engine_viewport import EngineViewport, Rasterizer, redraw_when_rendered, stop_redraws
 from .scene_splats import SplatCache, visible_layers
-from .view_transform import inverse_view, measure, needs_inverse
+from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background
 from .viewport_display import ENGINE
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
@@ -115,7 +112,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             return
         renderer = viewport.renderer
         if viewport.request_image(context, depsgraph):
-            redraw.redraw_when_rendered(renderer, self)
+            redraw_when_rendered(renderer, self)
         self.update_stats("", renderer.error)
         if renderer.image is not None:
             self.bind_display_space_shader(depsgraph.scene)
@@ -176,7 +173,7 @@ def unregister() -> None:
     remove_engine()
     bpy.app.handlers.render_pre.remove(_before_render)
     bpy.utils.unregister_class(SplatsEngine)
-    redraw.stop()
+    stop_redraws()
     _rasterizer.client.close()
 
 

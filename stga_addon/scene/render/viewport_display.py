@@ -16,16 +16,14 @@ from bpy.app.handlers import persistent
 from ...capture.color import linear_to_srgb
 from ...errors import StgaError
 from ...scene import tags
-from ..compat import world_nodes
+from ..cameras import viewport_camera
 from ..display import splat_nodes
 from ..display.display_modes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
-from ..gpu.front_bones import NO_BONES, front_bones
 from ..gpu.packing import NEAR_M, View
-from ..gpu.renderer import SplatRenderer, fastest_format
-from .camera import viewport_camera
+from ..gpu.renderer import NO_BONES, SplatRenderer, fastest_format, front_bones
 from .scene_splats import SplatCache, visible_layers
-from .view_transform import keeps_colors
+from .view_transform import keeps_colors, world_color
 
 ENGINE = "STGA_SPLATS"
 """The render engine, which draws all splats in *Rendered* mode."""
@@ -199,23 +197,6 @@ def background_source(context: Any) -> str:
         return str(shading.background_type)
     uses_world = shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
     return "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
-
-
-def world_color(scene: Any) -> tuple[float, ...] | None:
-    """Scene-linear color of the scene's world, None where it is not one color; black without a world."""
-    world = scene.world
-    if world is None:
-        return 0.0, 0.0, 0.0
-    tree = world_nodes(world)
-    output = tree.get_output_node("ALL") if tree else None
-    links = output.inputs["Surface"].links if output else ()
-    if not links:
-        return tuple(world.color)
-    if links[0].from_node.type == "BACKGROUND":
-        color, strength = (links[0].from_node.inputs[name] for name in ("Color", "Strength"))
-        if not color.is_linked and not strength.is_linked:
-            return tuple(channel * strength.default_value for channel in color.default_value[:3])
-    return None
 
 
 def _srgb(linear: Any) -> tuple[float, ...]:

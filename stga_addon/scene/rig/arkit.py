@@ -6,13 +6,20 @@ from typing import Any
 import numpy as np
 
 from ...driving.head_map import PRODUCTS, HeadMap
-from ...driving.names import ARKIT_SHAPES, COLUMN, COUNT, arkit_name
+from ...driving.performance import ARKIT_SHAPES, COLUMN, COUNT, arkit_name
 from ...driving.shapes import MOUTH_CLOSE
 from ...errors import StgaError
 from ..animation import add_driver, write_curve
 from ..compat import action_curves, push_down_action
-from .keyframes import check_keyable, key_turns, start_action
-from .names import expression_key, key_value_path, property_path, rotation_path
+from .keyframes import (
+    check_keyable,
+    expression_key,
+    key_turns,
+    key_value_path,
+    property_path,
+    rotation_path,
+    start_action,
+)
 
 SUMS = "stga_arkit_sums"
 """Property of the rig: partial sums of the expressions, and the axis-angles of jaw and eyes."""

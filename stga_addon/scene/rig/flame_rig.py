@@ -25,10 +25,12 @@ from .. import tags
 from ..animation import add_driver
 from ..arrays import flat_floats
 from ..objects import Warn, leave_edit_mode, log_warning, place, remove
-from .keyframes import MAX_SLIDER, key_motion, key_tracked_offsets
-from .names import (
+from .keyframes import (
     EXPRESSION_NAMES,
+    MAX_SLIDER,
     deform_bone,
+    key_motion,
+    key_tracked_offsets,
     key_value_path,
     location_path,
     offset_key,

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -122,7 +122,9 @@ class GpuBackend:
         self._splats = upload_splats(self.device, state.parameters, state.face)
         splats_of = upload("splats by triangle", optimizer.splats_by_triangle(state.face, self._triangles))
         self._offsets = {
-            name: OffsetTables(*(upload(f"{name} {part}", each) for part, each in vars(offset).items()), splats_of)
+            name: OffsetTables._make(
+                [*(upload(f"{name} {part}", each) for part, each in vars(offset).items()), splats_of]
+            )
             for name, offset in state.driven_offsets.items()
         }
 
@@ -141,7 +143,7 @@ class GpuBackend:
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
         """The view with the splats' moving average after all queued iterations: a new (3, H, W) float32 image."""
         self._finish_all()
-        average = self._splats._replace(rows=self._tables.average)
+        average = replace(self._splats, rows=self._tables.average)
         moved = {name: tables.average for name, tables in self._offsets.items()}
         while True:
             with self.device.record() as work:
