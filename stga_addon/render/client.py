@@ -9,16 +9,14 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
-from typing import Any, BinaryIO, cast
-
-import numpy as np
+from typing import BinaryIO, cast
 
 from ..capture.camera import Camera
 from ..errors import StgaError
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..worker.launch import start_python
 from .device import Composer
-from .server import pack_layers, receive, send
+from .server import pack_camera, pack_layers, receive, send
 
 REQUIRED_PACKAGES = ("numba", "platformdirs")
 """What the kernels need beside numpy, by the names of the packages."""
@@ -68,10 +66,7 @@ class RenderClient:
 
     def _request(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool) -> ComposedImage:
         python, server = self._server or self._start()
-        intrinsics = [camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy]
-        request: dict[str, Any] = {
-            "camera": np.array(intrinsics), "pose": camera.world_to_camera, "with_depth": with_depth
-        }  # fmt: skip
+        request = {**pack_camera(camera), "with_depth": with_depth}
         if layers is not self._sent:
             request |= pack_layers(layers)
         try:

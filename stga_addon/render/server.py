@@ -13,6 +13,7 @@ import numpy as np
 
 from ..avatar.embedding import FaceFrames
 from ..avatar.splats import Splats
+from ..capture.camera import Camera
 from ..raster.posed_splats import PosedSplats
 from ..worker.stdout import claim_stdout
 
@@ -37,6 +38,18 @@ def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
         raise ValueError(f"a message begins with {MARK!r}, got {mark!r}")
     with np.load(io.BytesIO(_read_exactly(stream, size)), allow_pickle=False) as arrays:
         return dict(arrays)
+
+
+def pack_camera(camera: Camera) -> dict[str, Any]:
+    """A camera as named arrays."""
+    intrinsics = [camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy]
+    return {"camera": np.array(intrinsics), "pose": camera.world_to_camera}
+
+
+def unpack_camera(arrays: Mapping[str, np.ndarray]) -> Camera:
+    """The inverse of `pack_camera`. Raises KeyError or ValueError where it is damaged."""
+    width, height, fl_x, fl_y, cx, cy = arrays["camera"].tolist()
+    return Camera(int(width), int(height), fl_x, fl_y, cx, cy, arrays["pose"])
 
 
 def pack_layers(layers: Sequence[PosedSplats], before: Sequence[PosedSplats] = ()) -> dict[str, Any]:
@@ -90,7 +103,6 @@ def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
 
     device: as `Composer` takes it.
     """
-    from ..capture.camera import Camera
     from ..errors import StgaError
     from ..raster.posed_splats import PosedSplats
     from .device import Composer
@@ -105,9 +117,7 @@ def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
         try:
             if "layers" in request:
                 layers = unpack_layers(request)
-            width, height, fl_x, fl_y, cx, cy = request["camera"].tolist()
-            camera = Camera(int(width), int(height), fl_x, fl_y, cx, cy, request["pose"])
-            image = composer.compose(layers, camera, bool(request["with_depth"]))
+            image = composer.compose(layers, unpack_camera(request), bool(request["with_depth"]))
         except Exception as error:  # the client reports it, whatever it is
             kind = "" if isinstance(error, StgaError) else f"{type(error).__name__}: "
             send(replies, {"error": f"{kind}{error}"})

@@ -16,7 +16,7 @@ from ..export.playback import check_rate
 from ..files import NumberedFiles, check_writable, replacing
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from .device import Composer
-from .server import pack_layers, receive, send, unpack_layers
+from .server import pack_camera, pack_layers, receive, send, unpack_camera, unpack_layers
 
 CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
 """H.264 with halved color resolution: what browsers, phones and editors play."""
@@ -89,18 +89,14 @@ def _encoder(container: Any, rate: Fraction) -> tuple[WriteImage, Callable[[], N
 
     def append(image: np.ndarray) -> None:
         nonlocal is_empty
-        frame = VideoFrame.from_ndarray(_even(image), format="rgb24")
+        odd = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
+        frame = VideoFrame.from_ndarray(np.ascontiguousarray(np.pad(image, odd, mode="edge")), format="rgb24")
         if is_empty:
             stream.width, stream.height, is_empty = frame.width, frame.height, False
         frame = frame.reformat(format=PIXEL_FORMAT, dst_colorspace=BT709, dst_color_range=LIMITED_RANGE)
         container.mux(stream.encode(frame))
 
     return append, lambda: container.mux(stream.encode())
-
-
-def _even(image: np.ndarray) -> np.ndarray:
-    height, width = image.shape[:2]
-    return np.ascontiguousarray(np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
 
 
 FIRST_IMAGE = "0001.png"
@@ -131,8 +127,7 @@ class Recorder:
 
     def add(self, layers: Sequence[PosedSplats], camera: Camera) -> None:
         """Append an image. Raises StgaError on a full disk."""
-        intrinsics = np.array([camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy])
-        message = {"camera": intrinsics, "pose": camera.world_to_camera, **pack_layers(layers, self._before)}
+        message = {**pack_camera(camera), **pack_layers(layers, self._before)}
         self._before = layers
         with self._reported():
             send(self._stream, message)
@@ -158,8 +153,7 @@ def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[Comp
             for _ in range(count):
                 message = receive(stream)
                 layers = unpack_layers(message, layers)
-                width, height, fl_x, fl_y, cx, cy = message["camera"].tolist()
-                yield composer.compose(layers, Camera(int(width), int(height), fl_x, fl_y, cx, cy, message["pose"]))
+                yield composer.compose(layers, unpack_camera(message))
     except (OSError, EOFError, KeyError, ValueError) as error:
         raise StgaError(f"{path}: cannot be read as the images of a video ({type(error).__name__})") from error
 

@@ -1,6 +1,6 @@
 """A capture's head, cameras and avatar in a scene, and the viewports that look at them."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -32,9 +32,11 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
     The dashed lines from cameras and bones to their parent are hidden.
     """
     matrix = head.matrix_world
-    corners = [matrix @ Vector(corner) for corner in _bounds(evaluated_vertices(head))]
-    center, radius = (corners[0] + corners[1]) / 2, (corners[1] - corners[0]).length / 2
-    for space in _viewports(screens):
+    vertices = evaluated_vertices(head)
+    low, high = matrix @ Vector(vertices.min(0)), matrix @ Vector(vertices.max(0))
+    center, radius = (low + high) / 2, (high - low).length / 2
+    for area in _viewports(screens):
+        space = area.spaces.active
         space.overlay.show_relationship_lines = False
         region = space.region_3d
         if region.view_perspective == "CAMERA":
@@ -64,27 +66,17 @@ def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
     Blender knows a sidebar's tabs only once it was drawn: call it again until it returns True.
     """
     is_shown = True
-    for screen in screens:
-        for area in screen.areas:
-            if area.type == "VIEW_3D":
-                area.spaces.active.show_region_ui = True
-                sidebar = next(region for region in area.regions if region.type == "UI")
-                with suppress(AttributeError, TypeError):  # not drawn yet
-                    sidebar.active_panel_category = tab
-                is_shown &= sidebar.active_panel_category == tab
+    for area in _viewports(screens):
+        area.spaces.active.show_region_ui = True
+        sidebar = next(region for region in area.regions if region.type == "UI")
+        with suppress(AttributeError, TypeError):  # not drawn yet
+            sidebar.active_panel_category = tab
+        is_shown &= sidebar.active_panel_category == tab
     return is_shown
 
 
-def _bounds(vertices: Any) -> tuple[Any, Any]:
-    return vertices.min(0), vertices.max(0)
-
-
-def _viewports(screens: Iterable[Any]) -> Iterator[Any]:
-    """The spaces of the 3D viewports on these screens."""
-    for screen in screens:
-        for area in screen.areas:
-            if area.type == "VIEW_3D":
-                yield area.spaces.active
+def _viewports(screens: Iterable[Any]) -> list[Any]:
+    return [area for screen in screens for area in screen.areas if area.type == "VIEW_3D"]
 
 
 WORLD_NAME = "World splats"

@@ -20,6 +20,8 @@ from .arrays import Z_UP_TO_Y_UP, evaluated_vertices, mesh_vertices
 from .blend_file import set_frames_per_second
 from .objects import Warn, log_warning, place, remove
 
+UP = (0.0, 0.0, 1.0)
+"""Blender's scenes are z-up."""
 ORTHOGRAPHIC_DISTANCE = 1000.0
 """An orthographic view is rendered in perspective from this many times its own width away."""
 
@@ -30,11 +32,13 @@ def image_size(render: Any) -> tuple[int, int]:
     return max(1, int(render.resolution_x * share)), max(1, int(render.resolution_y * share))
 
 
-def render_camera(camera: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int]) -> Camera:
+def render_camera(
+    camera: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int] | None = None
+) -> Camera:
     """The scene's camera for a final image of width × height pixels.
 
     camera: the evaluated camera object. border: x, y, width and height in pixels of the render region, from the bottom
-    left. Raises StgaError unless it is a perspective camera.
+    left; None: the whole image. Raises StgaError unless it is a perspective camera.
     """
     if camera is None or camera.type != "CAMERA":
         raise StgaError("The scene has no camera to render through")
@@ -45,15 +49,21 @@ def render_camera(camera: Any, depsgraph: Any, width: int, height: int, border: 
         depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
     )
     whole = camera_of(np.array(camera.matrix_world.normalized(), np.float64), projection, width, height)
-    return _cropped(whole, border)
+    if border is None:
+        return whole
+    x, y, columns, rows = border
+    return replace(whole, width=columns, height=rows, cx=whole.cx - x, cy=whole.cy - (height - y - rows))
 
 
 def viewport_camera(region: Any, width: int, height: int) -> Camera:
     """The view of a 3D viewport (a RegionView3D) for an image of width × height pixels."""
     pose = np.array(region.view_matrix.inverted(), np.float64)
     projection = np.array(region.window_matrix, np.float64)
-    if not region.is_perspective:
-        projection, distance = _perspective_of_orthographic(projection)
+    if not region.is_perspective:  # nearly the same in perspective from far behind
+        flat, distance = projection, ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
+        projection = np.zeros((4, 4))
+        projection[0, 0], projection[1, 1] = flat[0, 0] * distance, flat[1, 1] * distance
+        projection[:2, 2] = -flat[:2, 3]
         pose[:3, 3] += distance * pose[:3, 2]
     return camera_of(pose, projection, width, height)
 
@@ -70,21 +80,6 @@ def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Cam
         cx=(1 - p[0, 2]) * width / 2,
         cy=(1 + p[1, 2]) * height / 2,
     )
-
-
-def _perspective_of_orthographic(projection: np.ndarray) -> tuple[np.ndarray, float]:
-    """A perspective projection (4, 4) that nearly equals an orthographic one, and how many meters to step back."""
-    distance = ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
-    perspective = np.zeros((4, 4))
-    perspective[0, 0], perspective[1, 1] = projection[0, 0] * distance, projection[1, 1] * distance
-    perspective[0, 2], perspective[1, 2] = -projection[0, 3], -projection[1, 3]
-    return perspective, distance
-
-
-def _cropped(camera: Camera, border: tuple[int, int, int, int]) -> Camera:
-    x, y, width, height = border
-    top = camera.height - y - height
-    return replace(camera, width=width, height=height, cx=camera.cx - x, cy=camera.cy - top)
 
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
@@ -217,20 +212,16 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
     frames = np.array([view.timestep for view in found])
     for row, view in enumerate(found):
         background = data.background_images.new()
-        background.image = _load_image(view.image)
+        try:
+            background.image = bpy.data.images.load(str(view.image))
+        except RuntimeError as error:
+            raise StgaError(f"{view.image}: cannot be read as an image") from error
         background.show_background_image = row == 0
         # Visible from its own frame until the next image's; the first also before, the last also after.
         near = np.arange(max(row - 1, 0), min(row + 2, len(found)))
         path = f"background_images[{row}].show_background_image"
         write_curve(curves, path, 0, frames[near], (near == row).astype(float), "CONSTANT")
     data.show_background_images = True
-
-
-def _load_image(path: Path) -> Any:
-    try:
-        return bpy.data.images.load(str(path))
-    except RuntimeError as error:
-        raise StgaError(f"{path}: cannot be read as an image") from error
 
 
 def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
@@ -241,43 +232,34 @@ def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
     cameras. Image size: the scene's resolution, or that of the capture that the camera was imported from.
     Raises StgaError for a camera that is not perspective, is mirrored, or where there are none.
     """
-    entries = [_entry(camera.name, _camera(camera.evaluated_get(depsgraph), depsgraph)) for camera in cameras]
+    entries = []
+    for thing in cameras:
+        if np.linalg.det(np.array(thing.evaluated_get(depsgraph).matrix_world.to_3x3())) < 0:
+            raise StgaError(f"{thing.name}: is mirrored by a negative scale; apply the scale")
+        width, height = (int(n) for n in thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render))
+        camera = render_camera(thing.evaluated_get(depsgraph), depsgraph, width, height)
+        intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}
+        entries.append(
+            {
+                "file_path": f"{thing.name}.png",
+                "camera_id": thing.name,
+                "w": width,
+                "h": height,
+                **{key: float(value) for key, value in intrinsics.items()},
+                "transform_matrix": (Z_UP_TO_Y_UP @ camera.camera_to_world_gl).tolist(),
+            }
+        )
     if not entries:
         raise StgaError("No cameras to export; add them, or select some")
     write_json(path, {"camera_model": "PINHOLE", "world": "keep", "frames": entries})
     return len(entries)
 
 
-def _camera(camera: Any, depsgraph: Any) -> Camera:
-    if np.linalg.det(np.array(camera.matrix_world.to_3x3())) < 0:
-        raise StgaError(f"{camera.name}: is mirrored by a negative scale; apply the scale")
-    size = camera.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
-    width, height = (int(pixels) for pixels in size)
-    return render_camera(camera, depsgraph, width, height, (0, 0, width, height))
-
-
-def _entry(name: str, camera: Camera) -> dict[str, Any]:
-    intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}
-    return {
-        "file_path": f"{name}.png",
-        "camera_id": name,
-        "w": camera.width,
-        "h": camera.height,
-        **{key: float(value) for key, value in intrinsics.items()},
-        "transform_matrix": (Z_UP_TO_Y_UP @ camera.camera_to_world_gl).tolist(),
-    }
-
-
-UP = (0.0, 0.0, 1.0)
-"""Blender's scenes are z-up."""
-
-
 def scene_camera(depsgraph: Any) -> Camera:
     """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is perspective."""
     scene = depsgraph.scene
-    width, height = image_size(scene.render)
     camera = scene.camera.evaluated_get(depsgraph) if scene.camera else None
-    return render_camera(camera, depsgraph, width, height, (0, 0, width, height))
+    return render_camera(camera, depsgraph, *image_size(scene.render))
 
 
 def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
@@ -293,15 +275,9 @@ def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) ->
         middle = (vertices.min(0) + vertices.max(0)) / 2
     center = matrix[:3, :3] @ middle + matrix[:3, 3]
     angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)
-    cameras = _capture_cameras(subject)
-    if not angle and cameras:
-        angles = covered_angles(cameras, start, center, UP)
+    # The cameras of the capture that it belongs to, for their positions.
+    children = () if subject.parent is None else subject.parent.children_recursive
+    poses = [np.array(child.matrix_world, np.float64) for child in children if child.get(tags.KIND) == tags.CAMERA]
+    if not angle and poses:
+        angles = covered_angles([camera_from_gl(pose, 1, 1, 1, 1, 0, 0) for pose in poses], start, center, UP)
     return turntable(start, center, count, angles, UP)
-
-
-def _capture_cameras(subject: Any) -> list[Camera]:
-    """The cameras of the capture that `subject` belongs to, for their positions."""
-    root = subject.parent
-    children = () if root is None else root.children_recursive
-    found = [child for child in children if child.get(tags.KIND) == tags.CAMERA]
-    return [camera_from_gl(np.array(camera.matrix_world, np.float64), 1, 1, 1, 1, 0, 0) for camera in found]

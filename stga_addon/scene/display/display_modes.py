@@ -22,7 +22,9 @@ EXTENT = 3.0
 def point_material() -> bpy.types.Material:
     """Emits the color of a point cloud's points, with their opacity; built where the file has none."""
     # EEVEE does not sort the points of a point cloud.
-    return _splat_material(POINT_MATERIAL, _point_shader, "DITHERED")
+    return _splat_material(
+        POINT_MATERIAL, lambda nodes: _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY")), "DITHERED"
+    )
 
 
 def gaussian_material() -> bpy.types.Material:
@@ -45,10 +47,6 @@ def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bp
         material.surface_render_method = method
         material.use_backface_culling = True
     return material
-
-
-def _point_shader(nodes: Nodes) -> Any:
-    return _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY"))
 
 
 def _gaussian_shader(nodes: Nodes) -> Any:
@@ -113,10 +111,8 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
     is_viewport = nodes.out("GeometryNodeIsViewport")
     in_images = nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": made[QUADS]}, input_type="GEOMETRY")
     geometries = {AS_TRAINED: in_images, **made}
-    if native is not None:
-        native = native_splats(nodes.tree, native)
-    if native is not None:
-        geometries[NATIVE] = native
+    if native is not None and (points := native_splats(nodes.tree, native)) is not None:
+        geometries[NATIVE] = points
     menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
     menu.enum_definition.enum_items.clear()
     for name in geometries:
@@ -145,12 +141,7 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
     quad = nodes.out("GeometryNodeMeshGrid", {"Size X": side, "Size Y": side, "Vertices X": 2, "Vertices Y": 2})
     quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": gaussian_material()})
     quads = nodes.out("GeometryNodeInstanceOnPoints", {"Points": splats, "Selection": visible, "Instance": quad})
-    transform = _quad_transform(nodes, size)
-    return nodes.out("GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": transform})
-
-
-def _quad_transform(nodes: Nodes, size: Any) -> bpy.types.NodeSocket:
-    """Per splat: its ellipsoid's transform after a rotation that turns +Z to the active camera."""
+    # Per splat: its ellipsoid's transform after a rotation that turns +Z to the active camera.
     position = nodes.out("GeometryNodeInputPosition")
     rotation = nodes.attribute(WORLD_ROTATION, "QUATERNION")
     scale = nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size)
@@ -166,7 +157,8 @@ def _quad_transform(nodes: Nodes, size: Any) -> bpy.types.NodeSocket:
         nodes.out("FunctionNodeCombineTransform", ellipsoid),
         nodes.out("FunctionNodeCombineTransform", {"Rotation": facing}),
     ]
-    return nodes.out("FunctionNodeMatrixMultiply", {"Matrix": transforms})
+    transform = nodes.out("FunctionNodeMatrixMultiply", {"Matrix": transforms})
+    return nodes.out("GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": transform})
 
 
 def _native(

@@ -1,9 +1,8 @@
 """Node groups that compute triangles' frames and strain on the head, and place splats by them."""
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 
@@ -56,7 +55,13 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
     rotation = nodes.attribute(ROTATION, "QUATERNION")
     scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
     if convention is not None:
-        origin, frame_rotation, size = _sampled_frames(nodes, mesh, convention)
+        face = nodes.attribute(FACE, "INT")
+
+        def sample(name: str, data_type: str) -> Any:  # of each splat's triangle
+            return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
+
+        size = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
+        origin, frame_rotation = sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION")
         xyz = nodes.out("FunctionNodeRotateVector", {"Vector": nodes.scale(xyz, size), "Rotation": frame_rotation})
         xyz = nodes.vector("ADD", xyz, origin)
         rotations = {"Rotation": rotation, "Rotate By": frame_rotation}
@@ -65,17 +70,6 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
     splats = nodes.out("GeometryNodeSetPosition", {"Geometry": splats, "Position": xyz})
     splats = nodes.store(splats, WORLD_ROTATION, rotation, "QUATERNION")
     return nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
-
-
-def _sampled_frames(nodes: Nodes, mesh: Any, convention: str) -> tuple[Any, Any, Any]:
-    """Origin, rotation and scale of each splat's triangle."""
-    face = nodes.attribute(FACE, "INT")
-
-    def sample(name: str, data_type: str) -> Any:
-        return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
-
-    scale = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
-    return sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION"), scale
 
 
 def _frame_scale(nodes: Nodes, size: Any, convention: str) -> Any:
@@ -222,8 +216,7 @@ SAMPLED_STRAIN = NodeGroup("STGA Sampled Strain", {"Strain": "Geometry"}, "Vecto
 SMOOTHED = NodeGroup("STGA Smoothed Strain", {"Strain": "Geometry"}, "Geometry", _with_smoothed_strain)
 
 
-@dataclass(frozen=True)
-class SignalNodes:
+class SignalNodes(NamedTuple):
     """How nodes compute the signal of a driven offset, of three components at most.
 
     label      in names of node trees, short

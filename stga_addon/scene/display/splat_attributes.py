@@ -137,21 +137,16 @@ def read_splats(mesh: Any) -> Splats:
         )
 
 
-def read_strain_range(neutral: Any) -> np.ndarray | None:
-    """`Avatar.strain_range` as stored in a neutral mesh; None where it is not."""
-    return _read_vectors(neutral, RANGE)
-
-
 def read_driven_offsets(neutral: Any) -> dict[str, np.ndarray]:
     """`Avatar.driven_offsets` as stored in a neutral mesh."""
     found = {
-        name: _read_vectors(neutral, [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)])
+        name: read_vectors(neutral, [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)])
         for name, offset in OFFSETS.items()
     }
     return {name: coefficients for name, coefficients in found.items() if coefficients is not None}
 
 
-def _read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
+def read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
     """(F, len(names), 3) of vector attributes; None where the mesh lacks one."""
     if not all(name in mesh.attributes for name in names):
         return None

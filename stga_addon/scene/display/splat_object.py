@@ -19,13 +19,14 @@ from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
 from .frame_nodes import displayed_offsets
 from .node_builder import is_splat_tree
 from .splat_attributes import (
+    RANGE,
     Attributes,
     SplatAttributes,
     avatar_attributes,
     read_driven_offsets,
     read_light,
     read_splats,
-    read_strain_range,
+    read_vectors,
     splat_attributes,
     write_attributes,
     write_light,
@@ -82,8 +83,9 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Sp
     _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
-    neutral = _neutral_object(f"{splat_object.name} neutral", avatar, prepared)
-    set_input(splat_object, splat_nodes.NEUTRAL, neutral)
+    neutral = triangle_mesh(f"{splat_object.name} neutral", avatar.neutral, avatar.faces)
+    _write_neutral(neutral, prepared)
+    set_input(splat_object, splat_nodes.NEUTRAL, bpy.data.objects.new(neutral.name, neutral))
     # A sibling of the head: both have the same object space.
     splat_object.parent = head.parent
     splat_object.matrix_parent_inverse = head.matrix_parent_inverse
@@ -225,7 +227,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         neutral=mesh_vertices(neutral.data),
         faces=mesh_triangles(neutral.data),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
-        strain_range=read_strain_range(neutral.data),
+        strain_range=read_vectors(neutral.data, RANGE),
         driven_offsets=read_driven_offsets(neutral.data),
         light=read_light(neutral.data),
     )
@@ -266,12 +268,6 @@ def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
     return splat_object
 
 
-def _neutral_object(name: str, avatar: Avatar, prepared: SplatAttributes) -> Any:
-    mesh = triangle_mesh(name, avatar.neutral, avatar.faces)
-    _write_neutral(mesh, prepared)
-    return bpy.data.objects.new(name, mesh)
-
-
 def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
     write_attributes(mesh, prepared.neutral, "FACE")
     write_light(mesh, prepared.light)
@@ -281,9 +277,7 @@ def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
 def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
     modifier = splat_object.modifiers.new("STGA Splats", "NODES")
     modifier.node_group = splat_nodes.splat_tree(options)
-    set_input(
-        splat_object, splat_nodes.DISPLAY, AS_TRAINED
-    )  # a menu's default reaches the modifier in some versions only
+    set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)  # the default reaches it in some versions only
     for scene in splat_object.users_scene:
         use_transparent_bounces(scene)
 

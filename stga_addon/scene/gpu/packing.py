@@ -13,7 +13,7 @@ from ...avatar.embedding import FaceFrames
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...errors import StgaError
-from ...flame.quaternions import normalized
+from ...flame.quaternions import normalized, to_matrices
 from ...light.harmonics import GLOSSY
 from ...light.lamps import LightView, head_bounds, light_rows, light_view, texel_meters
 from ...light.relight import Kept, Relighter
@@ -89,17 +89,9 @@ def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
 def _axes(splats: Splats, layer: int) -> np.ndarray:
     """(N, 3, 4): the standard deviations along the splat's axes as vectors, beside them opacity, a random value in
     0…100 for the display's percentage, and the layer's index."""
-    w, x, y, z = normalized(splats.rotation).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
     axes = np.empty((len(splats), 3, 4), np.float32)
     deviation = np.exp(splats.log_scale.astype(np.float64))
-    for axis in range(3):
-        for row in range(3):
-            axes[:, axis, row] = rows[row][axis] * deviation[:, axis]
+    axes[..., :3] = np.swapaxes(to_matrices(normalized(splats.rotation)) * deviation[:, None], 1, 2)
     with np.errstate(over="ignore"):
         axes[:, 0, 3] = 1 / (1 + np.exp(-splats.opacity.astype(np.float64)))
     axes[:, 1, 3] = random_percentage(len(splats))
@@ -211,18 +203,11 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
             row[0, 3] = 0
         strained = bool(layer.frames.strain.shape[1] and layer.splats.strain_color.shape[1])
         row[1] = layer.antialiased, strained, settings.size, settings.opacity_threshold
-        row[2:5, :3] = direction_matrix(camera.world_to_camera @ layer.to_world)
+        # From directions in camera space to the space that splats were trained in: without scale and reflection.
+        u, _, v = np.linalg.svd((camera.world_to_camera @ layer.to_world)[:3, :3])
+        row[2:5, :3] = (u @ v).T
         row[2:5, 3] = settings.percentage, settings.show_selection, settings.selected_only
     return texels
-
-
-def direction_matrix(to_camera: np.ndarray) -> np.ndarray:
-    """(3, 3): from directions in camera space to the space that splats were trained in.
-
-    The rotation in the map `to_camera`; its scale and reflection do not change a direction.
-    """
-    u, _, v = np.linalg.svd(to_camera[:3, :3])
-    return np.asarray((u @ v).T)
 
 
 SURFACE_TEXELS, VERTEX_TEXELS, LIGHT_TEXELS, MAP_TEXELS = 4, 3, 4, 4
@@ -329,17 +314,13 @@ def _lights(relit: Relit, maps: list[ShadowView], map_rows: list[np.ndarray]) ->
             view = light_view(bounds, light)
             meshes = (relit.mesh, faces), *((caster.vertices, caster.faces) for caster in casters)
             maps.append(ShadowView(view, meshes))
-            map_rows.append(_map_row(view, texel_meters(bounds)))
+            # The rows of the map to the light's axes; scale, whether parallel, meters of a texel.
+            row = np.zeros((MAP_TEXELS, 4), np.float32)
+            row[:3, :3], row[:3, 3] = view.axes.T, -(view.origin @ view.axes)
+            row[3] = view.scale, view.is_parallel, texel_meters(bounds), 0
+            map_rows.append(row)
         found.append(light_rows(light, bounds.center, len(maps) - 1 if shadowed else -1))
     return np.concatenate(found).reshape(-1, 4)
-
-
-def _map_row(view: LightView, texel_m: float) -> np.ndarray:
-    """(MAP_TEXELS, 4): the rows of the map to the light's axes; scale, whether parallel, meters of a texel."""
-    row = np.zeros((MAP_TEXELS, 4), np.float32)
-    row[:3, :3], row[:3, 3] = view.axes.T, -(view.origin @ view.axes)
-    row[3] = view.scale, view.is_parallel, texel_m, 0
-    return row
 
 
 def _vertices(relit: Relit, distant: np.ndarray) -> np.ndarray:

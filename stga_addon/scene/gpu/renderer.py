@@ -213,7 +213,11 @@ class SplatRenderer:
         In two passes: the first projects and colors each splat, into a texel of the projected textures; the second
         reads these and draws the splats from far to near.
         """
-        self._resize(view.camera.width, view.camera.height)
+        size = view.camera.width, view.camera.height
+        if self._size != size:
+            self._size, self._color = size, GPUTexture(size, format=self._color_format)
+            self._depth = GPUTexture(size, format=DEPTH_FORMAT)
+            self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
         gpu.state.depth_test_set("NONE")
         gpu.state.depth_mask_set(False)
         count = self._project(layers, view) if layers else 0
@@ -292,26 +296,16 @@ class SplatRenderer:
         self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
         return self._static
 
-    def _frame_blocks(self, layers: Sequence[SceneLayer]) -> list[np.ndarray]:
-        """`packing.frame_block` of each layer, computed again only for frames that are new."""
+    def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
+        """Project and color the splats, farthest first, into the projected textures; returns how many there are."""
+        static = self._update_static(layers)
+        # Blocks are computed again only for frames that are new.
         known = self._blocks
         self._blocks = {
             id(layer.frames): known.get(id(layer.frames)) or (layer.frames, packing.frame_block(layer.frames))
             for layer in layers
         }
-        return [self._blocks[id(layer.frames)][1] for layer in layers]
-
-    def _resize(self, width: int, height: int) -> None:
-        if self._size != (width, height):
-            self._size = width, height
-            self._color = GPUTexture((width, height), format=self._color_format)
-            self._depth = GPUTexture((width, height), format=DEPTH_FORMAT)
-            self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
-
-    def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
-        """Project and color the splats, farthest first, into the projected textures; returns how many there are."""
-        static = self._update_static(layers)
-        frames = packing.posed_frames(layers, self._frame_blocks(layers), view)
+        frames = packing.posed_frames(layers, [self._blocks[id(layer.frames)][1] for layer in layers], view)
         order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0

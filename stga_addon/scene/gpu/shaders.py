@@ -96,13 +96,15 @@ RELIT_DEFINES = f"""
 #define PI 3.14159265358979
 """
 
-RELIT_FUNCTIONS = """
+_SRGB_FUNCTION = """
 vec3 srgb_to_linear(vec3 srgb)
 {
   vec3 curve = pow((max(srgb, vec3(0.04045)) + 0.055) / 1.055, vec3(2.4));
   return mix(curve, max(srgb, vec3(0.0)) / 12.92, vec3(lessThanEqual(srgb, vec3(0.04045))));
 }
+"""
 
+RELIT_FUNCTIONS = """
 vec3 linear_to_srgb(vec3 linear)
 {
   vec3 curve = 1.055 * pow(max(linear, vec3(0.0031308)), vec3(1.0 / 2.4)) - 0.055;
@@ -451,12 +453,6 @@ void main()
 """
 
 _COMPOSITE_FRAGMENT = """
-vec3 to_linear(vec3 srgb)
-{
-  vec3 curve = pow((max(srgb, vec3(0.04045)) + 0.055) / 1.055, vec3(2.4));
-  return mix(curve, srgb / 12.92, vec3(lessThanEqual(srgb, vec3(0.04045))));
-}
-
 bool is_near_bone(vec2 pixel)
 {
   for (int bone = 0; bone < int(part.y); bone++) {
@@ -481,15 +477,16 @@ void main()
   float z = distances.r / max(distances.g, 1e-9);
   gl_FragDepth = clamp(0.5 + 0.5 * (to_depth.x + to_depth.y * z) / (to_depth.z + to_depth.w * z), 0.0, 1.0);
   if (part.x > 1.5) {
-    color_final = vec4(splats.a * to_linear(behind.rgb), 0.0);
+    color_final = vec4(splats.a * srgb_to_linear(behind.rgb), 0.0);
     return;
   }
   if (behind.a < 0.5) {
-    color_final = vec4(to_linear(splats.rgb / splats.a) * splats.a, splats.a);
+    color_final = vec4(srgb_to_linear(splats.rgb / splats.a) * splats.a, splats.a);
     return;
   }
   /* Splats are blended in sRGB, the viewport blends linear: exact where `behind` is what lies behind. */
-  vec3 goal = to_linear(clamp(splats.rgb + (1.0 - splats.a) * behind.rgb, 0.0, 1.0)), back = to_linear(behind.rgb);
+  vec3 goal = srgb_to_linear(clamp(splats.rgb + (1.0 - splats.a) * behind.rgb, 0.0, 1.0));
+  vec3 back = srgb_to_linear(behind.rgb);
   vec3 most = min(vec3(1.0 - splats.a), goal / max(back, vec3(1e-6)));
   float through = min(most.r, min(most.g, most.b));
   color_final = vec4(goal - through * back, 1.0 - through);
@@ -512,7 +509,8 @@ def projection_shader(relit: bool = False) -> Any:
     for name in ("faces", "count"):
         info.push_constant("INT", name)
     info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(_TEXEL_FUNCTION + (RELIT_FUNCTIONS if relit else "") + _PROJECTION_FRAGMENT)
+    relighting = _SRGB_FUNCTION + RELIT_FUNCTIONS if relit else ""
+    info.fragment_source(_TEXEL_FUNCTION + relighting + _PROJECTION_FRAGMENT)
     return gpu.shader.create_from_info(info)
 
 
@@ -554,5 +552,5 @@ def composite_shader() -> Any:
     for name in ("corner_px", "to_depth", "behind", "part"):
         info.push_constant("VEC4", name)
     info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(_COMPOSITE_FRAGMENT)
+    info.fragment_source(_SRGB_FUNCTION + _COMPOSITE_FRAGMENT)
     return gpu.shader.create_from_info(info)

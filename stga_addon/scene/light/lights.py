@@ -47,7 +47,14 @@ def light_of(light: Any, matrix: Any) -> Light | None:
         found = replace(found, radius=light.shadow_soft_size)
         if light.type == "SPOT":
             found = replace(found, cone=light.spot_size, blend=light.spot_blend)
-    return found if is_normalized(light) else replace(found, color=color * _area(found))
+    if is_normalized(light):
+        return found
+    # Energy is per square meter, as Cycles counts them.
+    if found.kind == "area":
+        area = found.size[0] * found.size[1] * (np.pi / 4 if found.shape == "ellipse" else 1.0)
+    else:
+        area = float(np.pi * (np.tan(found.angle / 2) if found.kind == "sun" else found.radius) ** 2)
+    return replace(found, color=color * area)
 
 
 def in_avatar_space(light: Light, to_world: np.ndarray) -> Light:
@@ -82,13 +89,6 @@ def _link_state(collection: Any, receiver: Any) -> str:
         if receiver.name in child.all_objects:
             return str(entry.light_linking.link_state)
     return ""
-
-
-def _area(light: Light) -> float:
-    """What a light's energy per square meter is multiplied with, as by Cycles."""
-    if light.kind == "area":
-        return light.size[0] * light.size[1] * (np.pi / 4 if light.shape == "ellipse" else 1.0)
-    return float(np.pi * (np.tan(light.angle / 2) if light.kind == "sun" else light.radius) ** 2)
 
 
 def _node_factor(light: Any) -> np.ndarray:

@@ -1,7 +1,6 @@
 """The light of a Blender scene for each of its avatars, and heads' shadows onto the scene."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from .lights import WorldLight, in_avatar_space, is_linked, light_of, split_worl
 from .settings import current_settings, lighting_settings
 
 MAX_KEPT = 64
+COPIED_SETTINGS = ("mode", "mix", "exposure", "roughness", "specular", "shadows")
 
 
 class SceneLight:
@@ -43,11 +43,11 @@ class SceneLight:
             return None
         lighting = self.lighting(settings, (splat_object, head), to_world, visible, depsgraph)
         casters = self.casters.of(head, to_world, visible, depsgraph) if lighting.shadows else ()
-        relighter = self._relighter(splat_object.session_uid, avatar)
-        key, place = (
-            (_key(lighting), id(relighter), id(vertices), id(casters)),
-            (splat_object.session_uid, to_world.tobytes()),
-        )
+        uid = splat_object.session_uid
+        relighter = self._relighters.get(uid)
+        if relighter is None or relighter.avatar is not avatar:
+            relighter = self._relighters[uid] = Relighter(avatar)
+        key, place = (_key(lighting), id(relighter), id(vertices), id(casters)), (uid, to_world.tobytes())
         known = self._relit.get(place)
         if known is None or known[0] != key:
             if len(self._relit) > MAX_KEPT:  # objects that move leave an entry at each place
@@ -74,13 +74,8 @@ class SceneLight:
         return Lighting(
             world=world,
             lights=(*lights, *suns),
-            mode=settings.mode,
-            mix=settings.mix,
-            exposure=settings.exposure,
             white=(red, green, blue),
-            roughness=settings.roughness,
-            specular=settings.specular,
-            shadows=settings.shadows,
+            **{name: getattr(settings, name) for name in COPIED_SETTINGS},
         )
 
     def _world(self, depsgraph: Any, to_world: np.ndarray) -> tuple[np.ndarray, tuple[Light, ...]]:
@@ -99,22 +94,12 @@ class SceneLight:
         u, _, v = np.linalg.svd(to_world[:3, :3])
         return rotated(world, (u @ v).T), tuple(in_avatar_space(sun, to_world) for sun in suns)
 
-    def _relighter(self, uid: int, avatar: Avatar) -> Relighter:
-        if uid not in self._relighters or self._relighters[uid].avatar is not avatar:
-            self._relighters[uid] = Relighter(avatar)
-        return self._relighters[uid]
-
 
 def _key(lighting: Lighting) -> tuple[Any, ...]:
     """Equal for lightings of the same values."""
-    return (
-        *(_value(getattr(lighting, field.name)) for field in fields(lighting) if field.name != "lights"),
-        *(_value(getattr(light, field.name)) for light in lighting.lights for field in fields(light)),
-    )
-
-
-def _value(value: Any) -> Any:
-    return value.tobytes() if isinstance(value, np.ndarray) else value
+    values = [value for name, value in vars(lighting).items() if name != "lights"]
+    values += [value for light in lighting.lights for value in vars(light).values()]
+    return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in values)
 
 
 class Casters:

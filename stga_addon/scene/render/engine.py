@@ -99,7 +99,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         result = self.begin_result(0, 0, *size, layer=depsgraph.view_layer.name)
         for render_pass in result.layers[0].passes:
             if render_pass.name in passes:
-                _write_pass(render_pass, passes[render_pass.name])
+                from_bottom = np.ascontiguousarray(passes[render_pass.name][::-1], np.float32)
+                render_pass.rect.foreach_set(from_bottom.ravel())
         self.end_result(result)
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
@@ -147,11 +148,6 @@ def _border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
     return left, low, right - left, high - low
 
 
-def _write_pass(render_pass: Any, values: np.ndarray) -> None:
-    """Fill a render pass with (H, W, channels), top row first; Blender's rows start at the bottom."""
-    render_pass.rect.foreach_set(np.ascontiguousarray(values[::-1], np.float32).ravel())
-
-
 @persistent
 def _before_render(*_: Any) -> None:
     """Measure the view transforms of all scenes that a render may ask this engine for; a compositor may ask for any."""
@@ -166,35 +162,20 @@ def register(find_python: Callable[[], str], find_device: Callable[[], str] = la
     _rasterizer = Rasterizer(find_python, find_device)
     bpy.utils.register_class(SplatsEngine)
     bpy.app.handlers.render_pre.append(_before_render)
-    add_engine()
+    for panel in _panels_by_engine():
+        if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in SHARED_PANELS:
+            panel.COMPAT_ENGINES.add(ENGINE)
 
 
 def unregister() -> None:
-    remove_engine()
+    for panel in _panels_by_engine():
+        panel.COMPAT_ENGINES.discard(ENGINE)
     bpy.app.handlers.render_pre.remove(_before_render)
     bpy.utils.unregister_class(SplatsEngine)
     stop_redraws()
     _rasterizer.client.close()
 
 
-def add_engine() -> None:
-    for panel in _shared_panels():
-        panel.COMPAT_ENGINES.add(ENGINE)
-
-
-def remove_engine() -> None:
-    for panel in _panels_by_engine():
-        panel.COMPAT_ENGINES.discard(ENGINE)
-
-
 def _panels_by_engine() -> list[Any]:
     """The panels that list the engines they are for."""
     return [panel for panel in bpy.types.Panel.__subclasses__() if hasattr(panel, "COMPAT_ENGINES")]
-
-
-def _shared_panels() -> list[Any]:
-    return [
-        panel
-        for panel in _panels_by_engine()
-        if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in SHARED_PANELS
-    ]

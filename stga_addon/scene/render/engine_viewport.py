@@ -43,14 +43,11 @@ class RenderRequest:
     camera: Camera
     background: tuple[float, ...] | None
 
-    def is_same(self, other: "RenderRequest | None") -> bool:
-        """Whether both show the same layers (by identity) from the same camera."""
-        return other is not None and self.layers is other.layers and self._view() == other._view()
-
-    def _view(self) -> tuple[Any, ...]:
+    def key(self) -> tuple[Any, ...]:
+        """Equal for requests that show the same layers (by identity) from the same camera."""
         camera = self.camera
         intrinsics = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
-        return *intrinsics, camera.world_to_camera.tobytes(), self.background
+        return id(self.layers), *intrinsics, camera.world_to_camera.tobytes(), self.background
 
 
 class ViewportRenderer:
@@ -76,7 +73,7 @@ class ViewportRenderer:
     def request(self, request: RenderRequest) -> bool:
         """Render this next, instead of what was requested before; returns False if it is the same."""
         with self._lock:
-            if request.is_same(self._request):
+            if self._request is not None and request.key() == self._request.key():
                 return False
             self._request = request
             if self._thread is None:
@@ -116,7 +113,10 @@ class ViewportRenderer:
                 self.error, scale = str(error), 1.0
             except Exception as error:  # shown in the viewport: an exception would end the thread unseen
                 self.error, scale = f"{type(error).__name__}: {error}", 1.0
-            self._adapt_scale(scale, time.perf_counter() - begin)
+            elapsed_s = time.perf_counter() - begin
+            if scale < 1 or elapsed_s < MAX_RENDER_TIME_S:
+                factor = np.sqrt(MAX_RENDER_TIME_S / max(elapsed_s, 1e-3))
+                self._moving_scale = float(np.clip(self._moving_scale * factor, MIN_SCALE, 1.0))
             with self._lock:
                 self._has_update = True
 
@@ -129,11 +129,6 @@ class ViewportRenderer:
                 return None
             return latest, 1.0 if latest is last else self._moving_scale
 
-    def _adapt_scale(self, scale: float, elapsed_s: float) -> None:
-        if scale < 1 or elapsed_s < MAX_RENDER_TIME_S:
-            factor = np.sqrt(MAX_RENDER_TIME_S / max(elapsed_s, 1e-3))
-            self._moving_scale = float(np.clip(self._moving_scale * factor, MIN_SCALE, 1.0))
-
 
 class ViewportImage:
     """An image as a GPU texture."""
@@ -144,7 +139,6 @@ class ViewportImage:
 
     def draw(self, image: np.ndarray, width: int, height: int) -> None:
         """Draw an image (H, W, 4), bottom row first, over a region of width × height pixels."""
-        import gpu
         from gpu_extras.presets import draw_texture_2d
 
         if image is not self._uploaded:
@@ -210,7 +204,7 @@ class Rasterizer:
     """A render client whose Python and device the main thread looks up, for render threads.
 
     find_python   the interpreter that renders where Blender's own cannot; raises StgaError where there is none
-    find_device   the device, as `render.compose.Composer` takes it
+    find_device   the device, as `render.device.Composer` takes it
     """
 
     def __init__(self, find_python: Callable[[], str], find_device: Callable[[], str]) -> None:
@@ -280,7 +274,11 @@ class EngineViewport:
             self.renderer.error, self.renderer.image = self.error, None
             return False
         camera = viewport_camera(context.region_data, region.width, region.height)
-        self._pose(camera)
+        # Posed again for another camera where highlights depend on it.
+        assert self._layers is not None
+        seen_from = camera.position.tobytes() if any(layer.relit for layer in self._layers) else b"anywhere"
+        if seen_from != self._posed_for:
+            self._posed, self._posed_for = [layer.posed(camera.position) for layer in self._layers], seen_from
         if not self.renderer.is_busy():
             self._rasterizer.update()
         return self.renderer.request(RenderRequest(self._posed, camera, scene_background(depsgraph.scene)))
@@ -297,13 +295,6 @@ class EngineViewport:
                 return False
             self._posed, self._posed_for, self.error = [], b"", ""
         return True
-
-    def _pose(self, camera: Camera) -> None:
-        """Pose the layers for the rasterizer; again for another camera where highlights depend on it."""
-        assert self._layers is not None
-        seen_from = camera.position.tobytes() if any(layer.relit for layer in self._layers) else b"anywhere"
-        if seen_from != self._posed_for:
-            self._posed, self._posed_for = [layer.posed(camera.position) for layer in self._layers], seen_from
 
     def _draw(self, context: Any, depsgraph: Any) -> None:
         color = scene_background(depsgraph.scene)

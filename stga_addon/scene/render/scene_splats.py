@@ -76,26 +76,16 @@ def visible_layers(
     view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects.
     Raises StgaError where the head of an object is gone or has other triangles than its splats.
     """
-    shown = list(_visible_objects(depsgraph, view))
+    if view is None:
+        visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
+    else:
+        visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
+    shown = [found for each in visible for found in _with_instances(each, depsgraph, Matrix())]
     return [
         _layer(visible, matrix, depsgraph, cache, shown)
         for visible, matrix in shown
         if visible.get(tags.KIND) == tags.SPLATS and is_wanted(visible)
     ]
-
-
-def _visible_objects(depsgraph: Any, view: Any) -> Iterator[tuple[Any, Matrix]]:
-    """Objects that viewports or final images show, with their world matrices; members of an instanced collection once
-    per instance.
-
-    view: the 3D viewport (a SpaceView3D) that shows them, None for a final image.
-    """
-    if view is None:
-        visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
-    else:
-        visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
-    for each in visible:
-        yield from _with_instances(each, depsgraph, Matrix())
 
 
 def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
@@ -113,6 +103,7 @@ def _is_rendered(candidate: Any, depsgraph: Any) -> bool:
 
 
 def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iterator[tuple[Any, Matrix]]:
+    """An object and its world matrix; of an instanced collection also its members, once per instance."""
     matrix = parent_matrix @ visible.evaluated_get(depsgraph).matrix_world
     yield visible, matrix
     collection = visible.instance_collection if visible.instance_type == "COLLECTION" else None

@@ -221,8 +221,11 @@ def combined(
 def srgb_background(scene: Any) -> tuple[float, float, float] | None:
     """Color behind the splats as in `scene_background`, in sRGB 0…1."""
     linear = scene_background(scene)
-    if linear is None:
-        return None
+    return None if linear is None else srgb(linear)
+
+
+def srgb(linear: Any) -> tuple[float, float, float]:
+    """sRGB 0…1 of a scene-linear color."""
     red, green, blue = linear_to_srgb(np.clip(np.array(linear, np.float64), 0, 1)).tolist()
     return red, green, blue
 

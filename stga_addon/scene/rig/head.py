@@ -1,6 +1,5 @@
 """The tracked head as an animated Blender mesh, and meshes with shape keys as linear head models."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,10 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
         meshes[row] = capture.mesh(timestep)
     head = _place_head(capture)
     remove_rig(head)
-    _add_timestep_keys(head, capture.timesteps, meshes)
+    names = [f"t{timestep:05d}" for timestep in capture.timesteps]
+    for key_name, mesh in zip(names, meshes, strict=True):
+        head.shape_key_add(name=key_name, from_mix=False).points.foreach_set("co", mesh.ravel())
+    write_triangle_curves(head.data.shape_keys, names, capture.timesteps)
     return head
 
 
@@ -67,14 +69,6 @@ def _update_mesh(head: Any, capture: Capture) -> None:
         timestep = tags.group_timestep(group.name)
         if timestep is not None and timestep not in capture.timesteps:
             head.vertex_groups.remove(group)
-
-
-def _add_timestep_keys(head: Any, timesteps: Sequence[int], meshes: np.ndarray) -> None:
-    """meshes (T, V, 3) float32 in object space."""
-    names = [f"t{timestep:05d}" for timestep in timesteps]
-    for key_name, mesh in zip(names, meshes, strict=True):
-        head.shape_key_add(name=key_name, from_mix=False).points.foreach_set("co", mesh.ravel())
-    write_triangle_curves(head.data.shape_keys, names, timesteps)
 
 
 def has_shape_keys(thing: Any) -> bool:

@@ -25,6 +25,15 @@ EXPRESSION_NAMES = "stga_expressions"
 # The joints that each part of a motion (`flame.motion.PARTS`) rotates.
 PART_JOINTS = {"jaw": ("jaw",), "eyes": ("left_eye", "right_eye"), "neck": ("neck",), "head": ("root",)}
 ROOT_LOCATION = 'pose.bones["root"].location'
+identity_key = f"{IDENTITY_KEY}{{:03d}}".format
+offset_key = f"{OFFSET_KEY}{{:05d}}".format
+# The hidden bones of a joint whose position depends on the sliders: that moves its bone, and that its vertices follow.
+parent_bone, deform_bone = "{}_joint".format, "{}_deform".format
+# Properties of the rig: partial sums of the joint's displacement by the sliders, and that by tracked vertex offsets.
+sum_property, offset_property = "stga_{}_sums".format, "stga_{}_offset".format
+# Data paths of a property, of bones, and of a shape key.
+property_path, key_value_path = '["{}"]'.format, 'key_blocks["{}"].value'.format
+rotation_path, location_path = 'pose.bones["{}"].rotation_quaternion'.format, 'pose.bones["{}"].location'.format
 
 
 def expression_key(head: Any, component: int) -> str:
@@ -38,14 +47,6 @@ def is_expression_key(name: str) -> bool:
     return name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES
 
 
-def identity_key(component: int) -> str:
-    return f"{IDENTITY_KEY}{component:03d}"
-
-
-def offset_key(timestep: int) -> str:
-    return f"{OFFSET_KEY}{timestep:05d}"
-
-
 def slider_components(model: FlameModel) -> dict[str, int]:
     """Shape key -> component of `model.shapedirs`: every expression, and the first `IDENTITY_SLIDERS` of identity."""
     names = model.expression_names or [f"{EXPRESSION_KEY}{k:03d}" for k in range(model.n_expression)]
@@ -56,42 +57,6 @@ def slider_components(model: FlameModel) -> dict[str, int]:
 def offset_keys(head: Any) -> list[Any]:
     """The shape keys that hold tracked per-frame vertex offsets."""
     return [key for key in head.data.shape_keys.key_blocks if key.name.startswith(OFFSET_KEY)]
-
-
-def parent_bone(joint: str) -> str:
-    """The hidden bone that moves the bone of a joint whose position depends on the sliders."""
-    return f"{joint}_joint"
-
-
-def deform_bone(joint: str) -> str:
-    """The hidden bone that the vertices of such a joint follow."""
-    return f"{joint}_deform"
-
-
-def sum_property(joint: str) -> str:
-    """Property of the rig: partial sums of the joint's displacement by the sliders."""
-    return f"stga_{joint}_sums"
-
-
-def offset_property(joint: str) -> str:
-    """Property of the rig: the joint's displacement by the tracked per-frame vertex offsets."""
-    return f"stga_{joint}_offset"
-
-
-def property_path(name: str) -> str:
-    return f'["{name}"]'
-
-
-def rotation_path(bone: str) -> str:
-    return f'pose.bones["{bone}"].rotation_quaternion'
-
-
-def location_path(bone: str) -> str:
-    return f'pose.bones["{bone}"].location'
-
-
-def key_value_path(shape_key: str) -> str:
-    return f'key_blocks["{shape_key}"].value'
 
 
 def is_of_parts(data_path: str, parts: Sequence[str]) -> bool:

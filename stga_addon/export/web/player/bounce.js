@@ -1,5 +1,5 @@
 // @ts-check
-// Light that a head reflects onto itself. The rules are those of STGA for Blender's light/transfer.py.
+// Light that a head reflects onto itself. The rules are those of STGA for Blender's light/surface.py.
 
 import { box } from './vector.js';
 
