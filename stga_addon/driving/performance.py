@@ -129,13 +129,12 @@ def resampled(performance: Performance, fps: float | None = None) -> Performance
     rate = performance.fps if fps is None else fps
     count = int(np.floor(performance.times[-1] * rate + 1e-6)) + 1
     times = np.arange(count) / rate
-    return replace(
-        performance,
-        times=times,
-        weights=_interpolated(times, performance.times, performance.weights),
-        head=None if performance.head is None else _interpolated(times, performance.times, performance.head),
-        fps=rate,
-    )
+
+    def interpolated(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(times, performance.times, column) for column in values.T], axis=1)
+
+    head = None if performance.head is None else interpolated(performance.head)
+    return Performance(times, interpolated(performance.weights), head, rate)
 
 
 def mirrored(performance: Performance) -> Performance:
@@ -191,10 +190,6 @@ def relative_to(performance: Performance, rest: Performance) -> Performance:
 def parts_kept(performance: Performance, parts: tuple[str, ...]) -> Performance:
     """The performance with the weights of other parts at zero."""
     return amplified(performance, {part: 1.0 if part in parts else 0.0 for part in (*PARTS, "head")})
-
-
-def _interpolated(times: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
 
 
 @dataclass(frozen=True)

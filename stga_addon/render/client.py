@@ -65,7 +65,12 @@ class RenderClient:
                     cast(BinaryIO, pipe).close()
 
     def _request(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool) -> ComposedImage:
-        python, server = self._server or self._start()
+        if self._server is None:
+            python, self._server_device = self._python(), self._find_device()
+            arguments = ["stga_addon.render.server", self._server_device]
+            started = start_python(python, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            self._server = python, started
+        python, server = self._server
         request = {**pack_camera(camera), "with_depth": with_depth}
         if layers is not self._sent:
             request |= pack_layers(layers)
@@ -79,12 +84,6 @@ class RenderClient:
         if "error" in reply:
             raise StgaError(f"{python}: the render server could not render the image ({reply['error']})")
         return ComposedImage(reply["rgb"], reply["alpha"], reply["depth"] if with_depth else None)
-
-    def _start(self) -> tuple[str, subprocess.Popen[bytes]]:
-        python, self._server_device = self._python(), self._find_device()
-        arguments = ["stga_addon.render.server", self._server_device]
-        self._server = python, start_python(python, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        return self._server
 
     def _python(self) -> str:
         try:

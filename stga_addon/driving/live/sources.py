@@ -49,10 +49,6 @@ def _single(decode: Callable[[bytes], FacePacket | None]) -> Callable[[bytes, An
     return decoded
 
 
-def _decode_vmc(data: bytes, known: Any) -> Decoded | None:
-    return vmc.decode(data, known or vmc.Received())
-
-
 SOURCES = {
     "live_link_face": Source(
         "Live Link Face",
@@ -70,7 +66,7 @@ SOURCES = {
     "vmc": Source(
         "VMC (OSC)",
         39539,
-        _decode_vmc,
+        lambda data, known: vmc.decode(data, known or vmc.Received()),
         hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are left out",
     ),
 }
@@ -221,7 +217,11 @@ class Stream:
         if packet is None:
             return None
         sender = (address, packet.subject)
-        self._choose(sender, now)
+        _remember(self.senders, sender, now)
+        if self.chosen is None and sender != self.followed:  # followed where nobody else is to be
+            silent = self.silent_s(now)
+            if self.followed is None or silent is None or silent > SILENCE_S:
+                self._start(sender)
         if sender != self.followed or not self._is_next(packet.time):
             return None
         self._arrivals.append((now, packet.time))
@@ -248,15 +248,6 @@ class Stream:
         delay = offsets[-1] - min(offsets) if offsets else None
         return Health(rate, self.lost if offsets else None, self.late, self.foreign, delay)
 
-    def _choose(self, sender: Sender, now: float) -> None:
-        """Note the sender, and follow it where nobody else is to be followed."""
-        _remember(self.senders, sender, now)
-        if self.chosen is not None or sender == self.followed:
-            return
-        silent = self.silent_s(now)
-        if self.followed is None or silent is None or silent > SILENCE_S:
-            self._start(sender)
-
     def _start(self, sender: Sender) -> None:
         if sender != self.followed:
             self.followed = sender
@@ -278,16 +269,13 @@ class Stream:
         if before is not None and time < before:
             self._forget_clock()
         elif before is not None:
-            self._count_lost(time - before)
-        self._time = time
-        return True
-
-    def _count_lost(self, step: float) -> None:
-        if self._steps:
-            steps = step / median(self._steps)
+            step = time - before
+            steps = step / median(self._steps) if self._steps else 0.0
             if steps > GAP and step < PAUSE_S:
                 self.lost += round(steps) - 1
-        self._steps.append(step)
+            self._steps.append(step)
+        self._time = time
+        return True
 
 
 def _remember(table: OrderedDict[Any, Any], key: Any, value: Any) -> None:

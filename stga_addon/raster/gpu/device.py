@@ -179,11 +179,6 @@ class Device:
         return Recording(self)
 
     @staticmethod
-    def groups(threads: int) -> tuple[int, int, int]:
-        """Workgroups for at least so many threads; `thread_number` in WGSL numbers them."""
-        return Device.groups_of(-(-threads // WORKGROUP))
-
-    @staticmethod
     def groups_of(workgroups: int) -> tuple[int, int, int]:
         """At least so many workgroups, in rows of a length that every adapter allows."""
         rows = max(1, -(-workgroups // MAX_GROUPS))
@@ -221,7 +216,7 @@ class Recording:
         """Run `Device.kernel` with those of the tables that it uses, by at least so many threads or workgroups."""
         kernel, groups = self.device.kernel(name, **constants), threads
         if isinstance(groups, int):
-            groups = self.device.groups(groups)
+            groups = self.device.groups_of(-(-groups // WORKGROUP))  # `thread_number` in WGSL numbers the threads
         indirect = not isinstance(groups[0], int)
         if not indirect and 0 in groups:
             return
