@@ -61,8 +61,16 @@ def apply_motion(
     one that cannot take the motion; nothing is changed then.
     """
     rig = rig_of(head)
-    _check_rig(head, rig, frames, parts)
-    frames = [replace(frame, expr=_for_all_sliders(head, frame.expr)) for frame in frames]
+    check_keyable(rig, JOINTS)
+    check_keyable(head.data.shape_keys)
+    used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
+    for component in np.flatnonzero(used).tolist():
+        if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
+            raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
+    # Coefficients of the sliders that the motion lacks are zero.
+    sliders = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
+    padded = [np.pad(frame.expr[:sliders], (0, max(0, sliders - len(frame.expr)))) for frame in frames]
+    frames = [replace(frame, expr=expr) for frame, expr in zip(frames, padded, strict=True)]
     owners = animated_by(head, rig, parts)
     for owner in owners:
         start_action(owner, f"{owner.name} {name}", lambda path: is_of_parts(path, parts), as_strip)
@@ -80,21 +88,6 @@ def apply_motion(
             push_down_action(owner, extrapolation="NOTHING")
 
 
-def _for_all_sliders(head: Any, expr: np.ndarray) -> np.ndarray:
-    """(K,) coefficients of the head's K expression sliders; those that `expr` lacks are zero."""
-    count = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
-    return np.pad(expr[:count], (0, max(0, count - len(expr))))
-
-
-def _check_rig(head: Any, rig: Any, frames: Sequence[FlameFrame], parts: Sequence[str]) -> None:
-    check_keyable(rig, JOINTS)
-    check_keyable(head.data.shape_keys)
-    used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
-    for component in np.flatnonzero(used).tolist():
-        if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
-            raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
-
-
 def sample_motion(
     head: Any, sequence: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning
 ) -> FlameSequence:
@@ -109,7 +102,11 @@ def sample_motion(
     shape, largest_error = sequence.shape, 0.0
     for _ in iterate_frames(numbers):
         frame = _sample_frame(head, rig, sequence.model)
-        shape = shape if frames else _identity(head, sequence)
+        if not frames:
+            shape = shape.copy()
+            for name, component in slider_components(sequence.model).items():
+                if component < sequence.model.n_identity:
+                    shape[component] += _key_value(head, name)
         vertices = flame_forward(sequence.model, shape, frame, sequence.static_offset)
         largest_error = max(largest_error, float(np.abs(vertices - evaluated_vertices(head)).max()))
         frames.append(frame)
@@ -144,14 +141,6 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
         eyes_pose=np.concatenate([vectors["left_eye"], vectors["right_eye"]]),
         dynamic_offset=_dynamic_offset(head),
     )
-
-
-def _identity(head: Any, sequence: FlameSequence) -> np.ndarray:
-    shape = sequence.shape.copy()
-    for name, component in slider_components(sequence.model).items():
-        if component < sequence.model.n_identity:
-            shape[component] += _key_value(head, name)
-    return np.asarray(shape)
 
 
 def _key_value(head: Any, name: str) -> float:
