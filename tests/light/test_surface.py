@@ -1,12 +1,15 @@
-"""Where splats are on the mesh, against trimesh's nearest points."""
+"""Where splats lie on the mesh, against trimesh's nearest points; transfer and occlusion, against cast rays."""
 
 from dataclasses import replace
 
 import numpy as np
 import trimesh
 
-from light.scenes import lit_avatar
-from stga_addon.light.surface import surface_points
+from light.scenes import ball_and_plate, blocked, lit_avatar
+from stga_addon.capture.mesh_geometry import vertex_normals
+from stga_addon.light.harmonics import LAMBERT, basis, even_directions
+from stga_addon.light.lamps import LIFT_M
+from stga_addon.light.surface import surface_points, transfer_of
 
 
 def test_splats_are_at_the_nearest_point_of_the_mesh():
@@ -31,3 +34,29 @@ def test_splats_are_at_the_nearest_point_of_the_mesh():
     assert (away < 1.2 * least + 1e-4).mean() > 0.95
     assert (away <= own + 1e-9).all()
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
+
+
+def test_transfer_and_occlusion_are_those_of_cast_rays():
+    """Catches depth maps that are mirrored, too coarse, or that let the surface shade itself."""
+    vertices, faces = ball_and_plate(2)
+    transfer, occlusion = transfer_of(vertices, faces, directions=48)
+    normals, sky = vertex_normals(vertices, faces), even_directions(48)
+    points = vertices + LIFT_M * normals
+    seen = np.stack([~blocked(points, direction, vertices, faces) for direction in sky])
+    cosine = np.maximum(sky @ normals.T, 0)
+    expected = (seen * cosine).T @ basis(sky) * 4 * np.pi / len(sky)
+    np.testing.assert_allclose(occlusion, (seen * cosine).sum(0) / cosine.sum(0), atol=0.12)
+    assert np.abs(occlusion - (seen * cosine).sum(0) / cosine.sum(0)).mean() < 0.008
+    assert np.abs(transfer - expected).mean() < 0.01
+    assert occlusion[:162].min() < 0.7, "the plate hides no sky"
+
+
+def test_an_open_surface_receives_the_closed_form():
+    """Catches harmonics of another order or sign, and a wrong solid angle."""
+    vertices, faces = ball_and_plate(3)
+    transfer, occlusion = transfer_of(vertices, faces)
+    normals = vertex_normals(vertices, faces)
+    below = (normals[:, 1] < -0.3) & (np.linalg.norm(vertices, axis=1) < 0.1001)
+    assert below.sum() > 100
+    np.testing.assert_allclose(transfer[below], basis(normals[below]) * LAMBERT, atol=0.03)
+    np.testing.assert_allclose(occlusion[below], 1, atol=0.01)

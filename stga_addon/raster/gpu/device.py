@@ -7,7 +7,6 @@ Work is recorded into one command encoder and submitted at once; nothing waits f
 import logging
 import re
 import weakref
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import wgpu
-from wgpu.backends.wgpu_native import lib
 
 from ...errors import DeviceError, StgaError
 from .adapters import adapters, is_software
@@ -52,7 +50,7 @@ class Device:
     """Buffers by name on one adapter; devices of the same adapter share its connection and compiled kernels.
 
     dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
-    kernel_times                times the kernels while it is set
+    kernel_times                times the kernels while it is set (`KernelTimes` of benchmarks/gpu_kernels.py)
     failures                    what the driver raised while results were awaited
     """
 
@@ -69,7 +67,7 @@ class Device:
             self.gpu, self._kernels, self.failures = _open(self.name)
         self.max_bytes = min(self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"])
         self.dispatches = self.submits = self.waits = 0
-        self.kernel_times: KernelTimes | None = None
+        self.kernel_times: Any = None
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, list[Any]]] = {}
 
@@ -392,53 +390,3 @@ def _full_memory(name: str) -> DeviceError:
         f"the memory of {name} is full",
         "close other programs that use it, use smaller images or fewer splats, or continue on the CPU (--device cpu)",
     )
-
-
-MAX_DISPATCHES = 2048
-"""Dispatches that are timed between two readings; later ones are not."""
-_PER_RESOLVE = 32
-"""Stamps copied at a time: their places in the buffer are multiples of 256 bytes."""
-
-
-class KernelTimes:
-    """Times what is recorded for a device while this is its `kernel_times`, each dispatch in a pass of its own."""
-
-    def __init__(self, gpu: Any) -> None:
-        """gpu: `Device.gpu`. Raises ValueError where the adapter has no timestamps."""
-        if "timestamp-query" not in gpu.features:
-            raise ValueError(f"{gpu.adapter.info['device']} has no timestamp queries")
-        self._gpu, self._names = gpu, list[str]()
-        self._resolved = 0
-        self._queries = gpu.create_query_set(type="timestamp", count=2 * MAX_DISPATCHES)
-        usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
-        self._stamps = gpu.create_buffer(size=16 * MAX_DISPATCHES, usage=usage)
-        self._period_ns = float(lib.wgpuQueueGetTimestampPeriod(gpu.queue._internal))
-
-    def writes(self, name: str) -> dict[str, Any] | None:
-        """The `timestamp_writes` of the pass that the next dispatch is alone in."""
-        first = 2 * len(self._names)
-        if first == 2 * MAX_DISPATCHES:
-            return None
-        self._names.append(name)
-        indices = {"beginning_of_pass_write_index": first, "end_of_pass_write_index": first + 1}
-        return {"query_set": self._queries, **indices}
-
-    def resolve(self, encoder: Any) -> None:
-        """Record that the stamps written since the last call are copied where `read` finds them."""
-        end = 2 * len(self._names)
-        for start in range(2 * self._resolved // _PER_RESOLVE * _PER_RESOLVE, end, _PER_RESOLVE):
-            count = min(_PER_RESOLVE, end - start)
-            encoder.resolve_query_set(self._queries, start, count, self._stamps, 8 * start)
-        self._resolved = len(self._names)
-
-    def read(self) -> dict[str, float]:
-        """kernel -> milliseconds since the last call, after all submitted work, longest first."""
-        total: Counter[str] = Counter()
-        if self._names:
-            data = self._gpu.queue.read_buffer(self._stamps, 0, 16 * len(self._names))
-            stamps = np.frombuffer(data, np.uint64).reshape(-1, 2)
-            for name, (begin, end) in zip(self._names, stamps.tolist(), strict=True):
-                total[name] += 1e-6 * self._period_ns * max(end - begin, 0)
-        self._names.clear()
-        self._resolved = 0
-        return dict(total.most_common())
