@@ -357,6 +357,7 @@ def _source(name: str) -> str:
     return files(__package__).joinpath(f"{name}.wgsl").read_text(encoding="utf-8")
 
 
+@cache
 def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
     """The text of an entry point with the functions that it calls, and index and kind of each table that they use.
 
