@@ -30,6 +30,7 @@ _BINDING = re.compile(
     r"^@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)(.*)$", re.M
 )
 _FUNCTION = re.compile(r"(?:^@compute[^\n]*\n)?^fn (\w+)(.*?)^\}", re.M | re.S)
+_WRITTEN = re.compile(r"^\s*(\w+)\[[^=;\n]*\][.\w]* [-+*|]?=\s|&(\w+)", re.M)
 _LAYOUT_TYPE = {"uniform": "uniform", "storage, read": "read-only-storage", "storage, read_write": "storage"}
 
 Groups = tuple[int, int, int] | tuple[Any, int]
@@ -371,13 +372,14 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
         called = {name for each in left for name in re.findall(r"\w+(?=\()", bodies[each])}
         left = called & bodies.keys() - reached
     body = "".join(bodies[name] for name in sorted(reached))
+    used, assigned = set(re.findall(r"(?<![.\w])\w+", body)), {name for pair in _WRITTEN.findall(body) for name in pair}
     tables: dict[str, tuple[int, str]] = {}
 
     def declare(found: re.Match[str]) -> str:
         index, kind, name, rest = found.groups()
-        if not re.search(rf"(?<![.\w]){name}\b", body):
+        if name not in used:
             return ""
-        if kind == "storage, read_write" and not re.search(rf"\b{name}\[[^=;]*\][.\w]* [-+*|]?=\s|&{name}\b", body):
+        if kind == "storage, read_write" and name not in assigned:
             kind = "storage, read"
         tables[name] = int(index), _LAYOUT_TYPE[kind]
         return f"@group(0) @binding({index}) var<{kind}> {name}{rest}"
