@@ -53,7 +53,7 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
     state.steps += np.arange(len(state), dtype=np.int32) % 7
     state.unbound[::5] = True
     state.unseen_share[::5] = 0.7
-    shape = len(capture.faces), 3, 3
+    rng, shape = np.random.default_rng(5), (len(capture.faces), 3, 3)
     state.driven_offsets["strain_position"] = OffsetState(
         value=rng.normal(0, 2e-3, shape).astype(np.float32),
         first=np.zeros(shape, np.float32),
