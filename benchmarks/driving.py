@@ -26,10 +26,9 @@ from driving.heads import generated_flame, random_poses
 
 from stga_addon.driving.head_map import HeadMap, head_map
 from stga_addon.driving.inverse import arkit_weights
-from stga_addon.driving.names import ARKIT_SHAPES
-from stga_addon.driving.performance import Performance
+from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral
+from stga_addon.driving.performance import ARKIT_SHAPES, Performance
 from stga_addon.driving.shapes import effective_weights, face_shapes
-from stga_addon.driving.transfer import exchanged_neutral, quiet_neutral
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import JOINTS, FlameModel
 from stga_addon.flame.sequence import FlameSequence, with_identity

@@ -1,23 +1,75 @@
 """What an iteration costs a GPU, kernel by kernel: the part of `iteration.py --device gpu`."""
 
 import statistics
+from collections import Counter
 from dataclasses import replace
 from time import perf_counter, thread_time
+from typing import Any
 
 import numpy as np
+import wgpu
+from wgpu.backends.wgpu_native import lib
 
 from stga_addon.raster.cpu.layout import PROJECTED
 from stga_addon.raster.cpu.rasterize import tile_grid
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import COUNTS, DIGIT_BITS, NEEDED
-from stga_addon.raster.gpu.tiles import counts_buffer
-from stga_addon.raster.gpu.timing import KernelTimes
+from stga_addon.raster.gpu.rasterize import counts_buffer
 from stga_addon.training.optimize.backend import Batch
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 
 COPIED_BYTES, COPIES = 1 << 26, 8
 SPLAT_WORDS = 59
 """Words of a splat of SH degree 3."""
+
+MAX_DISPATCHES = 2048
+"""Dispatches that are timed between two readings; later ones are not."""
+_PER_RESOLVE = 32
+"""Stamps copied at a time: their places in the buffer are multiples of 256 bytes."""
+
+
+class KernelTimes:
+    """Times what is recorded for a device while this is its `kernel_times`, each dispatch in a pass of its own."""
+
+    def __init__(self, gpu: Any) -> None:
+        """gpu: `Device.gpu`. Raises ValueError where the adapter has no timestamps."""
+        if "timestamp-query" not in gpu.features:
+            raise ValueError(f"{gpu.adapter.info['device']} has no timestamp queries")
+        self._gpu, self._names = gpu, list[str]()
+        self._resolved = 0
+        self._queries = gpu.create_query_set(type="timestamp", count=2 * MAX_DISPATCHES)
+        usage = wgpu.BufferUsage.QUERY_RESOLVE | wgpu.BufferUsage.COPY_SRC
+        self._stamps = gpu.create_buffer(size=16 * MAX_DISPATCHES, usage=usage)
+        self._period_ns = float(lib.wgpuQueueGetTimestampPeriod(gpu.queue._internal))
+
+    def writes(self, name: str) -> dict[str, Any] | None:
+        """The `timestamp_writes` of the pass that the next dispatch is alone in."""
+        first = 2 * len(self._names)
+        if first == 2 * MAX_DISPATCHES:
+            return None
+        self._names.append(name)
+        indices = {"beginning_of_pass_write_index": first, "end_of_pass_write_index": first + 1}
+        return {"query_set": self._queries, **indices}
+
+    def resolve(self, encoder: Any) -> None:
+        """Record that the stamps written since the last call are copied where `read` finds them."""
+        end = 2 * len(self._names)
+        for start in range(2 * self._resolved // _PER_RESOLVE * _PER_RESOLVE, end, _PER_RESOLVE):
+            count = min(_PER_RESOLVE, end - start)
+            encoder.resolve_query_set(self._queries, start, count, self._stamps, 8 * start)
+        self._resolved = len(self._names)
+
+    def read(self) -> dict[str, float]:
+        """kernel -> milliseconds since the last call, after all submitted work, longest first."""
+        total: Counter[str] = Counter()
+        if self._names:
+            data = self._gpu.queue.read_buffer(self._stamps, 0, 16 * len(self._names))
+            stamps = np.frombuffer(data, np.uint64).reshape(-1, 2)
+            for name, (begin, end) in zip(self._names, stamps.tolist(), strict=True):
+                total[name] += 1e-6 * self._period_ns * max(end - begin, 0)
+        self._names.clear()
+        self._resolved = 0
+        return dict(total.most_common())
 
 
 def wait(device: Device) -> None:
@@ -88,19 +140,19 @@ def least_bytes(splats: int, pixels: int, tiles: int, pairs: int) -> dict[str, i
     row, projected = 4 * SPLAT_WORDS, 4 * PROJECTED
     sorted_keys = splats * -(-32 // DIGIT_BITS) + pairs * -(-tiles.bit_length() // DIGIT_BITS)
     return {
-        "project.main": splats * (row + projected + 24),
+        "project.forward": splats * (row + projected + 24),
         "sort.count": 4 * sorted_keys,
         "sort.scatter": 16 * sorted_keys,
-        "count_pairs.count": splats * 24,
-        "fill_pairs.main": splats * 36 + pairs * 8,
-        "tile_lists.main": pairs * 4,
-        "blend_forward.main": pairs * (8 + projected) + pixels * 20,
+        "tiles.count_pairs": splats * 24,
+        "tiles.fill_pairs": splats * 36 + pairs * 8,
+        "tiles.find_ranges": pairs * 4,
+        "blend.forward": pairs * (8 + projected) + pixels * 20,
         "image_loss.gradient": pixels * 27,
-        "blend_backward.main": pairs * (8 + 2 * projected) + pixels * 20,
-        "project_backward.main": pairs * projected + splats * (2 * row + projected + 16),
-        "limits.measure": splats * 40,
-        "rows.main": splats * (row + 40),
-        "adam.main": splats * (9 * row + 20),
+        "blend.backward": pairs * (8 + 2 * projected) + pixels * 20,
+        "project.backward": pairs * projected + splats * (2 * row + projected + 16),
+        "optimizer.measure_excess": splats * 40,
+        "optimizer.prepare": splats * (row + 40),
+        "optimizer.adam": splats * (9 * row + 20),
     }
 
 

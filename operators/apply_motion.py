@@ -11,21 +11,20 @@ from ..stga_addon.capture.open import open_capture
 from ..stga_addon.driving.head_map import head_turns
 from ..stga_addon.driving.open_motion import (
     MotionOptions,
+    TrainedRange,
     adapted,
     parsed_gain,
     performed,
     prepared_performance,
+    trained_range,
 )
 from ..stga_addon.driving.performance import EXCHANGEABLE, parts_kept
 from ..stga_addon.driving.read_performance import is_performance, read_performance
-from ..stga_addon.driving.transfer import TrainedRange, trained_range
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
-from ..stga_addon.scene.rig.live_pose import WEIGHT_RANGE
-from ..stga_addon.scene.rig.motion import apply_motion, sample_motion
-from ..stga_addon.scene.rig.trained import store_range, stored_range
+from ..stga_addon.scene.rig.motion import WEIGHT_RANGE, apply_motion, sample_motion, store_range, stored_range
 from . import ids
 from .common import (
     FileImport,

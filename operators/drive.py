@@ -6,13 +6,10 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.driving.head_map import head_map
-from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES, Receiver, leaves_this_machine
-from ..stga_addon.driving.live.stream import Recording
-from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S, MotionOptions
-from ..stga_addon.driving.transfer import trained_range
+from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES, Receiver, Recording, leaves_this_machine
+from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S, MotionOptions, trained_range
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.rig.live_pose import LivePose
-from ..stga_addon.scene.rig.trained import store_range, stored_range
+from ..stga_addon.scene.rig.motion import LivePose, store_range, stored_range
 from . import ids, live_session
 from .apply_motion import exchange_property
 from .common import (

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.scene.camera_export import export_cameras
+from ..stga_addon.scene.cameras import export_cameras
 from . import ids
 from .common import file_filter, file_path, path_property, reporting
 

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
-from ..stga_addon.scene.shape_keys import has_shape_keys, shape_key_model
+from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
 from . import ids
 from .common import file_filter, file_path, polled, reporting

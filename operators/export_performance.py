@@ -6,8 +6,8 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.driving.inverse import captured_performance, write_performance
+from ..stga_addon.scene.blend_file import frames_per_second
 from ..stga_addon.scene.rig.motion import sample_motion
-from ..stga_addon.scene.timeline import frames_per_second
 from . import ids
 from .common import capture_of, file_filter, file_path, flame_of, head_of, needs_rig, path_property, reporting
 

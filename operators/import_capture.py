@@ -10,10 +10,10 @@ from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.avatar_scene import frame_head
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
 from ..stga_addon.scene.objects import COLLECTIONS, capture_root, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.head import import_head
-from ..stga_addon.scene.viewports import frame_head
 from ..stga_addon.tracking.folder import is_tracked
 from . import ids
 from .common import (

@@ -13,13 +13,20 @@ from bpy.app.handlers import persistent
 
 from ..stga_addon.driving.head_map import HeadMap, head_turns
 from ..stga_addon.driving.inverse import write_performance
-from ..stga_addon.driving.live.sources import REQUEST_INTERVAL_S, Receiver
-from ..stga_addon.driving.live.stream import RESTING_PACKETS, Recording, Stream, eased, resting, row_of
-from ..stga_addon.driving.open_motion import MotionOptions, at_strength, corrected, frames_of
+from ..stga_addon.driving.live.sources import (
+    REQUEST_INTERVAL_S,
+    RESTING_PACKETS,
+    Receiver,
+    Recording,
+    Stream,
+    eased,
+    resting,
+    row_of,
+)
+from ..stga_addon.driving.open_motion import MotionOptions, TrainedRange, at_strength, corrected, frames_of
 from ..stga_addon.driving.performance import EXCHANGEABLE, FacePacket, Performance
-from ..stga_addon.driving.transfer import TrainedRange
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.rig.live_pose import LivePose
+from ..stga_addon.scene.rig.motion import LivePose
 from . import ids, monitor
 
 TICK_S = 1 / 60

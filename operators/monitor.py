@@ -26,7 +26,7 @@ from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.report import curve_image
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.viewports import open_sidebar
+from ..stga_addon.scene.avatar_scene import open_sidebar
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics

@@ -5,9 +5,8 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.scene.display.display_modes import LIMITS, POINTS, QUADS
-from ..stga_addon.scene.display.hints import shows_nodes, use_transparent_bounces, view_transform_hint
 from ..stga_addon.scene.display.splat_nodes import DISPLAY
-from ..stga_addon.scene.display.splat_object import set_input
+from ..stga_addon.scene.display.splat_object import set_input, shows_nodes, use_transparent_bounces, view_transform_hint
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from . import ids
 from .common import polled, reporting

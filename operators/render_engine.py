@@ -9,7 +9,7 @@ from .training_python import training_python
 
 
 def render_device() -> str:
-    """The rendering device in the preferences, as `render.compose.Composer` takes it."""
+    """The rendering device in the preferences, as `render.device.Composer` takes it."""
     stored = preferences(bpy.context)
     return str(stored.render_device) if stored else "auto"
 

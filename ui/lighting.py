@@ -9,11 +9,10 @@ from bpy.app.handlers import persistent
 from ..operators import ids
 from ..operators.common import scene_settings
 from ..stga_addon.jobs.table import Kind
-from ..stga_addon.scene.display.hints import shows_nodes
-from ..stga_addon.scene.display.splat_object import stored_light
+from ..stga_addon.scene.display.splat_object import shows_nodes, stored_light
+from ..stga_addon.scene.light.lights import world_light
 from ..stga_addon.scene.light.settings import lighting_settings
-from ..stga_addon.scene.light.world import world_light
-from ..stga_addon.scene.render.frame_colors import light_hint
+from ..stga_addon.scene.render.scene_splats import light_hint
 from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text

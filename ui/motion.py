@@ -7,10 +7,10 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, rig_or_none, scene_settings
-from ..stga_addon.driving.names import ARKIT_SHAPES
+from ..stga_addon.driving.performance import ARKIT_SHAPES
 from ..stga_addon.scene.rig.arkit import has_controls
-from ..stga_addon.scene.rig.names import IDENTITY_KEY, is_expression_key, property_path
-from ..stga_addon.scene.rig.trained import outside_now, stored_range
+from ..stga_addon.scene.rig.keyframes import IDENTITY_KEY, is_expression_key, property_path
+from ..stga_addon.scene.rig.motion import outside_now, stored_range
 from .sidebar import SidebarPanel
 
 MAX_SLIDERS = 10  # the first components vary most

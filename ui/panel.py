@@ -11,8 +11,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
-from ..stga_addon.scene.display.hints import view_transform_hint
-from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier
+from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier, view_transform_hint
 from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.render import viewport_display
 from . import lighting

@@ -33,7 +33,7 @@ class AvatarLight:
 
     radiance    (9, 3) float32: light of the capture, spherical harmonics of linear radiance (`light.harmonics.basis`)
                 in the axes of the capture
-    transfer    (V, 9) float32: irradiance is transfer @ radiance; with the head's own shadow (`light.transfer`)
+    transfer    (V, 9) float32: irradiance is transfer @ radiance; with the head's own shadow (`light.surface`)
     occlusion   (V,) float32, 0…1: cosine-weighted share of the sky that the head leaves open
     irradiance  (V, 3) float32: of the capture, with light that the head reflects onto itself, mean over its timesteps;
                 an albedo is π times linear color over this

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..driving.names import ARKIT_SHAPES, OPTIONAL
+from ..driving.performance import ARKIT_SHAPES, OPTIONAL
 from ..driving.shapes import SHAPES_FILE
 from ..files import read_npz, write_npz
 from ..tracking.correspondence import calibrate

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..driving.names import ARKIT_SHAPES, OPTIONAL
+from ..driving.performance import ARKIT_SHAPES, OPTIONAL
 from ..files import read_npz, write_npz
 from ..flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M
 from .arkit_shapes import METERS_PER_UNIT, ict_names

@@ -1,6 +1,5 @@
 """A performance from a video of a face: the scores of the face networks, frame by frame."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,7 @@ from ..progress import Cancelled, Progress, Report
 from ..tracking.face_networks import FaceNetworks
 from ..tracking.footage.video import VideoFrames, read_video
 from .inverse import head_angles
-from .names import COLUMN, COUNT, arkit_name
-from .performance import Performance
+from .performance import COLUMN, COUNT, Performance, arkit_name
 from .shapes import face_shapes
 
 CAMERA_FIELD_OF_VIEW_DEG = 63.0
@@ -40,23 +38,15 @@ def watched_performance(path: Path, report: Report) -> Performance:
         found = networks.score(image)
         if found is not None:
             times.append(timestep / video.fps)
-            rows.append(_weights(found.weights))
+            # The network's names have `_neutral` and lack tongueOut.
+            scores = {COLUMN[known]: s for name, s in found.weights.items() if (known := arkit_name(name)) is not None}
+            rows.append([scores.get(column, 0.0) for column in range(COUNT)])
             rotations.append(head_rotation(found.points, (image.shape[0], image.shape[1])))
     if not rows:
         raise StgaError(f"{path}: no face was found in any of its {len(frames.timesteps)} frames")
     turned = np.stack(rotations) @ rotations[0].T
     head = head_angles(to_axis_angle(from_matrices(turned)))
-    return Performance(np.array(times) - times[0], np.stack(rows), head, video.fps)
-
-
-def _weights(scores: Mapping[str, float]) -> np.ndarray:
-    """(52,) of the network's names, which has `_neutral` and lacks tongueOut."""
-    weights = np.zeros(COUNT)
-    for name, score in scores.items():
-        known = arkit_name(name)
-        if known is not None:
-            weights[COLUMN[known]] = score
-    return weights
+    return Performance(np.array(times) - times[0], np.array(rows, np.float64), head, video.fps)
 
 
 def head_rotation(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:

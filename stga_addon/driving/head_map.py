@@ -14,8 +14,7 @@ from ..flame.model import JOINTS, FlameModel
 from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.posed_points import PosedPoints, SurfacePoints
-from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
-from .performance import Performance
+from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
 from .shapes import JAW_OPEN, MOUTH_CLOSE, effective_weights, face_points, face_shapes
 
 JAW_SHAPES = ("jawOpen", "jawLeft", "jawRight")
@@ -105,19 +104,13 @@ def head_map(sequence: FlameSequence, name: str) -> HeadMap:
     """
     person = with_identity(sequence).model
     digest = hashlib.blake2b()
-    for array in (
-        person.v_template,
-        person.shapedirs,
-        person.posedirs,
-        person.weights,
-        person.j_regressor,
-        person.faces,
-    ):
-        digest.update(np.ascontiguousarray(array).tobytes())
+    for field in ("v_template", "shapedirs", "posedirs", "weights", "j_regressor", "faces"):
+        digest.update(np.ascontiguousarray(getattr(person, field)).tobytes())
     key = digest.digest()
     if key not in _cache:
-        fitted = _named if person.expression_names else _fitted
-        _cache[key] = fitted(person, *face_points(sequence.model, name))
+        places, used = face_points(sequence.model, name)
+        points = SurfacePoints(places.face[used], places.barycentric[used])
+        _cache[key] = (_named if person.expression_names else _fitted)(person, points, used)
         while len(_cache) > CACHED_MAPS:
             _cache.popitem(last=False)
     return _cache[key]
@@ -129,26 +122,21 @@ def person_of(model: FlameModel, neutral: np.ndarray) -> FlameSequence:
     return FlameSequence(model, np.zeros(model.n_identity), neutral - model.v_template, (), no_frames.__getitem__)
 
 
-def _fitted(person: FlameModel, places: SurfacePoints, used: np.ndarray) -> HeadMap:
+def _fitted(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
     """The map of a model without identity components."""
-    points = SurfacePoints(places.face[used], places.barycentric[used])
     fit = _Fit(person, points, used)
-    expressions = fit.expressions()
-    eyes = _gaze()
-    found = HeadMap(points, used, fit.targets, expressions, fit.jaw, eyes, np.zeros(COUNT))
+    found = HeadMap(points, used, fit.targets, fit.expressions(), fit.jaw, _gaze(), np.zeros(COUNT))
     return replace(found, reach=_reach(found, fit, person))
 
 
-def _named(person: FlameModel, places: SurfacePoints, used: np.ndarray) -> HeadMap:
+def _named(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
     """The map of a model without identity components whose expressions are ARKit's shapes."""
-    points = SurfacePoints(places.face[used], places.barycentric[used])
     columns = [COLUMN[name] for name in person.expression_names]
     targets, expressions = np.zeros((COUNT, used.sum(), 3)), np.zeros((FEATURES, person.n_expression))
     targets[columns] = [points.on(shape, person.faces) for shape in np.moveaxis(person.shapedirs, 2, 0)]
     expressions[columns, range(person.n_expression)] = 1
-    eyes, reach = _gaze(), np.zeros(COUNT)
-    reach[columns] = 1
-    return HeadMap(points, used, targets, expressions, np.zeros((COUNT, 3)), eyes, reach)
+    reach = np.isin(np.arange(COUNT), columns).astype(np.float64)
+    return HeadMap(points, used, targets, expressions, np.zeros((COUNT, 3)), _gaze(), reach)
 
 
 class _Fit:

@@ -11,8 +11,7 @@ from ..flame.quaternions import from_axis_angle, to_matrices
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.posed_points import PosedPoints
 from .head_map import JAW_SHAPES, PRODUCTS, HeadMap, head_map
-from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
-from .performance import Performance
+from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
 from .shapes import JAW_OPEN, MOUTH_CLOSE
 
 MAX_SWEEPS = 60
@@ -54,7 +53,8 @@ def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameS
         return weights
     jaw_columns = [COLUMN[name] for name in JAW_SHAPES]
     jaw = np.stack([frame.jaw_pose for frame in frames])
-    weights[:, jaw_columns] = _descended(*_normal(found.jaw[jaw_columns], jaw), np.zeros((len(frames), 3)))
+    rows = found.jaw[jaw_columns]
+    weights[:, jaw_columns] = _descended((rows @ rows.T)[None], jaw @ rows.T)
     looks = [column for column, name in enumerate(ARKIT_SHAPES) if name.startswith("eyeLook")]
     eyes = np.stack([frame.eyes_pose for frame in frames])
     weights[:, looks] = np.clip(eyes @ np.linalg.pinv(found.eyes[looks]) * 2, 0, 1)
@@ -65,7 +65,12 @@ def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameS
     by_jaw[PRODUCTS] = found.expressions[COUNT:]
     known = weights @ linear + opened[:, None] * (weights @ by_jaw)
     wanted = np.stack([frame.expr for frame in frames]) - known
-    metric = _metric(found, sequence)
+    # The length of coefficients times the metric is how far they move the face's points.
+    person = with_identity(sequence).model
+    _, slopes = PosedPoints(person, found.points).linearized(np.zeros(person.n_expression), np.zeros(RIGID_SIZE))
+    moves = slopes[..., : person.n_expression].reshape(-1, person.n_expression)
+    values, vectors = np.linalg.eigh(moves.T @ moves)
+    metric = vectors * np.sqrt(np.maximum(values, 0))
     first, second, wanted = linear[free] @ metric, by_jaw[free] @ metric, wanted @ metric
     cross = first @ second.T
     gram = np.stack([first @ first.T, cross + cross.T, second @ second.T])
@@ -73,37 +78,19 @@ def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameS
     limits = np.ones((len(frames), len(free)))
     limits[:, free == MOUTH_CLOSE] = opened[:, None]
     powers = np.stack([np.ones_like(opened), opened, opened**2], axis=1)
-    weights[:, free] = _descended(gram, right, np.zeros_like(right), powers, limits)
+    weights[:, free] = _descended(gram, right, powers, limits)
     return weights
 
 
-def _metric(found: HeadMap, sequence: FlameSequence) -> np.ndarray:
-    """(E, E) factor: the length of coefficients times it is how far they move the face's points."""
-    person = with_identity(sequence).model
-    _, slopes = PosedPoints(person, found.points).linearized(np.zeros(person.n_expression), np.zeros(RIGID_SIZE))
-    matrix = slopes[..., : person.n_expression].reshape(-1, person.n_expression)
-    values, vectors = np.linalg.eigh(matrix.T @ matrix)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
-
-
-def _normal(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return (rows @ rows.T)[None], wanted @ rows.T
-
-
 def _descended(
-    gram: np.ndarray,
-    right: np.ndarray,
-    start: np.ndarray,
-    powers: np.ndarray | None = None,
-    limits: np.ndarray | float = 1.0,
+    gram: np.ndarray, right: np.ndarray, powers: np.ndarray | None = None, limits: np.ndarray | float = 1.0
 ) -> np.ndarray:
     """(T, K) minimizers from 0 to `limits` of ½ wᵀGw − rᵀw by cyclic coordinate descent, all rows at once.
 
     gram (P, K, K) with G = Σ powers[:, p] gram[p], powers (T, P); right (T, K).
     """
     powers = np.ones((len(right), 1)) if powers is None else powers
-    limits = np.broadcast_to(limits, right.shape)
-    weights = start.copy()
+    limits, weights = np.broadcast_to(limits, right.shape), np.zeros_like(right)
     ridge = RIDGE * float(np.trace(gram[0])) / max(len(gram[0]), 1)
     rows = [powers @ gram[:, column] for column in range(right.shape[1])]
     for _ in range(MAX_SWEEPS):
@@ -158,13 +145,9 @@ def write_performance(path: Path, performance: Performance) -> None:
     lines = [",".join(header)]
     for time, weights, turn in zip(performance.times.tolist(), performance.weights, head, strict=True):
         cells = [*weights.tolist(), *turn.tolist(), *[0.0] * (len(EXTRA_COLUMNS) - 3)]
-        lines.append(",".join([_timecode(time), str(COUNT + len(EXTRA_COLUMNS)), *(f"{cell:.6f}" for cell in cells)]))
+        count, sub = divmod(round(time * TIMECODE_BASE * 1000), 1000)
+        whole, frame = divmod(count, TIMECODE_BASE)
+        code = f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{frame:02d}.{sub:03d}"
+        lines.append(",".join([code, str(COUNT + len(EXTRA_COLUMNS)), *(f"{cell:.6f}" for cell in cells)]))
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _timecode(seconds: float) -> str:
-    ticks = round(seconds * TIMECODE_BASE * 1000)
-    frames, sub = divmod(ticks, 1000)
-    whole, frame = divmod(frames, TIMECODE_BASE)
-    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{frame:02d}.{sub:03d}"

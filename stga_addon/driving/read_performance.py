@@ -10,8 +10,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import file_size, read_json
-from .names import COLUMN, COUNT, MAX_WEIGHT, arkit_name, columns_of
-from .performance import FacePacket, Performance
+from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6}))?", re.ASCII)
 BASES = (24, 25, 30, 48, 50, 60, 100, 120)
@@ -181,7 +180,8 @@ def _read_csv(path: Path) -> Performance:
     header, body = [cell.strip() for cell in rows[0]], rows[1:]
     columns = columns_of(str(path), header)
     plain = {name.rsplit(".", 1)[-1].lower(): index for index, name in reversed(list(enumerate(header)))}
-    body = [row for row in body if _has_face(row, plain.get(COUNT_COLUMN))]
+    count = plain.get(COUNT_COLUMN)  # 0 in rows without a face, or they end after it
+    body = [row for row in body if count is None or (len(row) > count + 1 and row[count].strip() not in ("", "0"))]
     if not body:
         raise StgaError(f"{path}: has no row with a face")
     weights = np.zeros((len(body), COUNT))
@@ -192,11 +192,6 @@ def _read_csv(path: Path) -> Performance:
         cells = [[_number(path, row, n, plain[name], header) for name in HEAD_COLUMNS] for n, row in enumerate(body)]
         head = np.array(cells) if np.any(cells) else None
     return _performance(path, _csv_times(path, body, plain, header), weights, head)
-
-
-def _has_face(row: list[str], count: int | None) -> bool:
-    """Rows without a face have a count of 0, or end after it."""
-    return count is None or (len(row) > count + 1 and row[count].strip() not in ("", "0"))
 
 
 def _csv_times(path: Path, body: list[list[str]], plain: dict[str, int], header: list[str]) -> np.ndarray | None:
@@ -273,15 +268,8 @@ def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) 
     if isinstance(frame, dict):
         found = next((frame[key] for key in WEIGHT_KEYS if key in frame), frame)
     if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
-        name_keys, value_keys = CATEGORY_KEYS
-        pairs = [
-            (
-                next((entry[k] for k in name_keys if k in entry), None),
-                next((entry[k] for k in value_keys if k in entry), 0),
-            )
-            for entry in found
-        ]
-        found = {str(name): value for name, value in pairs}
+        names_of, values_of = ([[e[k] for k in keys if k in e] for e in found] for keys in CATEGORY_KEYS)
+        found = {str((n or [None])[0]): (v or [0])[0] for n, v in zip(names_of, values_of, strict=True)}
     if isinstance(found, list):
         if names is None or len(names) != len(found):
             known = "none" if names is None else str(len(names))

@@ -19,7 +19,7 @@ from ..files import read_npz
 from ..flame.forward import joint_positions
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from ..tracking.posed_points import SurfacePoints
-from .names import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
+from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 
 SHAPES_FILE = Path(__file__).with_name("arkit_shapes.npz")
 PUPILS = (468, 473)

@@ -14,8 +14,7 @@ from ..avatar.file import Avatar, read_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture, sequence_capture
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..driving.open_motion import Motion, MotionOptions, open_motion
-from ..driving.transfer import TrainedRange, trained_range
+from ..driving.open_motion import Motion, MotionOptions, TrainedRange, open_motion, trained_range
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.sequence import motion_of

@@ -16,9 +16,8 @@ from tempfile import TemporaryDirectory
 from ..errors import StgaError
 from ..options import like
 from ..progress import Cancelled, Progress, Report, Say, counted
-from ..render.compose import Composer
-from ..render.recording import finished, is_video, recorded_images
-from ..render.video import sequence_writer, video_writer
+from ..render.device import Composer
+from ..render.video import finished, is_video, recorded_images, sequence_writer, video_writer
 from ..schema import MAX_COUNT, setting
 from ..worker.launch import end_with_this_process
 from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
@@ -42,7 +41,7 @@ FRAME_DIGITS = 6
 class RenderRecording:
     """Render the images that Blender has recorded, and encode them.
 
-    recording       file of the images (`render.recording`), removed afterwards
+    recording       file of the images (`render.video`), removed afterwards
     output          an .mp4 file, or a folder for PNGs
     images          how many
     background      sRGB in 0…1; None: transparent in PNGs, black in a video

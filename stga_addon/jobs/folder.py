@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import StgaError
 from ..files import read_json, read_npz, write_json, write_npz
-from ..render.recording import check_output
+from ..render.video import check_output
 from ..schema import Arrays, from_json, to_json
 from ..tracking.folder import is_written
 from ..training.run.folder import has_run, read_run

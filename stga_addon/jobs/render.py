@@ -22,7 +22,7 @@ from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
 from ..options import like, option
 from ..progress import Report, Say, counted
-from ..render.compose import Composer
+from ..render.device import Composer
 from ..render.video import sequence_writer, video_writer
 from ..schema import setting
 from ..training.run.folder import WORLD_FILE

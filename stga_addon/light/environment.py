@@ -198,7 +198,12 @@ def read_lighting(path: Path) -> Lighting:
         found: LightFile = from_json(LightFile, _completed(LightFile, values))
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error
-    return _lighting(found)
+    lights = []
+    for entry in found.lights:
+        own = {name: value for name, value in vars(entry).items() if name not in ("strength", "color")}
+        lights.append(Light(color=entry.strength * np.array(entry.color), **own))
+    rest = {name: value for name, value in vars(found).items() if name not in ("world", "lights")}
+    return Lighting(uniform(found.world), tuple(lights), **rest)
 
 
 def _completed(kind: type, values: Any) -> Any:
@@ -207,15 +212,6 @@ def _completed(kind: type, values: Any) -> Any:
         return values
     defaults = {spec.name: spec.default for spec in fields(kind) if spec.default is not MISSING}
     return {**{name: list(v) if isinstance(v, tuple) else v for name, v in defaults.items()}, **values}
-
-
-def _lighting(found: LightFile) -> Lighting:
-    lights = []
-    for entry in found.lights:
-        values = {name: getattr(entry, name) for name in vars(entry) if name not in ("strength", "color")}
-        lights.append(Light(color=entry.strength * np.array(entry.color), **values))
-    rest = {name: getattr(found, name) for name in ("exposure", "white", "roughness", "specular", "shadows")}
-    return Lighting(uniform(found.world), tuple(lights), **rest)
 
 
 def turned(lighting: Lighting, center: np.ndarray, degrees: float) -> Lighting:

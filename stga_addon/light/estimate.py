@@ -13,7 +13,7 @@ from ..errors import StgaError
 from ..progress import Progress, Report, ignore
 from .harmonics import COUNT, LAMBERT, basis, uniform
 from .lamps import ShadowMap
-from .transfer import Bounce, transfer_of
+from .surface import Bounce, transfer_of
 from .values import Light
 
 MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800
@@ -172,7 +172,9 @@ def estimate_light(capture: Capture, known: Known = Known(), report: Report = ig
         source = "file"
     elif known.card is not None:
         assert known.toward is not None
-        radiance, source = _level_with(radiance, known.card, known.toward), "gray_card"
+        # At the level and white balance at which gray that faces `toward` shows the card's colors.
+        arriving = np.maximum((basis(known.toward) * LAMBERT @ radiance).mean(0), 1e-6)
+        radiance, source = radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving), "gray_card"
     bounce = Bounce(capture.neutral, capture.faces, occlusion)
     irradiance = recorded_irradiance(np.maximum(posed @ radiance, DARK), observed.cameras, capture.faces, bounce)
     damping = MAX_DAMPING * float(np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1))
@@ -259,12 +261,6 @@ def _solve(color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: 
         ridge[np.diag_indices(COUNT)] += DARK**2  # a channel that shows nothing
         found[:, k] = np.linalg.solve(matrix + ridge, rows.T @ (color[:, k] * np.sqrt(weight[:, k])))
     return found
-
-
-def _level_with(radiance: np.ndarray, card: np.ndarray, toward: np.ndarray) -> np.ndarray:
-    """The light at the level and white balance at which gray that faces `toward` (K, 3) shows the colors (K, 3)."""
-    arriving = (basis(toward) * LAMBERT @ radiance).mean(0)
-    return np.asarray(radiance * (np.pi * card.mean(0) / CARD_REFLECTANCE / np.maximum(arriving, 1e-6)))
 
 
 def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
+from . import array_kernels
 from .array_kernels import toward_light
 from .harmonics import COUNT, basis
 from .values import Caster, Light, Lighting
@@ -118,7 +120,7 @@ class ShadowMap:
             points = self._project(mesh.vertices)
             if not is_parallel:  # of a plane in perspective, not depth but 1 / depth is linear in texels
                 points[:, 2] = -1 / points[:, 2]
-            shadow_kernels().add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
+            kernels("shadow").add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
         self.depth = depth if is_parallel else np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
 
     def lit(
@@ -132,7 +134,7 @@ class ShadowMap:
         if normals is not None:
             biases = self._slope_bias(points, normals, bias, step)
         places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
-        shadow_kernels().lit_shares(self.depth, places, biases, np.float32(step), found)
+        kernels("shadow").lit_shares(self.depth, places, biases, np.float32(step), found)
         return found
 
     def _slope_bias(self, points: np.ndarray, normals: np.ndarray, bias: float, step: float) -> np.ndarray:
@@ -148,26 +150,9 @@ class ShadowMap:
         return np.asarray(np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32)
 
 
-def shade_kernels() -> Any:
-    """The module with `add_lights`."""
-    if find_spec("numba") is None:
-        from . import array_kernels
-
-        return array_kernels
-    from ..raster.cpu import shade
-
-    return shade
-
-
-def shadow_kernels() -> Any:
-    """The module with `add_depths` and `lit_shares`."""
-    if find_spec("numba") is None:
-        from . import array_kernels
-
-        return array_kernels
-    from ..raster.cpu import shadow
-
-    return shadow
+def kernels(name: str) -> Any:
+    """The module `raster.cpu.shade`, with `add_lights`, or `raster.cpu.shadow`, with `add_depths` and `lit_shares`."""
+    return array_kernels if find_spec("numba") is None else import_module(f"...raster.cpu.{name}", __name__)
 
 
 FEW, SOME, MANY = 1, 2, 3
@@ -203,7 +188,7 @@ class Lamps:
         lit = np.ones((max(1, len(self._maps)), len(points)), np.float32)
         for row, shadow in zip(lit, self._maps, strict=False):
             row[:] = shadow.lit(points, normals=normals)
-        shade_kernels().add_lights(
+        kernels("shade").add_lights(
             np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32),
             np.asarray(eye, np.float32), np.asarray(roughness, np.float32),
             np.full(len(points), reflectance, np.float32), self._table, lit, *found,

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 
-from ..avatar.embedding import face_frames
 from ..avatar.file import Avatar
 from ..avatar.splats import SH_C0, no_strain_color, sh_color
 from ..capture.color import linear_to_srgb, srgb_to_linear
@@ -14,8 +13,7 @@ from ..capture.mesh_geometry import vertex_normals, weighted_procrustes
 from ..errors import StgaError
 from .harmonics import COUNT, GLOSSY, LAMBERT, basis, rotated
 from .lamps import LIFT_M, Lamps, distant_light
-from .surface import Lashes, at_splats, find_lashes, surface_points
-from .transfer import Bounce
+from .surface import Bounce, Lashes, at_splats, find_lashes, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
 UNLIKE_LIGHT = 0.2
@@ -92,8 +90,7 @@ harmonics over their value straight from the front."""
 class Relighter:
     """An avatar whose file holds its light (`Avatar.light`), ready to be lit by a scene; made once, used every frame.
 
-    What a GPU needs to do the same, all float32 and by splat: `albedo`, `transfer`, `occlusion`, `roughness`, `normal`.
-    Raises StgaError where the avatar has no light.
+    Properties are float32, by splat. Raises StgaError where the avatar has no light.
     """
 
     def __init__(self, avatar: Avatar) -> None:
@@ -148,14 +145,6 @@ class Relighter:
         return recorded_light(self.light.transfer, self.bounce, self.light.irradiance)
 
     @cached_property
-    def normal(self) -> np.ndarray:
-        """(N, 3) the mesh's smooth normal at the splat, in the axes of its triangle (`FaceFrames.rotation`)."""
-        mesh = self.avatar.neutral.astype(np.float64)
-        frames = face_frames(mesh, self.avatar.faces, mesh, self.avatar.convention)
-        normals = self._unit(self._at_splats(vertex_normals(mesh, self.avatar.faces)))
-        return np.asarray(np.einsum("nji,nj->ni", frames.rotation[self.avatar.splats.face], normals).astype(np.float32))
-
-    @cached_property
     def lashes(self) -> Lashes:
         """What throws shadows beside the mesh."""
         return find_lashes(self.avatar, self.corners, self.weights, self.roughness, self.albedo)
@@ -168,7 +157,9 @@ class Relighter:
     def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
         """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh` (V, 3): what
         `transfer` is multiplied with."""
-        rotation, _ = weighted_procrustes(np.asarray(mesh, np.float64), self.avatar.neutral, self._rigid)
+        # Open vertices, which the jaw moves least, say how the head is turned.
+        weights = np.asarray(self.light.occlusion, np.float64) + 1e-3
+        rotation, _ = weighted_procrustes(np.asarray(mesh, np.float64), self.avatar.neutral, weights)
         return rotated(world, rotation)
 
     def colors(
@@ -273,11 +264,6 @@ class Relighter:
     def bounce(self) -> Bounce:
         """Light that the head reflects onto itself."""
         return Bounce(self.avatar.neutral, self.avatar.faces, self.light.occlusion)
-
-    @cached_property
-    def _rigid(self) -> np.ndarray:
-        """(V,) weights of vertices that say how the head is turned: open ones, which the jaw moves least."""
-        return np.asarray(self.light.occlusion, np.float64) + 1e-3
 
     def _at_splats(self, values: np.ndarray) -> np.ndarray:
         return at_splats(values, self.corners, self.weights)

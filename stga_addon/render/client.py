@@ -9,16 +9,14 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
-from typing import Any, BinaryIO, cast
-
-import numpy as np
+from typing import BinaryIO, cast
 
 from ..capture.camera import Camera
 from ..errors import StgaError
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from ..worker.launch import start_python
-from .compose import Composer
-from .protocol import pack_layers, receive, send
+from .device import Composer
+from .server import pack_camera, pack_layers, receive, send
 
 REQUIRED_PACKAGES = ("numba", "platformdirs")
 """What the kernels need beside numpy, by the names of the packages."""
@@ -67,11 +65,13 @@ class RenderClient:
                     cast(BinaryIO, pipe).close()
 
     def _request(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool) -> ComposedImage:
-        python, server = self._server or self._start()
-        intrinsics = [camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy]
-        request: dict[str, Any] = {
-            "camera": np.array(intrinsics), "pose": camera.world_to_camera, "with_depth": with_depth
-        }  # fmt: skip
+        if self._server is None:
+            python, self._server_device = self._python(), self._find_device()
+            arguments = ["stga_addon.render.server", self._server_device]
+            started = start_python(python, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            self._server = python, started
+        python, server = self._server
+        request = {**pack_camera(camera), "with_depth": with_depth}
         if layers is not self._sent:
             request |= pack_layers(layers)
         try:
@@ -84,12 +84,6 @@ class RenderClient:
         if "error" in reply:
             raise StgaError(f"{python}: the render server could not render the image ({reply['error']})")
         return ComposedImage(reply["rgb"], reply["alpha"], reply["depth"] if with_depth else None)
-
-    def _start(self) -> tuple[str, subprocess.Popen[bytes]]:
-        python, self._server_device = self._python(), self._find_device()
-        arguments = ["stga_addon.render.server", self._server_device]
-        self._server = python, start_python(python, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        return self._server
 
     def _python(self) -> str:
         try:

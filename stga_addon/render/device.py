@@ -1,10 +1,14 @@
-"""Choice of the device that trains or renders: the GPU where it is right and faster, else the CPU."""
+"""The device that trains or renders, the GPU where it is right and faster, else the CPU; and pictures made there."""
 
+import logging
+from collections.abc import Sequence
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from ..errors import StgaError
+from ..capture.camera import Camera
+from ..errors import DeviceError, StgaError, one_line
+from ..raster.posed_splats import ComposedImage, PosedSplats
 
 if TYPE_CHECKING:  # without a GPU, choosing needs numpy only
     from ..raster.gpu.trial import Trial
@@ -109,3 +113,38 @@ def _comparison(trial: "Trial") -> str:
 
 def _wrong(adapter: str, trial: "Trial") -> str:
     return f"{adapter} computes gradients that differ from the CPU's by {100 * trial.error:.2g} %"
+
+
+class Composer:
+    """Renders layers on a device, which is chosen with the first image.
+
+    requested   see `choose_device`; with "auto", the CPU renders from a GPU's first failure on
+    device   the one that was chosen; "" before
+    failure  why the CPU took over; "" where it did not
+    """
+
+    def __init__(self, requested: str = "auto") -> None:
+        self.requested, self.device, self.failure = requested, "", ""
+
+    def choose(self) -> str:
+        """The device of the next image. Raises StgaError where the one that is asked for by name does not work."""
+        if not self.device:
+            self.device, _ = choose_device(self.requested, "Rendering")
+        return self.device
+
+    def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
+        """See `cpu.compose.compose`. Raises StgaError where a device that is asked for by name cannot render."""
+        if self.choose() != "cpu":
+            from ..raster.gpu import compose as gpu
+
+            try:
+                return gpu.compose(self.device.removeprefix(GPU), layers, camera, with_depth)
+            except Exception as error:  # a driver raises what it likes
+                if self.requested != "auto":
+                    raise
+                cause = error.cause if isinstance(error, DeviceError) else f"{self.device}: {first_line(error)}"
+                self.device, self.failure = "cpu", one_line(f"{cause}; the CPU renders instead")
+                logging.getLogger(__name__).warning(self.failure)
+        from ..raster.cpu import compose as cpu
+
+        return cpu.compose(layers, camera, with_depth)

@@ -26,7 +26,7 @@ from ..capture.camera import Camera
 from ..raster.cpu.layout import Parameters
 from ..raster.cpu.rasterize import frames_in_camera, render_forward
 from ..raster.posed_splats import PosedSplats
-from .compose import Composer
+from .device import Composer
 
 WHITE = (1.0, 1.0, 1.0)
 

@@ -1,20 +1,83 @@
-"""A capture's head, its cameras and its avatar in an empty scene."""
+"""A capture's head, cameras and avatar in a scene, and the viewports that look at them."""
 
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+import bpy
+from mathutils import Vector
 
 from ..avatar.file import Avatar
 from ..capture.model import Capture
 from ..export.ply import read_ply
 from ..training.run.folder import WORLD_FILE
 from . import tags
-from .blend_file import current_scene
+from .arrays import evaluated_vertices
+from .blend_file import current_scene, go_to_frame, set_frames_per_second
 from .cameras import central, configure_scene, import_cameras
+from .compat import enable_nodes
 from .display.splat_object import hide_object, show_avatar, show_world_splats
-from .objects import capture_root
+from .objects import COLLECTIONS, capture_root, show_kind
 from .rig.head import import_head
-from .timeline import go_to_frame
-from .viewports import frame_alone
+
+DISTANCE = 2.2
+"""From the viewport's eye to the head's center, in radii of the sphere around its bounding box."""
+
+
+def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
+    """Let the 3D viewports look at the head from the side of `camera`, or from the front where it is None.
+
+    They stay free to orbit. A viewport that looks through a camera stays so.
+    The dashed lines from cameras and bones to their parent are hidden.
+    """
+    matrix = head.matrix_world
+    vertices = evaluated_vertices(head)
+    low, high = matrix @ Vector(vertices.min(0)), matrix @ Vector(vertices.max(0))
+    center, radius = (low + high) / 2, (high - low).length / 2
+    for area in _viewports(screens):
+        space = area.spaces.active
+        space.overlay.show_relationship_lines = False
+        region = space.region_3d
+        if region.view_perspective == "CAMERA":
+            continue
+        region.view_perspective = "PERSP"
+        # Without a turn, a camera looks along -z with +y up: at the front of FLAME's heads.
+        region.view_rotation = (camera or head).matrix_world.to_quaternion()
+        region.view_location, region.view_distance = center, DISTANCE * radius
+
+
+def frame_alone(head: Any, scene: Any, frames_per_second: float) -> None:
+    """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on the head.
+
+    The world is white, the background of captures without one of their own.
+    """
+    set_frames_per_second(scene, frames_per_second)
+    scene.world = bpy.data.worlds.new("World")
+    enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    for kind in COLLECTIONS:
+        show_kind(head.parent, kind, scene.view_layers[0], False)
+    frame_head(head, scene.camera, bpy.data.screens)
+
+
+def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
+    """Open the sidebar of the 3D viewports at a tab; whether they show it.
+
+    Blender knows a sidebar's tabs only once it was drawn: call it again until it returns True.
+    """
+    is_shown = True
+    for area in _viewports(screens):
+        area.spaces.active.show_region_ui = True
+        sidebar = next(region for region in area.regions if region.type == "UI")
+        with suppress(AttributeError, TypeError):  # not drawn yet
+            sidebar.active_panel_category = tab
+        is_shown &= sidebar.active_panel_category == tab
+    return is_shown
+
+
+def _viewports(screens: Iterable[Any]) -> list[Any]:
+    return [area for screen in screens for area in screen.areas if area.type == "VIEW_3D"]
+
 
 WORLD_NAME = "World splats"
 

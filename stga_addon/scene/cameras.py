@@ -1,5 +1,7 @@
-"""The capture's cameras as Blender cameras, with its images as backgrounds."""
+"""Blender's cameras: imported from captures with their images, exported, and as calibrated cameras."""
 
+from collections.abc import Iterable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -8,13 +10,77 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..capture.camera import Camera, most_central
+from ..capture.camera import Camera, camera_from_gl, covered_angles, most_central, turntable
 from ..capture.model import Capture, View
 from ..errors import StgaError
+from ..files import write_json
 from . import compat, tags
 from .animation import write_curve
+from .arrays import Z_UP_TO_Y_UP, evaluated_vertices, mesh_vertices
+from .blend_file import set_frames_per_second
 from .objects import Warn, log_warning, place, remove
-from .timeline import set_frames_per_second
+
+UP = (0.0, 0.0, 1.0)
+"""Blender's scenes are z-up."""
+ORTHOGRAPHIC_DISTANCE = 1000.0
+"""An orthographic view is rendered in perspective from this many times its own width away."""
+
+
+def image_size(render: Any) -> tuple[int, int]:
+    """Width and height in pixels of final images by a scene's render settings."""
+    share = render.resolution_percentage / 100
+    return max(1, int(render.resolution_x * share)), max(1, int(render.resolution_y * share))
+
+
+def render_camera(
+    camera: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int] | None = None
+) -> Camera:
+    """The scene's camera for a final image of width × height pixels.
+
+    camera: the evaluated camera object. border: x, y, width and height in pixels of the render region, from the bottom
+    left; None: the whole image. Raises StgaError unless it is a perspective camera.
+    """
+    if camera is None or camera.type != "CAMERA":
+        raise StgaError("The scene has no camera to render through")
+    if camera.data.type != "PERSP":
+        raise StgaError(f"{camera.name}: is not a perspective camera; STGA Splats renders through no other type")
+    render = depsgraph.scene.render
+    projection = camera.calc_matrix_camera(
+        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+    )
+    whole = camera_of(np.array(camera.matrix_world.normalized(), np.float64), projection, width, height)
+    if border is None:
+        return whole
+    x, y, columns, rows = border
+    return replace(whole, width=columns, height=rows, cx=whole.cx - x, cy=whole.cy - (height - y - rows))
+
+
+def viewport_camera(region: Any, width: int, height: int) -> Camera:
+    """The view of a 3D viewport (a RegionView3D) for an image of width × height pixels."""
+    pose = np.array(region.view_matrix.inverted(), np.float64)
+    projection = np.array(region.window_matrix, np.float64)
+    if not region.is_perspective:  # nearly the same in perspective from far behind
+        flat, distance = projection, ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
+        projection = np.zeros((4, 4))
+        projection[0, 0], projection[1, 1] = flat[0, 0] * distance, flat[1, 1] * distance
+        projection[:2, 2] = -flat[:2, 3]
+        pose[:3, 3] += distance * pose[:3, 2]
+    return camera_of(pose, projection, width, height)
+
+
+def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Camera:
+    """Camera from a camera-to-world matrix with OpenGL axes and an OpenGL perspective projection, both (4, 4)."""
+    p = np.array(projection, np.float64)
+    return camera_from_gl(
+        pose,
+        width,
+        height,
+        fl_x=p[0, 0] * width / 2,
+        fl_y=p[1, 1] * height / 2,
+        cx=(1 - p[0, 2]) * width / 2,
+        cy=(1 + p[1, 2]) * height / 2,
+    )
+
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
 CLIP_START = 0.01  # meters
@@ -146,7 +212,10 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
     frames = np.array([view.timestep for view in found])
     for row, view in enumerate(found):
         background = data.background_images.new()
-        background.image = _load_image(view.image)
+        try:
+            background.image = bpy.data.images.load(str(view.image))
+        except RuntimeError as error:
+            raise StgaError(f"{view.image}: cannot be read as an image") from error
         background.show_background_image = row == 0
         # Visible from its own frame until the next image's; the first also before, the last also after.
         near = np.arange(max(row - 1, 0), min(row + 2, len(found)))
@@ -155,8 +224,60 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
     data.show_background_images = True
 
 
-def _load_image(path: Path) -> Any:
-    try:
-        return bpy.data.images.load(str(path))
-    except RuntimeError as error:
-        raise StgaError(f"{path}: cannot be read as an image") from error
+def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
+    """Write the cameras at the current frame as transforms.json with pinholes; how many.
+
+    cameras: camera objects. Each is named after its object: footage has a folder, a video or an image of that name.
+    Axes are those of captures, y up, and the file says that a capture keeps this world: imported, it lies among the
+    cameras. Image size: the scene's resolution, or that of the capture that the camera was imported from.
+    Raises StgaError for a camera that is not perspective, is mirrored, or where there are none.
+    """
+    entries = []
+    for thing in cameras:
+        if np.linalg.det(np.array(thing.evaluated_get(depsgraph).matrix_world.to_3x3())) < 0:
+            raise StgaError(f"{thing.name}: is mirrored by a negative scale; apply the scale")
+        width, height = (int(n) for n in thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render))
+        camera = render_camera(thing.evaluated_get(depsgraph), depsgraph, width, height)
+        intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}
+        entries.append(
+            {
+                "file_path": f"{thing.name}.png",
+                "camera_id": thing.name,
+                "w": width,
+                "h": height,
+                **{key: float(value) for key, value in intrinsics.items()},
+                "transform_matrix": (Z_UP_TO_Y_UP @ camera.camera_to_world_gl).tolist(),
+            }
+        )
+    if not entries:
+        raise StgaError("No cameras to export; add them, or select some")
+    write_json(path, {"camera_model": "PINHOLE", "world": "keep", "frames": entries})
+    return len(entries)
+
+
+def scene_camera(depsgraph: Any) -> Camera:
+    """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is perspective."""
+    scene = depsgraph.scene
+    camera = scene.camera.evaluated_get(depsgraph) if scene.camera else None
+    return render_camera(camera, depsgraph, *image_size(scene.render))
+
+
+def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
+    """`count` cameras that start as the scene's and orbit the object `subject`, a head or splats.
+
+    angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there are none.
+    """
+    start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
+    if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
+        middle = np.median(mesh_vertices(subject.data), axis=0)
+    else:
+        vertices = evaluated_vertices(subject)
+        middle = (vertices.min(0) + vertices.max(0)) / 2
+    center = matrix[:3, :3] @ middle + matrix[:3, 3]
+    angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)
+    # The cameras of the capture that it belongs to, for their positions.
+    children = () if subject.parent is None else subject.parent.children_recursive
+    poses = [np.array(child.matrix_world, np.float64) for child in children if child.get(tags.KIND) == tags.CAMERA]
+    if not angle and poses:
+        angles = covered_angles([camera_from_gl(pose, 1, 1, 1, 1, 0, 0) for pose in poses], start, center, UP)
+    return turntable(start, center, count, angles, UP)

@@ -72,7 +72,11 @@ class SceneLayer:
         visible &= random_percentage(len(splats)) < settings.percentage
         if self.frozen is not None:
             frozen = self.frozen[splats.face]
-            splats = _grayed(splats, frozen) if settings.show_selection else splats
+            if settings.show_selection:
+                sh, strain_color = splats.sh.copy(), splats.strain_color.copy()
+                sh[frozen] = strain_color[frozen] = 0
+                sh[frozen, 0] = (np.array(FROZEN_COLOR_SRGB) - 0.5) / SH_C0
+                splats = replace(splats, sh=sh, strain_color=strain_color)
             visible &= ~(frozen & settings.selected_only)
         if splats.sh_degree > 0 and not settings.view_dependent:
             splats = replace(splats, sh=splats.sh[:, :1])
@@ -90,10 +94,3 @@ class SceneLayer:
 def random_percentage(count: int) -> np.ndarray:
     """(N,) in 0…100, the same in every call: a splat is shown where it is less than `DisplaySettings.percentage`."""
     return np.random.default_rng(0).random(count) * 100
-
-
-def _grayed(splats: Splats, frozen: np.ndarray) -> Splats:
-    sh, strain_color = splats.sh.copy(), splats.strain_color.copy()
-    sh[frozen] = strain_color[frozen] = 0
-    sh[frozen, 0] = (np.array(FROZEN_COLOR_SRGB) - 0.5) / SH_C0
-    return replace(splats, sh=sh, strain_color=strain_color)

@@ -47,15 +47,6 @@ def collection_of(root: Any, kind: str) -> Any:
     return next((child for child in collection.children if child.get(tags.KIND) == kind), None)
 
 
-def _make_collection(root: Any, kind: str) -> Any:
-    collection = collection_of(root, kind)
-    if collection is None:
-        collection = bpy.data.collections.new(f"{root.name} {COLLECTIONS[kind]}")
-        collection[tags.KIND] = kind
-        root.users_collection[0].children.link(collection)
-    return collection
-
-
 def show_kind(root: Any, kind: str, view_layer: Any, show: bool) -> None:
     """Show or hide the root's objects of this kind in viewports; renders and animation stay as they are."""
     for layer in layers_of(root, kind, view_layer):
@@ -81,8 +72,12 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
     """
     obj = existing
     if obj is None:
-        obj = bpy.data.objects.new(name, data)
-        _make_collection(root, kind).objects.link(obj)
+        obj, collection = bpy.data.objects.new(name, data), collection_of(root, kind)
+        if collection is None:
+            collection = bpy.data.collections.new(f"{root.name} {COLLECTIONS[kind]}")
+            collection[tags.KIND] = kind
+            root.users_collection[0].children.link(collection)
+        collection.objects.link(obj)
         obj.parent = root
     else:
         leave_edit_mode()

@@ -11,8 +11,11 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
 from stga_addon.driving.head_map import head_map  # noqa: E402
 from stga_addon.driving.inverse import write_performance  # noqa: E402
-from stga_addon.driving.names import ARKIT_SHAPES, COLUMN  # noqa: E402
-from stga_addon.driving.performance import Performance  # noqa: E402
+from stga_addon.driving.performance import (  # noqa: E402
+    ARKIT_SHAPES,
+    COLUMN,
+    Performance,
+)
 from stga_addon.driving.read_performance import read_performance  # noqa: E402
 from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence  # noqa: E402

@@ -17,10 +17,10 @@ from stga_addon.capture.model import Capture, View  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.blend_file import frames_per_second  # noqa: E402
 from stga_addon.scene.cameras import central, configure_scene, import_cameras  # noqa: E402
 from stga_addon.scene.objects import capture_root, collection_of, layers_of, show_kind  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
-from stga_addon.scene.timeline import frames_per_second  # noqa: E402
 
 from .captures import mesh_capture  # noqa: E402
 

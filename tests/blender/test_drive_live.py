@@ -15,10 +15,9 @@ from driving.live import wire  # noqa: E402
 
 from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
 from stga_addon.driving.head_map import head_map  # noqa: E402
-from stga_addon.driving.names import ARKIT_SHAPES  # noqa: E402
-from stga_addon.driving.performance import Performance  # noqa: E402
+from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral  # noqa: E402
+from stga_addon.driving.performance import ARKIT_SHAPES, Performance  # noqa: E402
 from stga_addon.driving.read_performance import read_performance  # noqa: E402
-from stga_addon.driving.transfer import exchanged_neutral, quiet_neutral  # noqa: E402
 from stga_addon.flame.forward import flame_forward  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence, read_motion  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
@@ -192,7 +191,7 @@ def test_the_trained_range(live):
     """Catches a meter that says inside where nobody trained, and a live pose that is not led back."""
     bpy.context.scene.frame_set(2)
     bpy.ops.stga.measure_range()
-    from stga_addon.scene.rig.trained import outside_now, stored_range
+    from stga_addon.scene.rig.motion import outside_now, stored_range
 
     head, rig = the_head(), rig_of(the_head())
     trained = stored_range(head)

@@ -11,11 +11,11 @@ from mathutils import Vector  # noqa: E402
 
 from stga_addon.export.ply import write_ply  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.avatar_scene import frame_head  # noqa: E402
 from stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, POINTS, QUADS  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier  # noqa: E402
 from stga_addon.scene.objects import layers_of  # noqa: E402
-from stga_addon.scene.viewports import frame_head  # noqa: E402
 
 from .test_operators import write_ball_avatar  # noqa: E402
 

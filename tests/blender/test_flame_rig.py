@@ -15,8 +15,8 @@ from stga_addon.flame.teeth import with_teeth  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.rig.head import import_head  # noqa: E402
+from stga_addon.scene.rig.keyframes import is_of_parts  # noqa: E402
 from stga_addon.scene.rig.motion import sample_motion  # noqa: E402
-from stga_addon.scene.rig.names import is_of_parts  # noqa: E402
 
 from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
 

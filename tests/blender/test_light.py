@@ -25,7 +25,7 @@ from stga_addon.scene.display.splat_nodes import PERCENTAGE  # noqa: E402
 from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar  # noqa: E402
 from stga_addon.scene.layers import Relit  # noqa: E402
 from stga_addon.scene.light import settings  # noqa: E402
-from stga_addon.scene.light.head_shadow import throw_shadow, throws_shadow  # noqa: E402
+from stga_addon.scene.light.scene_light import throw_shadow, throws_shadow  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .exr import read_exr  # noqa: E402

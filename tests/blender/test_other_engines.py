@@ -16,12 +16,12 @@ from stga_addon.capture.color import linear_to_srgb, srgb_to_linear  # noqa: E40
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.raster.cpu.compose import compose  # noqa: E402
 from stga_addon.raster.posed_splats import PosedSplats  # noqa: E402
+from stga_addon.scene.cameras import render_camera  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import QUADS  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
 from stga_addon.scene.gpu.context import has_gpu_context  # noqa: E402
-from stga_addon.scene.render.camera import render_camera  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .test_engine import camera_at, show, textured, with_light  # noqa: E402
@@ -135,9 +135,9 @@ def test_images_of_recorded_light_say_so(extension, tmp_path: Path, capsys: pyte
 def test_relit_color_of_a_frame(tmp_path: Path) -> None:
     """Catches relit colors that do not reach the nodes, in another color space, or stay when they are taken back."""
     from stga_addon.light.relight import Relighter
-    from stga_addon.scene.display.materials import DISPLAY_COLOR
+    from stga_addon.scene.display.display_modes import DISPLAY_COLOR
     from stga_addon.scene.light import settings
-    from stga_addon.scene.render.frame_colors import forget_frame, relight_frame
+    from stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 
     def node_colors() -> np.ndarray:
         depsgraph = bpy.context.evaluated_depsgraph_get()

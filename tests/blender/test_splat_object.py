@@ -17,8 +17,7 @@ from stga_addon.avatar.strain import edge_neighbors, rest_strain  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import POINTS, QUADS  # noqa: E402
-from stga_addon.scene.display.materials import DISPLAY_COLOR, EXTENT  # noqa: E402
+from stga_addon.scene.display.display_modes import DISPLAY_COLOR, EXTENT, POINTS, QUADS  # noqa: E402  # noqa: E402
 from stga_addon.scene.display.splat_attributes import OPACITY, SCALE, SH, avatar_attributes  # noqa: E402
 from stga_addon.scene.display.splat_object import (  # noqa: E402
     can_update,

@@ -13,9 +13,9 @@ bpy = pytest.importorskip("bpy")
 
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene.render import redraw, viewport  # noqa: E402
-from stga_addon.scene.render.camera import camera_of, viewport_camera  # noqa: E402
-from stga_addon.scene.render.viewport import RenderRequest, ViewportRenderer  # noqa: E402
+from stga_addon.scene.cameras import camera_of, viewport_camera  # noqa: E402
+from stga_addon.scene.render import engine_viewport  # noqa: E402
+from stga_addon.scene.render.engine_viewport import RenderRequest, ViewportRenderer  # noqa: E402
 
 CAMERA = Camera(800, 600, 700.0, 700.0, 400.0, 300.0, np.eye(4))
 
@@ -66,7 +66,7 @@ class Engine:
 @pytest.fixture(autouse=True)
 def _stopped_timer() -> Iterator[None]:
     yield
-    redraw.stop()
+    engine_viewport.stop_redraws()
 
 
 def test_a_resting_view_is_rendered_at_full_resolution():
@@ -99,13 +99,13 @@ def test_a_moving_view_is_rendered_from_its_latest_request():
 
 def test_slow_images_get_coarser(monkeypatch):
     """Catches a viewport that stutters on a slow machine."""
-    monkeypatch.setattr(viewport, "MAX_RENDER_TIME_S", 1e-9)
+    monkeypatch.setattr(engine_viewport, "MAX_RENDER_TIME_S", 1e-9)
     recorder = Recorder()
     for x in range(12):
         recorder.renderer.request(request(float(x)))
         recorder.renderer.join()
     coarse = [scale for _, scale in recorder.rendered if scale < 1]
-    assert coarse[-1] == viewport.MIN_SCALE < coarse[0]
+    assert coarse[-1] == engine_viewport.MIN_SCALE < coarse[0]
 
 
 @pytest.mark.parametrize("error", [StgaError("no head"), ValueError("no head")])
@@ -125,7 +125,7 @@ def test_failures_are_reported(error):
 def poll_until_idle() -> None:
     """Call the timer's function as Blender's main loop would."""
     for _ in range(1000):
-        if redraw._poll() is None:
+        if engine_viewport._poll() is None:
             return
         time.sleep(0.005)
     raise AssertionError("the timer never ends")
@@ -135,20 +135,20 @@ def test_viewports_are_redrawn_from_the_main_thread():
     """Catches bpy called from the render thread, a last image that is never shown, and a timer that runs when idle."""
     recorder, engine = Recorder(waits=True), Engine()
     recorder.renderer.request(request())
-    redraw.redraw_when_rendered(recorder.renderer, engine)
-    assert bpy.app.timers.is_registered(redraw._poll)
-    assert redraw._poll() == redraw.POLL_INTERVAL_S
+    engine_viewport.redraw_when_rendered(recorder.renderer, engine)
+    assert bpy.app.timers.is_registered(engine_viewport._poll)
+    assert engine_viewport._poll() == engine_viewport.POLL_INTERVAL_S
     assert engine.threads == []  # nothing was rendered yet
     for images in (1, 2):  # a coarse one, then the full one
         recorder.go.release()
         recorder.wait_for(images)
         while not recorder.renderer._has_update:
             time.sleep(0.001)
-        redraw._poll()
+        engine_viewport._poll()
         assert engine.threads == [threading.main_thread()] * images
     poll_until_idle()
     assert len(engine.threads) == 2
-    assert redraw._active == {}
+    assert engine_viewport._active == {}
 
 
 @pytest.mark.parametrize("freed", [False, True])
@@ -157,21 +157,21 @@ def test_a_closed_viewport_ends_its_thread(freed):
     recorder, engine = Recorder(waits=True), Engine(freed)
     recorder.renderer.request(request())
     recorder.started.wait()
-    redraw.redraw_when_rendered(recorder.renderer, engine)
+    engine_viewport.redraw_when_rendered(recorder.renderer, engine)
     if not freed:  # else Blender's part of it is gone while Python still holds its own
         del engine
         gc.collect()
-        redraw._poll()
+        engine_viewport._poll()
     recorder.go.release()
     recorder.wait_for(1)
     if freed:
         while not recorder.renderer._has_update:
             time.sleep(0.001)
-        redraw._poll()
+        engine_viewport._poll()
         recorder.go.release()
     recorder.renderer.join()
     assert recorder.rendered[-1][1] < 1 or freed
-    assert redraw._poll() is None
+    assert engine_viewport._poll() is None
 
 
 def test_stopping_ends_timer_and_threads():
@@ -179,7 +179,7 @@ def test_stopping_ends_timer_and_threads():
     recorder, engine = Recorder(waits=True), Engine()
     recorder.renderer.request(request())
     recorder.started.wait()
-    redraw.redraw_when_rendered(recorder.renderer, engine)
+    engine_viewport.redraw_when_rendered(recorder.renderer, engine)
 
     def finish_image_once_cancelled() -> None:
         while recorder.renderer._request is not None:
@@ -187,8 +187,8 @@ def test_stopping_ends_timer_and_threads():
         recorder.go.release(10**6)
 
     threading.Thread(target=finish_image_once_cancelled).start()
-    redraw.stop()
-    assert not bpy.app.timers.is_registered(redraw._poll)
+    engine_viewport.stop_redraws()
+    assert not bpy.app.timers.is_registered(engine_viewport._poll)
     assert not recorder.renderer.is_busy()
     assert len(recorder.rendered) == 1
     assert engine.threads == []

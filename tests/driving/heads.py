@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from flame.mouths import open_flame
 
-from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
+from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT
 from stga_addon.driving.shapes import face_points, face_shapes
 from stga_addon.flame.model import FlameModel
 

@@ -13,8 +13,7 @@ from stga_addon.capture.camera import look_at
 from stga_addon.cli.main import main
 from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.driving.inverse import write_performance
-from stga_addon.driving.names import COLUMN
-from stga_addon.driving.performance import Performance
+from stga_addon.driving.performance import COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
 from stga_addon.flame.forward import flame_forward, neutral_frame
 from stga_addon.flame.sequence import read_motion, sequence_mesh

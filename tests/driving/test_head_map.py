@@ -9,9 +9,8 @@ from scipy.optimize import least_squares
 from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.driving.head_map import head_map, head_turns
 from stga_addon.driving.inverse import arkit_weights, captured_performance, head_angles, write_performance
-from stga_addon.driving.names import ARKIT_SHAPES, COLUMN
 from stga_addon.driving.open_motion import MotionOptions, performed
-from stga_addon.driving.performance import Performance
+from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
 from stga_addon.driving.shapes import effective_weights, face_points
 from stga_addon.errors import StgaError

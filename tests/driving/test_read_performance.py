@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, arkit_name
-from stga_addon.driving.performance import Performance, mirrored, resampled, smoothed
+from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance, arkit_name, mirrored, resampled, smoothed
 from stga_addon.driving.read_performance import is_performance, read_performance
 from stga_addon.errors import StgaError
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stga_addon.driving.open_motion import MotionOptions, adapted
-from stga_addon.driving.performance import Performance, relative_to
-from stga_addon.driving.transfer import (
+from stga_addon.driving.open_motion import (
+    MotionOptions,
+    adapted,
     exchanged_neutral,
     led_back,
     outside,
@@ -15,6 +15,7 @@ from stga_addon.driving.transfer import (
     quiet_weights,
     trained_range,
 )
+from stga_addon.driving.performance import Performance, relative_to
 from stga_addon.flame.forward import FlameFrame
 
 ZERO = np.zeros(3)

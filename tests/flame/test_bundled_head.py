@@ -8,8 +8,7 @@ from stga_addon.development.arkit_shapes import ict_names
 from stga_addon.development.bundled_head import collapsed
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.inverse import arkit_weights
-from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
-from stga_addon.driving.performance import Performance
+from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
 from stga_addon.flame.forward import FlameFrame, flame_forward, joint_positions, neutral_frame
 from stga_addon.flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M, key_regions, torso_faces
 from stga_addon.flame.sequence import FlameSequence

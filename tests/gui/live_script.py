@@ -101,7 +101,7 @@ def count_draws() -> None:
 def steps() -> Any:
     set_up()
     yield 0.5
-    sys.modules[f"{extension}.stga_addon.scene.viewports"].open_sidebar("STGA", bpy.data.screens)
+    sys.modules[f"{extension}.stga_addon.scene.avatar_scene"].open_sidebar("STGA", bpy.data.screens)
     yield 0.5
     threading.Thread(target=send, daemon=True).start()
     window, area, region = viewport()

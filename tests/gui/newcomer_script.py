@@ -24,7 +24,7 @@ STARTED = time.monotonic()
 seen: dict[str, Any] = {"version": bpy.app.version_string}
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 monitor = sys.modules[f"{extension}.operators.monitor"]
-open_sidebar = sys.modules[f"{extension}.stga_addon.scene.viewports"].open_sidebar
+open_sidebar = sys.modules[f"{extension}.stga_addon.scene.avatar_scene"].open_sidebar
 bpy.context.preferences.view.show_splash = False
 
 

@@ -23,7 +23,7 @@ from stga_addon.capture.camera import Camera
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.lamps import ShadowMap
-from stga_addon.light.transfer import transfer_of
+from stga_addon.light.surface import transfer_of
 from stga_addon.light.values import Light
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats

@@ -8,7 +8,7 @@ from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.color import linear_to_srgb
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import HIGHLIGHT_SHARE
-from stga_addon.light.transfer import Bounce, transfer_of
+from stga_addon.light.surface import Bounce, transfer_of
 
 RADIUS = 0.1
 

@@ -10,7 +10,7 @@ from light.scenes import ball_and_plate
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.estimate import HARD_RESIDUAL, fit_light, recorded_irradiance, wet_roughness
 from stga_addon.light.harmonics import LAMBERT, basis, even_directions, project, rotated, uniform
-from stga_addon.light.transfer import Bounce, transfer_of
+from stga_addon.light.surface import Bounce, transfer_of
 
 SKIN = np.array([0.5, 0.36, 0.25])
 

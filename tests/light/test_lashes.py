@@ -11,10 +11,9 @@ from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
-from stga_addon.light.surface import surface_points
-from stga_addon.light.transfer import transfer_of
+from stga_addon.light.surface import surface_points, transfer_of
 from stga_addon.light.values import Light, Lighting
-from stga_addon.scene.gpu.relit_packing import relit_scene
+from stga_addon.scene.gpu.packing import relit_scene
 from stga_addon.scene.layers import Relit, SceneLayer
 
 EYE_RADIUS, LID_HEIGHT = 0.012, 0.016

@@ -74,12 +74,10 @@ def _render(
         with device.record() as work:
             rendering = rasterizer.forward(work, table, frames, options, rasterizer.upload_view(table, options))
             if cotangents is not None:
-                rasterizer.backward(work, rendering, table, v_images[0], gradients, v_images[1])
+                rasterizer.backward(work, rendering, table, options.camera, v_images[0], gradients, v_images[1])
         if rasterizer.pairs_fit():
             break
-    pixels, rows = (
-        device.read(rendering.pixels, (height, width, 2)),
-        device.read(gradients, (table.count, table.stride)),
-    )
-    image = device.read(rendering.image, (3, height, width))
+    pixels = device.read(rendering["pixels"], (height, width, 2))
+    rows = device.read(gradients, (table.count, table.stride))
+    image = device.read(rendering["image"], (3, height, width))
     return image, pixels[..., 0].copy(), split_rows(rows, table.coefficients)

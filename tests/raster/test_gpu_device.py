@@ -1,6 +1,8 @@
 """The WebGPU device: buffers, uploads, dispatches and what is said when something fails."""
 
-from collections.abc import Callable
+import importlib
+from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from raster import gpu_device
 from stga_addon.errors import StgaError
 from stga_addon.raster.gpu import device as device_module
 from stga_addon.raster.gpu.adapters import adapters
-from stga_addon.raster.gpu.device import Device, Kernel, Readback
+from stga_addon.raster.gpu.device import Device, Readback
 
 pytestmark = pytest.mark.needs("adapter")
 
@@ -29,12 +31,11 @@ def device() -> Device:
     return gpu_device.device()
 
 
-@pytest.fixture
-def numbers(device: Device, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Kernel]:
-    """A kernel that adds STEP times its index to every word."""
+@pytest.fixture(autouse=True)
+def numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel "numbers.main" adds STEP times its index to every word."""
     source = device_module._source
     monkeypatch.setattr(device_module, "_source", lambda name: NUMBERS if name == "numbers" else source(name))
-    return lambda **constants: device.kernel("numbers", **constants)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int32])
@@ -46,30 +47,27 @@ def test_arrays_arrive_whole(device: Device, dtype: type, count: int) -> None:
     np.testing.assert_array_equal(device.read(buffer, values.shape, dtype), values)
 
 
-def test_every_thread_of_a_long_dispatch_runs_once(
-    device: Device, numbers: Callable[..., Kernel], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_thread_of_a_long_dispatch_runs_once(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches threads beyond the longest row of workgroups that are lost or run twice."""
     monkeypatch.setattr(device_module, "MAX_GROUPS", 7)
     count = 100 * 256 + 10
-    assert device.groups(count)[1] > 10
+    assert device.groups_of(count // 256)[1] > 10
     buffer = device.buffer("many", count)
     with device.record() as work:
         work.clear(buffer)
-        work.dispatch(numbers(), device.groups(count), numbers=buffer)
+        work.dispatch("numbers.main", count, {"numbers": buffer})
     expected = np.arange(count, dtype=np.uint32)
     np.testing.assert_array_equal(device.read(buffer, (count,), np.uint32), expected)
 
 
-def test_recorded_work_runs_in_order_in_one_submit(device: Device, numbers: Callable[..., Kernel]) -> None:
+def test_recorded_work_runs_in_order_in_one_submit(device: Device) -> None:
     """Catches a dispatch that does not see what an earlier dispatch, copy or constant did."""
     words, submits, dispatches = 1000, device.submits, device.dispatches
     source, target = device.upload("source", np.full(words, 5, np.uint32)), device.buffer("target", words)
-    one, three, groups = numbers(), numbers(STEP=3), device.groups(words)
     with device.record() as work:
         work.copy(source, target, words)
-        work.dispatch(one, groups, numbers=target)
-        work.dispatch(three, groups, numbers=target)
+        work.dispatch("numbers.main", words, {"numbers": target})
+        work.dispatch("numbers.main", words, {"numbers": target}, STEP=3)
     assert device.submits == submits + 1
     assert device.dispatches == dispatches + 2
     np.testing.assert_array_equal(device.read(target, (words,), np.uint32), 5 + 4 * np.arange(words))
@@ -85,12 +83,12 @@ def test_an_upload_does_not_change_work_submitted_before(device: Device) -> None
     assert (device.read(kept, (1 << 20,), np.uint32) == 1).all()
 
 
-def test_groups_from_the_device(device: Device, numbers: Callable[..., Kernel]) -> None:
+def test_groups_from_the_device(device: Device) -> None:
     """Catches an indirect dispatch at the wrong offset."""
     groups, target = device.upload("groups", np.uint32([9, 9, 9, 2, 1, 1]), "indirect"), device.buffer("two", 1024)
     with device.record() as work:
         work.clear(target)
-        work.dispatch(numbers(), (groups, 12), numbers=target)
+        work.dispatch("numbers.main", (groups, 12), {"numbers": target})
     found = device.read(target, (1024,), np.uint32)
     np.testing.assert_array_equal(found, np.where(np.arange(1024) < 512, np.arange(1024), 0))
 
@@ -149,14 +147,50 @@ def test_a_lost_device_is_told_to_who_waits(device: Device, monkeypatch: pytest.
     device.failures.clear()
 
 
-def test_missing_bindings_are_refused(device: Device, numbers: Callable[..., Kernel]) -> None:
-    """Catches a dispatch with a buffer too many, which would be ignored."""
-    buffer = device.buffer("few", 4)
-    with pytest.raises(TypeError, match=r"numbers\.main binds"):
-        device.record().dispatch(numbers(STEP=2), (1, 1, 1), numbers=buffer, others=buffer)
+def test_missing_tables_are_refused(device: Device) -> None:
+    """Catches a dispatch that would read what another one bound."""
+    with pytest.raises(KeyError, match="numbers"):
+        device.record().dispatch("numbers.main", (1, 1, 1), {"others": device.buffer("few", 4)})
 
 
 def test_adapters_have_names_of_their_own() -> None:
     """Catches two equal cards of which only one can be chosen."""
     assert len(adapters()) == len(set(adapters()))
     assert all(name.strip() for name in adapters())
+
+
+def count_up(device: Device, count: int, repeats: int) -> None:
+    """Dispatch a kernel of `count` threads in one recording."""
+    buffer = device.buffer("counted", count)
+    with device.record() as work:
+        for _ in range(repeats):
+            work.dispatch("numbers.main", count, {"numbers": buffer})
+
+
+def test_every_dispatch_is_timed(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches stamps of another dispatch or recording, lost beyond the first, in another unit, or read twice."""
+    if "timestamp-query" not in device.gpu.features:
+        pytest.skip(f"{device.name} has no timestamp queries")
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "benchmarks")
+    gpu_kernels = importlib.import_module("gpu_kernels")
+    monkeypatch.setattr(gpu_kernels, "MAX_DISPATCHES", 90)
+    count = 500_000
+    count_up(device, count, 1)
+    device.kernel_times = times = gpu_kernels.KernelTimes(device.gpu)
+    try:
+        begin = perf_counter()
+        for repeats in (1, 50, 7):
+            count_up(device, count, repeats)
+        found = times.read()
+        elapsed_ms = 1e3 * (perf_counter() - begin)
+        assert list(found) == ["numbers.main"]
+        assert 0.2 * elapsed_ms < found["numbers.main"] <= elapsed_ms
+        assert times.read() == {}
+        count_up(device, 10, 1)
+        assert 0 < times.read()["numbers.main"] < found["numbers.main"] / 20
+        count_up(device, 10, 100)  # more than there is room for
+        assert times.read()["numbers.main"] > 0
+    finally:
+        device.kernel_times = None
+    count_up(device, 10, 1)
+    assert times.read() == {}

@@ -16,12 +16,12 @@ from raster.test_kernels import (
     random_cotangents,
 )
 from stga_addon.avatar.embedding import WORLD
-from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.cpu.rasterize import frames_in_camera
+from stga_addon.raster.cpu.layout import PROJECTED, Parameters
+from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
 from stga_addon.raster.gpu import trial
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import split_rows
-from stga_addon.raster.gpu.rasterize import Rasterizer, Rendering, ViewOptions, upload_frames, upload_splats
+from stga_addon.raster.gpu.rasterize import Rasterizer, Tables, ViewOptions, mark_focus, upload_frames, upload_splats
 
 pytestmark = pytest.mark.needs("adapter")
 
@@ -40,10 +40,10 @@ class Raw:
     def read(self, buffer, *shape: int, dtype: type = np.float32) -> np.ndarray:
         return self.device.read(buffer, shape, dtype)
 
-    def image(self, rendering: Rendering) -> np.ndarray:
-        return self.read(rendering.image, 3, self.scene.camera.height, self.scene.camera.width)
+    def image(self, rendering: Tables) -> np.ndarray:
+        return self.read(rendering["image"], 3, self.scene.camera.height, self.scene.camera.width)
 
-    def forward(self, focus: np.ndarray | None = None, reach: int = 0, background=(0, 0, 0)) -> Rendering:
+    def forward(self, focus: np.ndarray | None = None, reach: int = 0, background=(0, 0, 0)) -> Tables:
         self.table = upload_splats(self.device, self.splats, np.zeros(self.count, np.int32))
         frames = upload_frames(self.device, frames_in_camera(WORLD, self.scene.camera))
         options = ViewOptions(
@@ -55,16 +55,16 @@ class Raw:
             view = self.rasterizer.upload_view(self.table, options)
             return self.rasterizer.forward(work, self.table, frames, options, view, marked)
 
-    def gradients(
-        self, rendering: Rendering, fill: float = 0.0
-    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    def gradients(self, rendering: Tables, fill: float = 0.0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
         """Gradients by name, the rows written, and those rows' screen gradient."""
         table, device = self.table, self.device
         gradients = device.upload("gradients", np.full((table.count, table.stride), fill, np.float32))
         v_image, v_transmittance = (device.upload(f"v {n}", v) for n, v in enumerate(self.cotangents))
         with device.record() as work:
-            screen = self.rasterizer.backward(work, rendering, table, v_image, gradients, v_transmittance)
-        written = np.flatnonzero(self.read(rendering.lists.wanted, self.count, dtype=np.uint32))
+            screen = self.rasterizer.backward(
+                work, rendering, table, self.scene.camera, v_image, gradients, v_transmittance
+            )
+        written = np.flatnonzero(self.read(rendering["wanted"], self.count, dtype=np.uint32))
         rows = split_rows(self.read(gradients, table.count, table.stride), table.coefficients)
         return {name: getattr(rows, name) for name in NAMES}, written, self.read(screen, self.count)[written]
 
@@ -94,17 +94,18 @@ def test_screen_gradient_is_the_other_back_ends() -> None:
     np.testing.assert_allclose(screen, expected[written], atol=GRADIENT_TOLERANCE["xyz"] * expected[written].max())
 
 
-def test_focused_rendering_gives_selected_rows_the_full_images_gradient() -> None:
+@pytest.mark.parametrize("count", [80, 700])
+def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count: int) -> None:
     """Catches a local iteration whose restricted tiles change a selected gradient, or touch another row."""
-    scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
-    focus = np.zeros(80, bool)
+    scene = cloud(21, count=count, size=(100, 70), log_scale=-3.0)
+    focus = np.zeros(count, bool)
     focus[[3, 17, 40]] = True
     raw = Raw(scene)
     rendering = raw.forward()
     image = raw.image(rendering)
     full, all_written, full_screen = raw.gradients(rendering)
     part = raw.forward(focus, reach=10)
-    rendered = raw.read(part.tile_table.rendered, 5, 7, dtype=np.uint32) > 0
+    rendered = raw.read(part["rendered"], 5, 7, dtype=np.uint32) > 0
     assert 0 < rendered.sum() < rendered.size
     pixels = np.kron(rendered, np.ones((16, 16), bool))[:70, :100]
     np.testing.assert_array_equal(raw.image(part)[:, pixels], image[:, pixels])
@@ -167,8 +168,46 @@ def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def loses_a_tile(self, work, rendering, *arguments):
         work.clear(work.device.buffer("pair_gradients", 0))  # which hold the right ones of the first trial
-        work.clear(rendering.tile_table.touched, 12)
+        work.clear(rendering["touched"], 12)
         return backward(self, work, rendering, *arguments)
 
     monkeypatch.setattr(Rasterizer, "backward", loses_a_tile)
     assert not trial.try_device(device).is_right
+
+
+@pytest.mark.parametrize("field", NAMES)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_broken_splat_is_dropped(field: str, value: float) -> None:
+    """Catches NaN and infinity that reach the screen, and neighbors that change because of them."""
+    scene = SCENES["plain"]
+    raw = Raw(scene, Rasterizer(gpu_device.device()))
+
+    def projected() -> tuple[np.ndarray, np.ndarray]:
+        tables = raw.forward()
+        return raw.read(tables["rect"], raw.count, 4, dtype=np.int32), raw.read(
+            tables["projected"], raw.count, PROJECTED
+        )
+
+    bounds, expected = projected()
+    row = int(np.flatnonzero(bounds[:, 2] > bounds[:, 0])[3])
+    raw.splats = Parameters(*(scene.splats[name].copy() for name in NAMES))
+    getattr(raw.splats, field).reshape(raw.count, -1)[row, 0] = value
+    frames = frames_in_camera(WORLD, scene.camera)
+    on_cpu = render_forward(raw.splats, np.zeros(raw.count, np.int32), frames, scene.degree).projection.rect
+    found, columns = projected()
+    visible, others = found[:, 2] > found[:, 0], np.arange(raw.count) != row
+    np.testing.assert_array_equal(found[others], bounds[others])
+    np.testing.assert_array_equal(columns[others & visible], expected[others & visible])
+    assert np.isfinite(columns[visible]).all()
+    assert visible[row] == (on_cpu[row, 2] > on_cpu[row, 0])
+
+
+def test_focus_is_the_selected_triangles_splats() -> None:
+    """Catches a triangle's byte read from the wrong place of its word."""
+    rng, raw = np.random.default_rng(2), Raw(SCENES["plain"], Rasterizer(gpu_device.device()))
+    selected, face = rng.random(9) < 0.5, rng.integers(0, 9, raw.count).astype(np.int32)
+    table = upload_splats(raw.device, raw.splats, face)
+    with raw.device.record() as work:
+        view = raw.rasterizer.upload_view(table, ViewOptions(raw.scene.camera, 3))
+        focus = mark_focus(work, table, view, raw.device.upload("selected", selected.astype(np.uint8)))
+    np.testing.assert_array_equal(raw.read(focus, raw.count, dtype=np.uint32), selected[face])

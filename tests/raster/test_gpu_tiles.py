@@ -10,7 +10,7 @@ from raster.test_outline import covariances
 from stga_addon.raster.cpu.layout import PROJECTED, TILE
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED, WORKGROUP
-from stga_addon.raster.gpu.tiles import INCLUDE, choose_tiles, counts_buffer, list_pairs, sort_keys
+from stga_addon.raster.gpu.rasterize import choose_tiles, counts_buffer, list_pairs, sort_keys
 
 pytestmark = pytest.mark.needs("adapter")
 
@@ -43,7 +43,7 @@ def test_sorted_keys_are_numpys(device: Device, count: int, kind: str) -> None:
         "reversed": 0xFFFFFF00 - np.arange(count),
     }[kind].astype(np.uint32)
     with device.record() as work:
-        found = sort_keys(work, device.upload("keys", keys), count, 32, view=view_of(device, count))
+        found = sort_keys(work, device.upload("keys", keys), count, 32, view_of(device, count))
     order = np.argsort(keys, kind="stable")
     np.testing.assert_array_equal(device.read(found[1], (count,), np.uint32), order)
     np.testing.assert_array_equal(device.read(found[0], (count,), np.uint32), keys[order])
@@ -70,21 +70,21 @@ def listed(
     count, tiles = len(rect), TILES_X * TILES_Y
     if columns is None:
         columns = np.tile(np.float32([0, 0, 1e-9, 0, 1e-9, 1, 0, 0, 0]), (count, 1))
-    view, rects = view_of(device, count, capacity, focus is not None, ring), device.upload("rect", rect)
-    given = {"view": view, "rect": rects}
-    given["focus"] = None if focus is None else device.upload("focus", focus.astype(np.uint32))
-    keys = device.upload("depth_key", depth_key)
+    given = {
+        "rect": rect,
+        "depth_key": depth_key,
+        "projected": columns,
+        "focus": np.uint32(0 if focus is None else focus),
+    }
+    tables = {name: device.upload(name, np.atleast_1d(values)) for name, values in given.items()}
+    tables["view"] = view_of(device, count, capacity, focus is not None, ring)
     with device.record() as work:
-        chosen = choose_tiles(work, count, tiles, **given)
-        projected = device.upload("projected", columns)
-        lists = list_pairs(
-            work, count, tiles, capacity, depth_key=keys, projected=projected, tile_table=chosen, **given
-        )
+        choose_tiles(work, count, tiles, tables, focus is not None)
+        list_pairs(work, count, tiles, capacity, tables)
     counts = device.read(counts_buffer(device), (COUNTS,), np.uint32)
     shapes = {"touched": (tiles,), "rendered": (tiles,), "tile_range": (tiles, 2)}
     shapes |= dict.fromkeys(("pair_slot", "slot_splat"), (int(counts[PAIRS]),))
     shapes |= {"slots": (count, 2), "wanted": (count,)}
-    tables = chosen._asdict() | lists._asdict()
     found = {name: device.read(tables[name], shape, np.uint32) for name, shape in shapes.items()}
     return found | {"counts": counts, "pair_splat": found["slot_splat"][found["pair_slot"]] & (WANTED - 1)}
 
@@ -157,12 +157,10 @@ def test_pairs_that_do_not_fit_change_nothing_until_the_host_makes_room(device: 
 
 def test_a_count_beyond_32_bits_is_too_many(device: Device) -> None:
     """Catches a sum that wraps around to a small number: of three workgroups with 2³¹ − 1 pairs each."""
-    names = ("order", "rect", "rendered", "projected", "focus", "wanted")
-    given = {name: device.upload(f"unused {name}", np.zeros(4, np.uint32)) for name in names}
     until = device.upload("pairs_until", np.full(3 * WORKGROUP + 3, 0x7FFFFFFF, np.uint32))
-    given |= {"view": view_of(device, 3 * WORKGROUP), "counts": counts_buffer(device), "pairs_until": until}
+    tables = {"view": view_of(device, 3 * WORKGROUP), "counts": counts_buffer(device), "pairs_until": until}
     with device.record() as work:
-        work.dispatch(device.kernel("count_pairs", "total", INCLUDE), (1, 1, 1), **given)
+        work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
     counts = device.read(counts_buffer(device), (COUNTS,), np.uint32)
     device.upload("counts", np.zeros(COUNTS, np.uint32))
     assert counts[NEEDED] == 0x7FFFFFFF

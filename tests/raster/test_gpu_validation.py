@@ -16,16 +16,15 @@ from pathlib import Path
 from render.test_compose import CAMERA, scene
 from stga_addon.capture.open import open_capture
 from stga_addon.raster.gpu import compose
-from training.test_gpu_backend import batch_of
-from training.test_gpu_driven_offsets import position_settings, state_of
+from training.test_gpu_backend import batch_of, disturbed, settings_of
 from stga_addon.training.optimize.trainer import make_backend
 from stga_addon.training.optimize.frames import FrameStore
 
 adapter, root = sys.argv[1:]
 compose.compose(adapter, scene(), CAMERA, True)
-toy, settings = open_capture(Path(root)), position_settings()
+toy, settings = open_capture(Path(root)), settings_of()
 frames = FrameStore(toy, settings.convention, True)
-backend = make_backend(f"gpu:{adapter}", settings, frames, state_of(toy, settings))
+backend = make_backend(f"gpu:{adapter}", settings, frames, disturbed(toy, settings))
 for part in (None, toy.regions["mouth"]):
     backend.step(batch_of(toy, settings, selected=part))
 assert len(backend.state.steps)

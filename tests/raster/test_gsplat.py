@@ -69,7 +69,7 @@ def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
     from .test_gpu_rasterize import Raw
 
     raw = Raw(scene(), antialiased=antialiased)
-    return raw.read(raw.forward().projected, 24, PROJECTED)
+    return raw.read(raw.forward()["projected"], 24, PROJECTED)
 
 
 def scene():

@@ -91,6 +91,7 @@ SCENES = {
     "faint": cloud(18, logit=-4.0),
     "dark": replace(cloud(19), splats=cloud(19).splats | {"sh": cloud(19).splats["sh"] - 0.5}),
     "single": cloud(20, count=1, spread=0.0, log_scale=-1.0, logit=2.0),
+    "many layers": cloud(30, count=700, size=(40, 40), log_scale=-1.5, logit=-3.0),
 }
 
 

@@ -15,9 +15,9 @@ from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.gpu import compose as gpu
 from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
 from stga_addon.render import client as render_client
-from stga_addon.render import compose as compose_module
+from stga_addon.render import device as compose_module
 from stga_addon.render.client import RenderClient
-from stga_addon.render.compose import Composer
+from stga_addon.render.device import Composer
 
 TOLERANCE = 2e-5
 

@@ -16,8 +16,8 @@ from stga_addon.jobs.folder import write_request
 from stga_addon.jobs.perform import perform_in_folder
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
-from stga_addon.render.protocol import pack_layers, unpack_layers
-from stga_addon.render.recording import Recorder, check_output, finished
+from stga_addon.render.server import pack_layers, unpack_layers
+from stga_addon.render.video import Recorder, check_output, finished
 from stga_addon.worker.status import inspect_worker, request_cancel
 
 IMAGES = "recording.bin"

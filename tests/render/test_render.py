@@ -84,7 +84,7 @@ def test_a_gpu_renders_the_same_picture() -> None:
 
     from stga_addon.avatar.embedding import face_frames
     from stga_addon.avatar.strain import strain_basis
-    from stga_addon.render.compose import Composer
+    from stga_addon.render.device import Composer
 
     posed, neutral, faces = bent_ball()
     count, random = len(faces), np.random.default_rng(3)

@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.errors import StgaError
-from stga_addon.render.recording import check_output
-from stga_addon.render.video import sequence_writer, video_writer
+from stga_addon.render.video import check_output, sequence_writer, video_writer
 
 FPS = 12.5
 

@@ -189,7 +189,7 @@ def test_a_small_glb_is_read(tmp_path):
 def test_shape_keys_become_a_linear_model(tmp_path):
     """Catches shape keys in Blender's axes or object space, and those relative to others, in the model's file."""
     pytest.importorskip("bpy", reason="bpy is not installed")
-    from stga_addon.scene.shape_keys import shape_key_model
+    from stga_addon.scene.rig.head import shape_key_model
 
     head = blender_head(MESH.v_template, MESH.faces, NAMES, SHAPES)
     head.location = (0, 0, 0.3)

@@ -117,9 +117,8 @@ def _train(
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat from numpy's."""
     from ...scene.avatar_scene import show_on_head
-    from ...scene.blend_file import object_named, open_file, save_file
+    from ...scene.blend_file import go_to_frame, object_named, open_file, save_file
     from ...scene.display.splat_object import evaluated_splats
-    from ...scene.timeline import go_to_frame
 
     name = show_on_head(avatar, head, "//avatar.npz", FRAMES_PER_SECOND).name
     save_file(path)

@@ -4,8 +4,7 @@ import struct
 
 import numpy as np
 
-from ..names import ARKIT_SHAPES, COLUMN, COUNT, MAX_WEIGHT, OPTIONAL
-from ..performance import FacePacket
+from ..performance import ARKIT_SHAPES, COLUMN, COUNT, MAX_WEIGHT, OPTIONAL, FacePacket
 
 VERSION = 6
 MAX_TEXT_BYTES = 512

@@ -1,15 +1,21 @@
-"""The live sources that can be listened to, and their socket, which is read without waiting."""
+"""Live sources: their sockets, read without waiting, whose packets count, how well they arrive, and recordings."""
 
 import ipaddress
 import socket
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from statistics import median
 from typing import Any
+
+import numpy as np
 
 from ...errors import StgaError
 from .. import read_performance
-from ..performance import FacePacket
+from ..open_motion import MotionOptions, corrected
+from ..performance import FacePacket, Performance
+from ..read_performance import DEFAULT_FPS, MAX_FPS, MAX_ROWS
 from . import live_link_face, vmc
 
 Decoded = tuple[FacePacket | None, Any]
@@ -43,10 +49,6 @@ def _single(decode: Callable[[bytes], FacePacket | None]) -> Callable[[bytes, An
     return decoded
 
 
-def _decode_vmc(data: bytes, known: Any) -> Decoded | None:
-    return vmc.decode(data, known or vmc.Received())
-
-
 SOURCES = {
     "live_link_face": Source(
         "Live Link Face",
@@ -64,7 +66,7 @@ SOURCES = {
     "vmc": Source(
         "VMC (OSC)",
         39539,
-        _decode_vmc,
+        lambda data, known: vmc.decode(data, known or vmc.Received()),
         hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are left out",
     ),
 }
@@ -140,3 +142,230 @@ def leaves_this_machine(source: Source, address: str, phone: str) -> bool:
     if not checked_address("address to listen on", address).is_loopback:
         return True
     return bool(source.request) and not checked_address("phone's address", phone).is_loopback
+
+
+Sender = tuple[str, str]
+"""Address and subject: two phones may share either."""
+
+MAX_SENDERS = 8
+"""Kept in memory; of more, those silent for longest are forgotten."""
+SILENCE_S = 2.0
+"""Without a packet, after which another sender is followed."""
+RESTART_S = 1.0
+"""A clock set back by more is a source that started anew; by less, a packet that came late."""
+PAUSE_S = 2.0
+"""Longer gaps are pauses of the source, not lost packets."""
+GAP = 1.5
+"""Packets farther apart than this many usual steps have lost some between them."""
+STEPS, ARRIVALS = 31, 240
+"""Steps of the source's clock, and arrivals, that are remembered."""
+RATE_WINDOW_S = 2.0
+
+
+@dataclass(frozen=True)
+class Health:
+    """How well packets arrive.
+
+    rate     packets per second of the last seconds
+    lost     packets that never came, by the source's clock; None: it sends no clock
+    late     packets that came after later ones, or twice
+    foreign  datagrams that are none of this source's
+    delay_s  seconds that the last packet came later, by the source's clock, than the quickest of the last seconds: what
+             the network adds to its shortest time, which cannot be measured from one side; None without a clock
+    """
+
+    rate: float = 0.0
+    lost: int | None = None
+    late: int = 0
+    foreign: int = 0
+    delay_s: float | None = None
+
+
+@dataclass
+class Stream:
+    """What has arrived from a source. Times are seconds of this machine's clock.
+
+    chosen    sender to follow; None: the first that is heard, until it falls silent
+    followed  sender whose packets count now
+    senders   all that were heard lately, and when
+    latest    the last packet with a face that counted
+    has_face  whether the last packet that counted had one
+    """
+
+    source: Source
+    chosen: Sender | None = None
+    followed: Sender | None = None
+    senders: OrderedDict[Sender, float] = field(default_factory=OrderedDict)
+    latest: FacePacket | None = None
+    has_face: bool = False
+    lost: int = 0
+    late: int = 0
+    foreign: int = 0
+    _known: OrderedDict[str, Any] = field(default_factory=OrderedDict)
+    _time: float | None = None
+    _steps: deque[float] = field(default_factory=lambda: deque(maxlen=STEPS))
+    _arrivals: deque[tuple[float, float | None]] = field(default_factory=lambda: deque(maxlen=ARRIVALS))
+
+    def receive(self, address: str, data: bytes, now: float) -> FacePacket | None:
+        """Take a datagram; the frame that it holds, where it counts: of the followed sender, with a face, in order."""
+        decoded = self.source.decode(data, self._known.get(address))
+        if decoded is None:
+            self.foreign += 1
+            return None
+        packet, known = decoded
+        _remember(self._known, address, known)
+        if packet is None:
+            return None
+        sender = (address, packet.subject)
+        _remember(self.senders, sender, now)
+        if self.chosen is None and sender != self.followed:  # followed where nobody else is to be
+            silent = self.silent_s(now)
+            if self.followed is None or silent is None or silent > SILENCE_S:
+                self._start(sender)
+        if sender != self.followed or not self._is_next(packet.time):
+            return None
+        self._arrivals.append((now, packet.time))
+        self.has_face = packet.weights is not None
+        if packet.weights is None:
+            return None
+        self.latest = packet
+        return packet
+
+    def follow(self, sender: Sender) -> None:
+        """Follow a sender from now on, also while it is silent."""
+        self.chosen = sender
+        self._start(sender)
+
+    def silent_s(self, now: float) -> float | None:
+        """Seconds since the last packet that counted; None before the first."""
+        return now - self._arrivals[-1][0] if self._arrivals else None
+
+    def health(self, now: float) -> Health:
+        recent = [arrival for arrival in self._arrivals if now - arrival[0] <= RATE_WINDOW_S]
+        span = recent[-1][0] - recent[0][0] if len(recent) > 1 else 0.0
+        rate = (len(recent) - 1) / span if span > 0 else 0.0
+        offsets = [arrived - time for arrived, time in self._arrivals if time is not None]
+        delay = offsets[-1] - min(offsets) if offsets else None
+        return Health(rate, self.lost if offsets else None, self.late, self.foreign, delay)
+
+    def _start(self, sender: Sender) -> None:
+        if sender != self.followed:
+            self.followed = sender
+            self._forget_clock()
+
+    def _forget_clock(self) -> None:
+        self._time = None
+        self._steps.clear()
+        self._arrivals.clear()
+
+    def _is_next(self, time: float | None) -> bool:
+        """Whether a packet of the source's `time` is later than those before; counts what is lost between them."""
+        if time is None:
+            return True
+        before = self._time
+        if before is not None and before - RESTART_S < time <= before:
+            self.late += 1
+            return False
+        if before is not None and time < before:
+            self._forget_clock()
+        elif before is not None:
+            step = time - before
+            steps = step / median(self._steps) if self._steps else 0.0
+            if steps > GAP and step < PAUSE_S:
+                self.lost += round(steps) - 1
+            self._steps.append(step)
+        self._time = time
+        return True
+
+
+def _remember(table: OrderedDict[Any, Any], key: Any, value: Any) -> None:
+    """Store the value as the newest of at most MAX_SENDERS."""
+    table[key] = value
+    table.move_to_end(key)
+    while len(table) > MAX_SENDERS:
+        table.popitem(last=False)
+
+
+RESTING_PACKETS = 15
+"""Whose mean is the resting face: a quarter of a second."""
+MIN_STEP_S = 2 / MAX_FPS
+"""Between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
+MAX_LEAD_S = 5.0
+"""By which a source's clock may be ahead of the packets' arrival: a usual socket keeps packets for 4 s while Blender is
+busy. Beyond it, the clock was set, or is another's."""
+
+
+def row_of(packet: FacePacket) -> Performance:
+    """A packet with a face as a performance of one row."""
+    assert packet.weights is not None
+    head = None if packet.head is None else np.array([packet.head])
+    return Performance(np.zeros(1), packet.weights[None], head, DEFAULT_FPS)
+
+
+def resting(packets: list[FacePacket]) -> Performance:
+    """The mean of packets with a face, one at least, as one row."""
+    rows = [row_of(packet) for packet in packets]
+    heads = [row.head for row in rows if row.head is not None]
+    weights = np.mean([row.weights for row in rows], axis=0)
+    return replace(rows[-1], weights=weights, head=np.mean(heads, axis=0) if len(heads) == len(rows) else None)
+
+
+def eased(before: Performance | None, row: Performance, step_s: float, smoothing_s: float) -> Performance:
+    """The row, drawn towards the one before it: a low-pass filter of time constant `smoothing_s`."""
+    if before is None or smoothing_s <= 0:
+        return row
+    share = 1 - np.exp(-step_s / smoothing_s)
+    head = row.head
+    if head is not None and before.head is not None:
+        head = before.head + share * (head - before.head)
+    return replace(row, weights=before.weights + share * (row.weights - before.weights), head=head)
+
+
+@dataclass
+class Recording:
+    """Packets of a take with their times: steps of the source's clock, or of arrival where it has none or jumps.
+
+    start  Blender frame at which it began
+    rest   the performer's resting face, which is taken off; None: nothing is
+    """
+
+    start: int
+    rest: Performance | None
+    exchange: tuple[str, ...] = ()
+    _times: list[float] = field(default_factory=list)
+    _packets: list[FacePacket] = field(default_factory=list)
+    _arrived: float = 0.0
+
+    def add(self, packet: FacePacket, now: float) -> None:
+        """Take a packet that arrived at `now`; of more than a performance may have, the rest are left out."""
+        time = now
+        if self._packets:
+            before, last, step = self._times[-1], self._packets[-1], now - self._arrived
+            if packet.time is not None:
+                own = -1.0 if last.time is None else packet.time - last.time
+                has_jumped = own <= 0 or before + own > now + MAX_LEAD_S or packet.subject != last.subject
+                step = max(step, MIN_STEP_S) if has_jumped else own
+            time = before + step
+            if step < MIN_STEP_S or len(self._times) >= MAX_ROWS:
+                return
+        self._arrived = now
+        self._times.append(time)
+        self._packets.append(packet)
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def performance(self) -> Performance | None:
+        """What was recorded, with the resting face taken off; None for fewer than two rows."""
+        if len(self._times) < 2:
+            return None
+        rows = [row_of(packet) for packet in self._packets]
+        heads = [row.head for row in rows if row.head is not None]
+        times = np.array(self._times) - self._times[0]
+        raw = Performance(
+            times,
+            np.concatenate([row.weights for row in rows]),
+            np.concatenate(heads) if len(heads) == len(rows) else None,
+            1 / float(np.median(np.diff(times))),
+        )
+        return corrected(raw, MotionOptions(exchange=self.exchange), self.rest)

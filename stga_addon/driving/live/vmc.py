@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..names import COLUMN, COUNT, MAX_WEIGHT, arkit_name
-from ..performance import FacePacket
+from ..performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, arkit_name
 
 Value = int | float | str | bytes | bool | None
 Message = tuple[str, tuple[Value, ...]]

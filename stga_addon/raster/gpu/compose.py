@@ -10,10 +10,17 @@ from ...errors import DeviceError
 from ..cpu.compose import layer_frames
 from ..cpu.layout import CameraFrames, Parameters
 from ..posed_splats import ComposedImage, PosedSplats
-from .blend import blend_forward
 from .device import Device, Recording
-from .project import ProjectedSplats, project, projected_tables
-from .rasterize import Rasterizer, Rendering, SplatTable, ViewOptions, upload_frames, upload_splats
+from .rasterize import (
+    Rasterizer,
+    SplatTable,
+    Tables,
+    ViewOptions,
+    blend,
+    projected_tables,
+    upload_frames,
+    upload_splats,
+)
 
 
 def compose(adapter: str, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
@@ -22,7 +29,7 @@ def compose(adapter: str, layers: Sequence[PosedSplats], camera: Camera, with_de
     Raises DeviceError where the adapter fails.
     """
     try:
-        return _Composition(_rasterizer(adapter), layers, camera).image(with_depth)
+        return _compose(_rasterizer(adapter), layers, camera, with_depth)
     except DeviceError:
         _rasterizer.cache_clear()
         raise
@@ -33,60 +40,43 @@ def _rasterizer(adapter: str) -> Rasterizer:
     return Rasterizer(Device(adapter))
 
 
-class _Composition:
-    """Layers on a device: each has its own view of the same camera, and all share the tables of projected splats."""
-
-    def __init__(self, rasterizer: Rasterizer, layers: Sequence[PosedSplats], camera: Camera) -> None:
-        self._rasterizer, self._device, self._camera, self._layers = rasterizer, rasterizer.device, camera, layers
-        self._frames = [layer_frames(layer, camera) for layer in layers]
-        self._tables = [self._upload(n, layer) for n, layer in enumerate(layers)]
-        self._on_device = [upload_frames(self._device, frames, f" {n}") for n, frames in enumerate(self._frames)]
-        self._count = sum(table.count for table in self._tables)
-
-    def image(self, with_depth: bool) -> ComposedImage:
-        camera, read = self._camera, self._device.read
-        rendering = self._render()
-        while not self._rasterizer.pairs_fit():
-            rendering = self._render()
-        alpha = 1 - read(rendering.pixels, (camera.height, camera.width, 2))[..., 0]
-        rgb = read(rendering.image, (3, camera.height, camera.width))
-        if not with_depth:
-            return ComposedImage(rgb, alpha, None)
-        with self._device.record() as work:
-            seen, lists, tile_table = self._project(work, depth_as_color=True), rendering.lists, rendering.tile_table
-            image, _ = blend_forward(
-                work, camera.width * camera.height, rendering.tiles, view=rendering.view, rendered=tile_table.rendered,
-                tile_range=tile_table.tile_range, pair_slot=lists.pair_slot, slot_splat=lists.slot_splat,
-                projected=seen.projected,
-            )  # fmt: skip
-        depth = read(image, (camera.height, camera.width))
-        return ComposedImage(rgb, alpha, depth / np.maximum(alpha, np.finfo(np.float32).tiny))
-
-    def _upload(self, n: int, layer: PosedSplats) -> SplatTable:
+def _compose(rasterizer: Rasterizer, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool) -> ComposedImage:
+    """Each layer has its own view of the same camera, and all share the tables of projected splats."""
+    device, given = rasterizer.device, list[tuple[PosedSplats, SplatTable, CameraFrames, Tables]]()
+    for n, layer in enumerate(layers):
+        frames = layer_frames(layer, camera)
         parameters = Parameters(*(getattr(layer.splats, name) for name in Parameters._fields))
-        return upload_splats(self._device, parameters, layer.splats.face, f" {n}")
+        table = upload_splats(device, parameters, layer.splats.face, f" {n}")
+        tables = {"splats": table.rows, "face": table.face, "frames": upload_frames(device, frames, f" {n}")}
+        given.append((layer, table, frames, tables))
+    count = sum(table.count for _, table, _, _ in given)
 
-    def _render(self) -> Rendering:
-        """The colors, of all layers together; submitted."""
-        every = SplatTable(None, None, self._count, 0, 0)
-        view = self._rasterizer.upload_view(every, ViewOptions(self._camera, 0))
-        with self._device.record() as work:
-            return self._rasterizer.draw(work, self._project(work), self._count, self._camera, view)
-
-    def _project(self, work: Recording, depth_as_color: bool = False) -> ProjectedSplats:
-        """Record the projection of every layer."""
-        first, seen = 0, projected_tables(work.device, self._count)
-        for n, (layer, table, frames) in enumerate(zip(self._layers, self._tables, self._frames, strict=True)):
-            view = self._rasterizer.upload_view(
-                table, self._options(layer, frames, depth_as_color), frames.to_world, first, f"view {n}"
-            )
-            given = {"splats": table.rows, "face": table.face, "frames": self._on_device[n]}
-            project(work, table.count, seen, view=view, **given)
+    def project(work: Recording, depth_as_color: bool = False) -> Tables:
+        first, seen = 0, projected_tables(device, count)
+        for n, (layer, table, frames, tables) in enumerate(given):
+            options = ViewOptions(
+                camera, layer.splats.sh_degree, strains=frames.strain.shape[1], depth_as_color=depth_as_color,
+                antialiased=layer.antialiased,
+            )  # fmt: skip
+            view = rasterizer.upload_view(table, options, frames.to_world, first, f"view {n}")
+            work.dispatch("project.forward", table.count, {**tables, **seen, "view": view})
             first += table.count
         return seen
 
-    def _options(self, layer: PosedSplats, frames: CameraFrames, depth_as_color: bool) -> ViewOptions:
-        return ViewOptions(
-            self._camera, layer.splats.sh_degree, strains=frames.strain.shape[1], depth_as_color=depth_as_color,
-            antialiased=layer.antialiased,
-        )  # fmt: skip
+    def render() -> Tables:
+        """The colors, of all layers together; submitted."""
+        view = rasterizer.upload_view(SplatTable(None, None, count, 0, 0), ViewOptions(camera, 0))
+        with device.record() as work:
+            return rasterizer.draw(work, {**project(work), "view": view}, count, camera)
+
+    rendering = render()
+    while not rasterizer.pairs_fit():
+        rendering = render()
+    alpha = 1 - device.read(rendering["pixels"], (camera.height, camera.width, 2))[..., 0]
+    rgb = device.read(rendering["image"], (3, camera.height, camera.width))
+    if not with_depth:
+        return ComposedImage(rgb, alpha, None)
+    with device.record() as work:
+        blend(work, camera, rendering | project(work, depth_as_color=True))
+    depth = device.read(rendering["image"], (camera.height, camera.width))
+    return ComposedImage(rgb, alpha, depth / np.maximum(alpha, np.finfo(np.float32).tiny))

@@ -7,7 +7,7 @@ Work is recorded into one command encoder and submitted at once; nothing waits f
 import logging
 import re
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -22,12 +22,15 @@ import wgpu
 from ...errors import DeviceError, StgaError
 from .adapters import adapters, is_software
 from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
-from .timing import KernelTimes
 
 POLL_INTERVAL_S = 2e-4
 LOST_CHECK_S = 0.5
 
-_BINDING = re.compile(r"@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)")
+_BINDING = re.compile(
+    r"^@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)(.*)$", re.M
+)
+_FUNCTION = re.compile(r"(?:^@compute[^\n]*\n)?^fn (\w+)(.*?)^\}", re.M | re.S)
+_WRITTEN = re.compile(r"^\s*(\w+)\[[^=;\n]*\][.\w]* [-+*|]?=\s|&(\w+)", re.M)
 _LAYOUT_TYPE = {"uniform": "uniform", "storage, read": "read-only-storage", "storage, read_write": "storage"}
 
 Groups = tuple[int, int, int] | tuple[Any, int]
@@ -36,7 +39,7 @@ Groups = tuple[int, int, int] | tuple[Any, int]
 
 @dataclass(frozen=True)
 class Kernel:
-    """An entry point of a WGSL file, ready to be dispatched; bindings: index of each of the file's buffers by name."""
+    """An entry point of a WGSL file, ready to be dispatched; bindings: index of each table that it uses by name."""
 
     name: str
     pipeline: Any
@@ -48,7 +51,7 @@ class Device:
     """Buffers by name on one adapter; devices of the same adapter share its connection and compiled kernels.
 
     dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
-    kernel_times                times the kernels while it is set
+    kernel_times                times the kernels while it is set (`KernelTimes` of benchmarks/gpu_kernels.py)
     failures                    what the driver raised while results were awaited
     """
 
@@ -65,9 +68,9 @@ class Device:
             self.gpu, self._kernels, self.failures = _open(self.name)
         self.max_bytes = min(self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"])
         self.dispatches = self.submits = self.waits = 0
-        self.kernel_times: KernelTimes | None = None
+        self.kernel_times: Any = None
         self._buffers: dict[str, Any] = {}
-        self._groups: dict[tuple[int | str, ...], tuple[Any, tuple[Any, ...]]] = {}
+        self._groups: dict[tuple[int, ...], tuple[Any, list[Any]]] = {}
 
     @property
     def bytes(self) -> int:
@@ -127,29 +130,25 @@ class Device:
         readback.start()
         return np.array(readback.result().view(dtype)[:count].reshape(shape))
 
-    def kernel(self, file: str, entry: str = "main", include: tuple[str, ...] = (), **constants: float) -> Kernel:
-        """The entry point of `file`.wgsl, compiled once.
-
-        The module's text is the shared prelude, the included files, and the file itself; constants: values of its
-        `override` declarations.
-        """
-        key = (file, entry, include, *sorted(constants.items()))
+    def kernel(self, name: str, **constants: float) -> Kernel:
+        """The entry point "file.function", compiled once; constants: values of the file's `override` declarations."""
+        key = name, *sorted(constants.items())
         if key not in self._kernels:
-            self._kernels[key] = self._compile(file, entry, include, constants)
+            self._kernels[key] = self._compile(name, constants)
         return self._kernels[key]
 
-    def _compile(self, file: str, entry: str, include: tuple[str, ...], constants: dict[str, float]) -> Kernel:
-        code = "".join([constants_wgsl(), struct_wgsl("View", VIEW), *map(_source, ("common", *include, file))])
-        found = [(int(index), _LAYOUT_TYPE[kind], name) for index, kind, name in _BINDING.findall(code)]
+    def _compile(self, name: str, constants: dict[str, float]) -> Kernel:
+        file, entry = name.split(".")
+        code, tables = _linked(file, entry)
         with self.errors():
             layout = self.gpu.create_bind_group_layout(
                 entries=[
                     {"binding": index, "visibility": wgpu.ShaderStage.COMPUTE, "buffer": {"type": kind}}
-                    for index, kind, _ in found
+                    for index, kind in tables.values()
                 ]
             )
             pipeline = self.gpu.create_compute_pipeline(
-                label=f"{file}.{entry}",
+                label=name,
                 layout=self.gpu.create_pipeline_layout(bind_group_layouts=[layout]),
                 compute={
                     "module": self.gpu.create_shader_module(label=file, code=code),
@@ -157,31 +156,26 @@ class Device:
                     "constants": constants,
                 },
             )
-        return Kernel(f"{file}.{entry}", pipeline, layout, {name: index for index, _, name in found})
+        return Kernel(name, pipeline, layout, {table: index for table, (index, _) in tables.items()})
 
-    def bind(self, kernel: Kernel, buffers: dict[str, Any]) -> Any:
-        """The bind group of a kernel with a buffer for each of its bindings; made once for the same buffers."""
-        key: tuple[int | str, ...] = id(kernel), *buffers, *map(id, buffers.values())
+    def bind(self, kernel: Kernel, tables: Mapping[str, Any]) -> Any:
+        """The bind group of a kernel with those of the tables that it uses; made once for the same buffers."""
+        buffers = [tables[name] for name in kernel.bindings]
+        key = id(kernel), *map(id, buffers)
         found = self._groups.get(key)
         if found is None:
-            if buffers.keys() != kernel.bindings.keys():
-                raise TypeError(f"{kernel.name} binds {sorted(kernel.bindings)}, not {sorted(buffers)}")
             entries = [
-                {"binding": index, "resource": {"buffer": buffers[name]}} for name, index in kernel.bindings.items()
+                {"binding": index, "resource": {"buffer": buffer}}
+                for index, buffer in zip(kernel.bindings.values(), buffers, strict=True)
             ]
             group = self.gpu.create_bind_group(layout=kernel.layout, entries=entries)
             # Kept with its buffers, so that no identity in the key is given to another one.
-            found = self._groups[key] = group, tuple(buffers.values())
+            found = self._groups[key] = group, buffers
         return found[0]
 
     def record(self) -> "Recording":
         """Begin to record work; used as a context manager it is submitted at the end."""
         return Recording(self)
-
-    @staticmethod
-    def groups(threads: int) -> tuple[int, int, int]:
-        """Workgroups for at least so many threads; `thread_number` in WGSL numbers them."""
-        return Device.groups_of(-(-threads // WORKGROUP))
 
     @staticmethod
     def groups_of(workgroups: int) -> tuple[int, int, int]:
@@ -217,14 +211,17 @@ class Recording:
         self._encoder = device.gpu.create_command_encoder()
         self._pass: Any = None
 
-    def dispatch(self, kernel: Kernel, groups: Groups, **buffers: Any) -> None:
-        """Run a kernel with a buffer for each of its bindings, by name."""
+    def dispatch(self, name: str, threads: int | Groups, tables: Mapping[str, Any], **constants: float) -> None:
+        """Run `Device.kernel` with those of the tables that it uses, by at least so many threads or workgroups."""
+        kernel, groups = self.device.kernel(name, **constants), threads
+        if isinstance(groups, int):
+            groups = self.device.groups_of(-(-groups // WORKGROUP))  # `thread_number` in WGSL numbers the threads
         indirect = not isinstance(groups[0], int)
         if not indirect and 0 in groups:
             return
         compute = self._compute_pass(kernel)
         compute.set_pipeline(kernel.pipeline)
-        compute.set_bind_group(0, self.device.bind(kernel, buffers))
+        compute.set_bind_group(0, self.device.bind(kernel, tables))
         if indirect:
             compute.dispatch_workgroups_indirect(*groups)
         else:
@@ -359,6 +356,36 @@ def _poll_without_blocking(device: Any, failures: list[Exception]) -> None:
 
 def _source(name: str) -> str:
     return files(__package__).joinpath(f"{name}.wgsl").read_text(encoding="utf-8")
+
+
+@cache
+def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
+    """The text of an entry point with the functions that it calls, and index and kind of each table that they use.
+
+    A table is bound for reading where none of them assigns to it: what only reads needs no barrier between dispatches.
+    """
+    text = "\n".join([constants_wgsl(), struct_wgsl("View", VIEW), _source("common"), _source(file)])
+    code = re.sub("//.*", "", text)
+    bodies, reached, left = dict(_FUNCTION.findall(code)), set[str](), {entry}
+    while left:
+        reached |= left
+        called = {name for each in left for name in re.findall(r"\w+(?=\()", bodies[each])}
+        left = called & bodies.keys() - reached
+    body = "".join(bodies[name] for name in sorted(reached))
+    used, assigned = set(re.findall(r"(?<![.\w])\w+", body)), {name for pair in _WRITTEN.findall(body) for name in pair}
+    tables: dict[str, tuple[int, str]] = {}
+
+    def declare(found: re.Match[str]) -> str:
+        index, kind, name, rest = found.groups()
+        if name not in used:
+            return ""
+        if kind == "storage, read_write" and name not in assigned:
+            kind = "storage, read"
+        tables[name] = int(index), _LAYOUT_TYPE[kind]
+        return f"@group(0) @binding({index}) var<{kind}> {name}{rest}"
+
+    code = _BINDING.sub(declare, code)
+    return _FUNCTION.sub(lambda found: found[0] if found[1] in reached else "", code), tables
 
 
 def _full_memory(name: str) -> DeviceError:

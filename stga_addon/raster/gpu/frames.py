@@ -1,22 +1,56 @@
-"""Camera-space frames and strain of a posed mesh's triangles, computed on the device."""
+"""Camera-space frames and strain of a posed mesh's triangles, computed on the device, moved by driven offsets."""
 
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from ...avatar import embedding
-from ...avatar.strain import STRAIN_COMPONENTS, StrainBasis
+from ...avatar.offsets import OFFSETS
+from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, StrainBasis
 from ...capture.camera import Camera
-from . import driven_offsets
 from .device import Device, Recording
 from .layout import FRAME_STRAIN, list_words
 
 POSE = np.dtype(
     [("rows", np.float32, (3, 4))] + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "padding")]
 )
-"""The uniform of pose.wgsl."""
-INCLUDE = ("pose",)
+"""The uniform of frames.wgsl."""
+
+
+class Signal(Protocol):
+    """Computes the signal of a driven offset of one mesh; kernels: what it dispatches."""
+
+    kernels: ClassVar[tuple[str, ...]]
+
+    def __init__(self, device: Device, basis: StrainBasis) -> None: ...
+
+    def record(self, work: Recording, pose: Any, strain_from_rest: Any) -> Any:
+        """Record the signal of the pose whose strain (F, 3), less that at rest, is given; returns its table (F, S)."""
+
+
+class SmoothedStrain:
+    """The signal of one mesh, whose neighborhood is uploaded once."""
+
+    kernels: ClassVar[tuple[str, ...]] = ("frames.smooth_strain",)
+
+    def __init__(self, device: Device, basis: StrainBasis) -> None:
+        self._count = len(basis.faces)
+        self._neighbors = device.upload("neighbors", list_words(basis.neighbors))
+        self._rounds = [device.buffer(f"smoothed strain {n}", self._count * STRAIN_COMPONENTS) for n in range(2)]
+
+    def record(self, work: Recording, pose: Any, strain_from_rest: Any) -> Any:
+        """As of `Signal`; S is 3."""
+        averaged = strain_from_rest
+        for n in range(AVERAGING_ROUNDS):
+            smoothed, averaged = averaged, self._rounds[n % 2]
+            tables = {"pose": pose, "neighbors": self._neighbors, "smoothed": smoothed, "averaged": averaged}
+            work.dispatch(self.kernels[0], self._count, tables)
+        return averaged
+
+
+SIGNALS: dict[str, type[Signal]] = {"strain_position": SmoothedStrain}
+"""Driven offset -> what computes its signal; those without are trained on the CPU only."""
 
 
 class Embedding:
@@ -36,18 +70,23 @@ class Embedding:
             raise ValueError(f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}")
         self.strains = 0 if basis is None else STRAIN_COMPONENTS
         self._device, self._count, self._area_scales = device, len(faces), convention == "stga"
-        none = np.zeros(0, np.uint32)
-        rows = none if basis is None else _basis_rows(basis)
-        self._buffers = {
+        area = embedding.face_areas(neutral, faces)
+        area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)  # zero only where the float64 is
+        rows, touching = np.zeros(0, np.float32), np.zeros(0, np.uint32)
+        if basis is not None:
+            parts = basis.gram, basis.to_tensor, basis.to_plane, basis.range
+            rows = np.concatenate([part.reshape(len(faces), -1) for part in parts], axis=1, dtype=np.float32)
+            touching = list_words(basis.vertex_faces)
+        self._tables = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
-            "neutral_area": device.upload("neutral area", _area(neutral, faces)),
-            "basis": device.upload("strain basis", rows.astype(np.float32)),
-            "vertex_faces": device.upload("vertex faces", none if basis is None else list_words(basis.vertex_faces)),
+            "neutral_area": device.upload("neutral area", area.astype(np.float32)),
+            "basis": device.upload("strain basis", rows),
+            "vertex_faces": device.upload("vertex faces", touching),
             "tensors": device.buffer("strain tensors", 6 * len(faces) if self.strains else 0),
+            "strain_from_rest": device.buffer("strain from rest", len(faces) * self.strains),
         }
-        self._strain_from_rest = device.buffer("strain from rest", len(faces) * self.strains)
         assert basis is not None or not offsets
-        self._signals = {name: driven_offsets.SIGNALS[name](device, basis) for name in offsets if basis is not None}
+        self._signals = {name: SIGNALS[name](device, basis) for name in offsets if basis is not None}
         self.signals: dict[str, Any] = {}
 
     def upload(self, vertices: np.ndarray, camera: Camera) -> None:
@@ -61,8 +100,8 @@ class Embedding:
         parts[:, :3] = local
         parts[:, 3:] = local - parts[:, :3]
         self._device.upload("vertices", parts)
-        pose = np.zeros(1, POSE)
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        pose = np.zeros(1, POSE)
         pose["rows"] = np.c_[turn, turn @ center + shift]
         pose["triangles"], pose["strains"], pose["area_scales"] = self._count, self.strains, self._area_scales
         self._device.upload("pose", pose, "uniform")
@@ -72,37 +111,16 @@ class Embedding:
 
         coefficients: driven offset -> table (F, S, 3): the frames are moved by them as in `Avatar.frames`.
         """
-        device, groups = self._device, self._device.groups(self._count)
-        buffers = {
-            **self._buffers,
-            "pose": device.buffer("pose", POSE.itemsize // 4, "uniform"),
-            "vertices": device.buffer("vertices", 0),
-            "frames": device.buffer("frames", self._count * (FRAME_STRAIN + self.strains)),
-            "strain_from_rest": self._strain_from_rest,
-        }
-        work.dispatch(device.kernel("frames", "compose", INCLUDE), groups, **buffers)
+        buffer, tables = self._device.buffer, self._tables
+        pose = tables["pose"] = buffer("pose", POSE.itemsize // 4, "uniform")
+        tables["vertices"] = buffer("vertices", 0)
+        tables["frames"] = buffer("frames", self._count * (FRAME_STRAIN + self.strains))
+        work.dispatch("frames.compose", self._count, tables)
         if self.strains:
-            work.dispatch(device.kernel("frames", "average_strain", INCLUDE), groups, **buffers)
-        pose, frames, strain = buffers["pose"], buffers["frames"], self._strain_from_rest
+            work.dispatch("frames.average_strain", self._count, tables)
+        strain = tables["strain_from_rest"]
         self.signals = {name: signal.record(work, pose, strain) for name, signal in self._signals.items()}
-        driven_offsets.shift(work, self._count, coefficients, self.signals, pose, frames)
-        return frames
-
-
-def compile_kernels(device: Device) -> None:
-    """Compile what this module dispatches."""
-    for entry in ("compose", "average_strain"):
-        device.kernel("frames", entry, INCLUDE)
-
-
-def _area(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) float32, zero only where the float64 is."""
-    area = embedding.face_areas(neutral, faces)
-    area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)
-    return np.asarray(area, np.float32)
-
-
-def _basis_rows(basis: StrainBasis) -> np.ndarray:
-    """(F, 21 + 8·S): a triangle's numbers side by side."""
-    parts = basis.gram, basis.to_tensor, basis.to_plane, basis.range
-    return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+        for name, table in coefficients.items():
+            moving = {**tables, "coefficients": table, "driving": self.signals[name]}
+            work.dispatch("frames.shift", self._count, moving, SIGNALS=OFFSETS[name].signals)
+        return tables["frames"]

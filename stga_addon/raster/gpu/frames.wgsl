@@ -1,14 +1,12 @@
 // Camera-space frames and strain of a posed mesh's triangles, as `avatar/embedding.py` and `avatar/strain.py` define
-// them.
+// them, and their move by driven offsets (`avatar/offsets/offset.py`). A thread is a triangle.
 //
 // Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's first vertex, of
 // which only differences and means are formed: an edge is as exact as float32 can hold it.
 
 @group(0) @binding(0) var<uniform> pose: Pose;
-// (V, 6): a position's float32 and what is left of it.
-@group(0) @binding(1) var<storage, read> vertices: array<f32>;
-// (F, 3)
-@group(0) @binding(2) var<storage, read> faces: array<u32>;
+@group(0) @binding(1) var<storage, read> vertices: array<f32>; // (V, 6): a position's float32 and what is left of it
+@group(0) @binding(2) var<storage, read> faces: array<u32>; // (F, 3)
 // (F,) area in the neutral mesh, 0 where a triangle counts as a line.
 @group(0) @binding(3) var<storage, read> neutral_area: array<f32>;
 // (F, 21 + 8·S): `gram`, `to_tensor`, `to_plane` and `range` of the `StrainBasis`.
@@ -18,8 +16,27 @@
 // (F, 6): a triangle's own strain as xx, yy, zz, xy, yz, zx.
 @group(0) @binding(6) var<storage, read_write> tensors: array<f32>;
 @group(0) @binding(7) var<storage, read_write> frames: array<f32>;
-// (F, S): strain less that at rest, which positions follow where it is averaged (smoothed_strain.wgsl).
+// (F, S): strain less that at rest, which positions follow where it is averaged.
 @group(0) @binding(8) var<storage, read_write> strain_from_rest: array<f32>;
+// (F + 1 + N): where the triangles that share an edge with a triangle begin in this array, then those triangles.
+@group(0) @binding(9) var<storage, read> neighbors: array<u32>;
+@group(0) @binding(10) var<storage, read> smoothed: array<f32>; // (F, S): as averaged in the rounds so far
+@group(0) @binding(11) var<storage, read_write> averaged: array<f32>; // (F, S): once more
+@group(0) @binding(12) var<storage, read> coefficients: array<f32>; // (F, S, 3): `Avatar.driven_offsets`
+@group(0) @binding(13) var<storage, read> driving: array<f32>; // (F, S): their signal
+
+override SIGNALS: u32 = 1u; // S of a driven offset
+
+struct Pose {
+  // The matrix from the mesh, relative to its first vertex, to the camera.
+  row_x: vec4f,
+  row_y: vec4f,
+  row_z: vec4f,
+  triangles: u32,
+  strains: u32, // components of strain, 0 where neither colors nor positions follow it
+  area_scales: u32, // 1: the convention "stga", 0: "gaussian_avatars"
+  padding: u32,
+}
 
 const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
 const TENSOR: u32 = 6u; // words of a tensor
@@ -163,5 +180,41 @@ fn average_strain(thread: Thread) {
     strain = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
     frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = strain;
     strain_from_rest[f * pose.strains + k] = strain - clamp(0.0, basis[range], basis[range + pose.strains]);
+  }
+}
+
+// The mean of a triangle's strain and of those that share an edge with it: one round of averaging.
+@compute @workgroup_size(WORKGROUP)
+fn smooth_strain(thread: Thread) {
+  let f = thread_number(thread);
+  if f >= pose.triangles {
+    return;
+  }
+  for (var k = 0u; k < pose.strains; k++) {
+    var total = smoothed[f * pose.strains + k];
+    let end = neighbors[f + 1u];
+    for (var n = neighbors[f]; n < end; n++) {
+      total += smoothed[neighbors[n] * pose.strains + k];
+    }
+    averaged[f * pose.strains + k] = total / f32(1u + end - neighbors[f]);
+  }
+}
+
+// Move a triangle's origin by Σ signal · coefficients, in the triangle's axes and unit.
+@compute @workgroup_size(WORKGROUP)
+fn shift(thread: Thread) {
+  let f = thread_number(thread);
+  if f >= pose.triangles {
+    return;
+  }
+  var moved = vec3f(0.0);
+  for (var k = 0u; k < SIGNALS; k++) {
+    let row = f * SIGNALS + k;
+    moved += driving[row] * vec3f(coefficients[3u * row], coefficients[3u * row + 1u], coefficients[3u * row + 2u]);
+  }
+  let at = f * (FRAME_STRAIN + pose.strains);
+  for (var axis = 0u; axis < 3u; axis++) {
+    let row = at + FRAME_MATRIX + 3u * axis;
+    frames[at + FRAME_ORIGIN + axis] += dot(vec3f(frames[row], frames[row + 1u], frames[row + 2u]), moved);
   }
 }

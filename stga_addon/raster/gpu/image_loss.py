@@ -39,26 +39,19 @@ def image_loss(
     Returns the gradient (3, H, W), undefined in other tiles, and the loss (1,), which is computed if `whole`: every
     tile is touched.
     """
-    device = work.device
-    columns, rows = tile_grid(width, height)
-    buffers = {
+    buffer, (columns, rows) = work.device.buffer, tile_grid(width, height)
+    tables = {
         "view": view,
-        "loss": device.buffer("loss", LOSS.itemsize // 4, "uniform"),
+        "loss": buffer("loss", LOSS.itemsize // 4, "uniform"),
         "image": image,
-        "image_target": device.buffer("image_target", 0),
-        "mask": device.buffer("mask", 0),
+        "image_target": buffer("image_target", 0),
+        "mask": buffer("mask", 0),
         "touched": touched,
-        "v_image": device.buffer("v_image", 3 * width * height),
-        "sums": device.buffer("loss sums", 6 * columns * rows),
-        "result": device.buffer("loss result", 1),
+        "v_image": buffer("v_image", 3 * width * height),
+        "sums": buffer("loss sums", 6 * columns * rows),
+        "result": buffer("loss result", 1),
     }
-    work.dispatch(device.kernel("image_loss", "gradient"), (columns, rows, 3), **buffers)
+    work.dispatch("image_loss.gradient", (columns, rows, 3), tables)
     if whole:
-        work.dispatch(device.kernel("image_loss", "total"), (1, 1, 1), **buffers)
-    return buffers["v_image"], buffers["result"]
-
-
-def compile_kernels(device: Device) -> None:
-    """Compile what this module dispatches."""
-    for entry in ("gradient", "total"):
-        device.kernel("image_loss", entry)
+        work.dispatch("image_loss.total", (1, 1, 1), tables)
+    return tables["v_image"], tables["result"]

@@ -71,41 +71,26 @@ VIEW = np.dtype(
 )
 """The uniform `view` of an iteration: camera, sizes and rendering options."""
 
+_OWN = (
+    "WORKGROUP HIDDEN WANTED MAX_GROUPS SORT_BLOCK SORT_GROUPS PAIR_GROUPS PAIRS NEEDED OVERFLOWED XYZ ROTATION"
+    " LOG_SCALE OPACITY_LOGIT SH FRAME_ORIGIN FRAME_MATRIX FRAME_STRAIN"
+)
+_CPU = {
+    layout: "TILE PIXELS PROJECTED MEAN_X MEAN_Y PRECISION_X SHEAR PRECISION_Y OPACITY RED GREEN BLUE",
+    blend: "MAX_ALPHA MIN_ALPHA MIN_TRANSMITTANCE",
+    splat_block: "LOW_PASS_PX2 NEAR_M QUATERNION_LIFT",
+    embedding: "MIN_AREA_RATIO UPRIGHT_COSINE",
+    strain: "STRAIN_GAIN STRAIN_COMPONENTS",
+    image_loss: "WINDOW_RADIUS_PX",
+    optimizer: "MAX_GRADIENT",
+}
 CONSTANTS: dict[str, int | float] = {
-    "WORKGROUP": WORKGROUP,
-    "TILE": layout.TILE,
-    "PIXELS": layout.PIXELS,
-    "PROJECTED": layout.PROJECTED,
-    **{name: getattr(layout, name) for name in ("MEAN_X", "MEAN_Y", "PRECISION_X", "SHEAR", "PRECISION_Y")},
-    **{name: getattr(layout, name) for name in ("OPACITY", "RED", "GREEN", "BLUE")},
-    "XYZ": XYZ,
-    "ROTATION": ROTATION,
-    "LOG_SCALE": LOG_SCALE,
-    "OPACITY_LOGIT": OPACITY_LOGIT,
-    "SH": SH,
-    "FRAME_ORIGIN": FRAME_ORIGIN,
-    "FRAME_MATRIX": FRAME_MATRIX,
-    "FRAME_STRAIN": FRAME_STRAIN,
-    "HIDDEN": HIDDEN,
-    "WANTED": WANTED,
-    "MAX_GROUPS": MAX_GROUPS,
-    "DIGITS": 1 << DIGIT_BITS,
-    "SORT_BLOCK": SORT_BLOCK,
-    "SORT_GROUPS": SORT_GROUPS,
-    "PAIR_GROUPS": PAIR_GROUPS,
-    "PAIRS": PAIRS,
-    "NEEDED": NEEDED,
-    "OVERFLOWED": OVERFLOWED,
-    **{name: float(getattr(blend, name)) for name in ("MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE")},
-    **{name: float(getattr(splat_block, name)) for name in ("LOW_PASS_PX2", "NEAR_M", "QUATERNION_LIFT")},
-    **{name: getattr(embedding, name) for name in ("MIN_AREA_RATIO", "UPRIGHT_COSINE")},
-    "STRAIN_GAIN": strain.STRAIN_GAIN,
-    "STRAIN_COMPONENTS": strain.STRAIN_COMPONENTS,
-    "WINDOW_RADIUS_PX": image_loss.WINDOW_RADIUS_PX,
+    **{name: globals()[name] for name in _OWN.split()},
+    **{name: getattr(module, name) for module, names in _CPU.items() for name in names.split()},
     **{f"WINDOW_{k}": float(getattr(image_loss, f"W{5 - k}")) for k in range(6)},
+    "DIGITS": 1 << DIGIT_BITS,
     "SSIM_C1": float(image_loss.C1),
     "SSIM_C2": float(image_loss.C2),
-    "MAX_GRADIENT": float(optimizer.MAX_GRADIENT),
 }
 
 

@@ -1,4 +1,4 @@
-"""Adam on the wanted rows only, with the limits of size and distance, on the device."""
+"""Adam on the device: on wanted rows only, with the limits of size and distance, and on driven offsets."""
 
 import math
 from collections.abc import Mapping
@@ -6,11 +6,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...avatar.offsets import OFFSETS
 from ..cpu.layout import Parameters
 from .device import Device, Recording
+from .frames import SIGNALS
 from .layout import WORKGROUP
+from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
-INCLUDE = ("numbers", "optimizer")
+KERNELS = {
+    "frames": ("compose", "average_strain"),
+    "project": ("mark_focus", "forward", "backward"),
+    "tiles": ("mark_touched", "choose_rendered", "count_pairs", "add_pairs", "fill_pairs", "find_ranges"),
+    "blend": ("forward", "backward"),
+    "image_loss": ("gradient", "total"),
+    "optimizer": ("measure_excess", "join_excess", "prepare", "adam"),
+}
+"""What any iteration may dispatch, by file, beside sorting and driven offsets."""
 RATES = (*Parameters._fields, "sh_rest")
 """Learning rates in the order of the kernels; the last is that of the harmonics above the constant one."""
 STEP = np.dtype(
@@ -65,38 +76,82 @@ def upload_step(
     device.upload("step", step, "uniform")
 
 
-def optimize(
-    work: Recording, count: int, stride: int, tables: OptimizerTables, limited: bool, *, view: Any, splats: Any,
-    gradients: Any, face: Any, wanted: Any, screen: Any,
-) -> None:  # fmt: skip
+def optimize(work: Recording, count: int, stride: int, limited: bool, tables: OptimizerTables, **given: Any) -> None:
     """Record a step of the wanted rows of `count` splats of `stride` words, with the numbers uploaded last.
 
-    limited: whether a limit of scale or distance has a weight. screen (N,): of `project_backward`. The gradients are
-    changed by those of the limits.
+    limited: whether a limit of scale or distance has a weight. given: view, splats, face, wanted, gradients, which are
+    changed by those of the limits, and screen, of `Rasterizer.backward`.
     """
-    device = work.device
-    shared = {"view": view, "wanted": wanted, "splats": splats}
-    step, corrections = device.buffer("step", STEP.itemsize // 4, "uniform"), device.buffer("corrections", 4 * count)
-    constant = {"face": face, "traits": tables.traits, "limits": tables.limits, "norms": device.buffer("norms", 2)}
+    buffer = work.device.buffer
+    all_tables = {
+        **given,
+        **tables._asdict(),
+        "step": buffer("step", STEP.itemsize // 4, "uniform"),
+        "corrections": buffer("corrections", 4 * count),
+        "norms": buffer("norms", 2),
+        "excess": buffer("excess", 4 * -(-count // WORKGROUP) if limited else 0),
+    }
     if limited:
-        groups = -(-count // WORKGROUP)
-        buffers = {**shared, **constant, "excess": device.buffer("excess", 4 * groups)}
-        work.dispatch(device.kernel("limits", "measure", INCLUDE[:1]), device.groups(count), **buffers)
-        work.dispatch(device.kernel("limits", "total", INCLUDE[:1]), (1, 1, 1), **buffers)
-    work.dispatch(
-        device.kernel("rows", include=INCLUDE), device.groups(count), **shared, **constant, step=step, screen=screen,
-        gradients=gradients, history=tables.history, corrections=corrections,
-    )  # fmt: skip
-    work.dispatch(
-        device.kernel("adam", include=INCLUDE), device.groups(count * stride), **shared, step=step,
-        gradients=gradients, corrections=corrections, first=tables.first, second=tables.second,
-        average=tables.average,
-    )  # fmt: skip
+        work.dispatch("optimizer.measure_excess", count, all_tables)
+        work.dispatch("optimizer.join_excess", (1, 1, 1), all_tables)
+    work.dispatch("optimizer.prepare", count, all_tables)
+    work.dispatch("optimizer.adam", count * stride, all_tables)
+
+
+class OffsetTables(NamedTuple):
+    """Tables of a driven offset of F triangles in training, on the device.
+
+    coefficients, first, second, average  (F, S, 3) float32, with Adam's moments and the exponential moving average
+    steps      (F,) uint32
+    splats_of  of `splats_by_triangle`
+    """
+
+    coefficients: Any
+    first: Any
+    second: Any
+    average: Any
+    steps: Any
+    splats_of: Any
+
+
+def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
+    """(triangles + 1 + N,) the splats on each triangle, in order, behind where each one's begin in this same array.
+
+    face (N,): the triangle of each splat.
+    """
+    by_triangle = np.argsort(face, kind="stable")
+    start = np.searchsorted(face[by_triangle], np.arange(triangles + 1)) + triangles + 1
+    return np.asarray(np.concatenate([start, by_triangle]), np.uint32)
+
+
+def step_offsets(
+    work: Recording, triangles: int, offsets: Mapping[str, OffsetTables], signals: Mapping[str, Any], **given: Any
+) -> None:
+    """Record a step of the triangles that have a wanted splat, with the numbers of `upload_step`.
+
+    signals: of `Embedding`. given: view, wanted, and the splats' gradients, without those of the limits.
+    """
+    uniform = work.device.buffer("step", STEP.itemsize // 4, "uniform")
+    for name, tables in offsets.items():
+        all_tables = {**given, **tables._asdict(), "step": uniform, "driving": signals[name]}
+        work.dispatch("optimizer.step_offset", triangles, all_tables, **offset_constants(name))
+
+
+def offset_constants(name: str) -> dict[str, float]:
+    """The constants of `step_offset` for a driven offset."""
+    return {"SIGNALS": OFFSETS[name].signals, "RATE_SHARE": OFFSETS[name].rate_share}
 
 
 def compile_kernels(device: Device) -> None:
-    """Compile what this module dispatches."""
-    for entry in ("measure", "total"):
-        device.kernel("limits", entry, INCLUDE[:1])
-    for name in ("rows", "adam"):
-        device.kernel(name, include=INCLUDE)
+    """Compile what an iteration of up to 2²² tiles dispatches, before the time that is given to training."""
+    for file, entries in KERNELS.items():
+        for entry in entries:
+            device.kernel(f"{file}.{entry}")
+    for constants in (*sort_passes(DEPTH_BITS, False), *sort_passes(MAX_TILE_BITS, True)):
+        for entry in ("count", "place", "scatter"):
+            device.kernel(f"sort.{entry}", **constants)
+    for name, signal in SIGNALS.items():
+        for kernel in signal.kernels:
+            device.kernel(kernel)
+        device.kernel("frames.shift", SIGNALS=OFFSETS[name].signals)
+        device.kernel("optimizer.step_offset", **offset_constants(name))

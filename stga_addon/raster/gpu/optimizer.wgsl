@@ -1,4 +1,37 @@
-// What the optimizer's kernels share: the uniform `step`, the fields of a splat's row, and a step's corrections.
+// Adam on the splats and on the coefficients of driven offsets, with the gradients of the limits. Rows that are not
+// wanted, and triangles without a wanted splat, keep every bit.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> step: Step;
+@group(0) @binding(2) var<storage, read_write> splats: array<f32>;
+@group(0) @binding(3) var<storage, read> face: array<u32>;
+@group(0) @binding(4) var<storage, read> wanted: array<u32>;
+@group(0) @binding(5) var<storage, read> traits: array<vec2f>; // (N,) 1 if unbound, else 0; share of unseen cameras
+@group(0) @binding(6) var<storage, read> limits: array<f32>; // (F, 3) scale of bound and of unbound splats, distance
+// A workgroup's excess of scale (xy) and of distance (zw).
+@group(0) @binding(7) var<storage, read_write> excess: array<vec4f>;
+@group(0) @binding(8) var<storage, read_write> norms: array<f32>; // (2,) of scale and of distance
+@group(0) @binding(9) var<storage, read> screen: array<f32>;
+@group(0) @binding(10) var<storage, read_write> gradients: array<f32>; // of the splats
+// (N, 3): steps, sum of the screen gradients and number of summands; the latter two are bits of float32.
+@group(0) @binding(11) var<storage, read_write> history: array<u32>;
+// (N, 4): what corrects the first and second moment's bias, the step's share in the average, all three bits of
+// float32; and a bit for each field that keeps its value because its gradient is broken.
+@group(0) @binding(12) var<storage, read_write> corrections: array<vec4u>;
+// Moments and moving average, of the splats or of an offset's coefficients.
+@group(0) @binding(13) var<storage, read_write> first: array<f32>;
+@group(0) @binding(14) var<storage, read_write> second: array<f32>;
+@group(0) @binding(15) var<storage, read_write> average: array<f32>;
+@group(0) @binding(16) var<storage, read_write> coefficients: array<f32>; // (F, S, 3) of a driven offset
+@group(0) @binding(17) var<storage, read_write> steps: array<u32>; // (F,) of its triangles
+@group(0) @binding(18) var<storage, read> driving: array<f32>; // (F, S): its signal
+// (F + 1 + N): where each triangle's splats begin in this array, then those splats.
+@group(0) @binding(19) var<storage, read> splats_of: array<u32>;
+
+override SIGNALS: u32 = 1u; // S of a driven offset
+override RATE_SHARE: f32 = 1.0; // its learning rate, as a share of that of the splats' positions
+
+const REST_RATE: u32 = 6u; // of the harmonics above the constant one
 
 struct Step {
   rates: array<vec4f, 2>, // by field, see field_of(); the last is that of the harmonics above the constant one
@@ -59,4 +92,216 @@ fn one_minus_exp(x: f32) -> f32 {
 fn is_too_large(gradient: f32) -> bool {
   let size = bitcast<u32>(gradient) & 0x7fffffffu; // ordered like the absolute values
   return size >= bitcast<u32>(MAX_GRADIENT);
+}
+
+// How far the splats exceed the limits of size and distance, as norms over all wanted rows, in two steps: a value for
+// each workgroup, then one workgroup for all.
+//
+// A sum of squares is kept as (largest, Σ (value / largest)²), whose parts stay in float32's range.
+
+var<workgroup> parts: array<vec4f, WORKGROUP>;
+
+fn join(a: vec2f, b: vec2f) -> vec2f {
+  let largest = max(a.x, b.x);
+  if largest == 0.0 {
+    return vec2f(0.0);
+  }
+  let shrunk = vec2f(a.x, b.x) / largest;
+  return vec2f(largest, a.y * shrunk.x * shrunk.x + b.y * shrunk.y * shrunk.y);
+}
+
+fn join_both(a: vec4f, b: vec4f) -> vec4f {
+  return vec4f(join(a.xy, b.xy), join(a.zw, b.zw));
+}
+
+fn join_workgroup(value: vec4f, index: u32) {
+  parts[index] = value;
+  for (var half = WORKGROUP / 2u; half > 0u; half /= 2u) {
+    workgroupBarrier();
+    if index < half {
+      parts[index] = join_both(parts[index], parts[index + half]);
+    }
+  }
+}
+
+fn excess_of(i: u32) -> vec4f {
+  let at = i * splat_stride(view);
+  let unbound = traits[i].x > 0.0;
+  let limit = limits[3u * face[i] + select(0u, 1u, unbound)];
+  var found = vec4f(0.0);
+  for (var c = 0u; c < 3u; c++) {
+    let over = max(0.0, bounded_exp(splats[at + LOG_SCALE + c]) - limit);
+    found = vec4f(join(found.xy, vec2f(over, 1.0)), found.zw);
+  }
+  if !unbound {
+    let away = length(vec3f(splats[at + XYZ], splats[at + XYZ + 1u], splats[at + XYZ + 2u]));
+    found.z = max(0.0, away - limits[3u * face[i] + 2u]);
+    found.w = 1.0;
+  }
+  return found;
+}
+
+@compute @workgroup_size(WORKGROUP)
+fn measure_excess(thread: Thread) {
+  let local = thread.local;
+  let i = thread_number(thread);
+  var value = vec4f(0.0);
+  if i < view.splats && wanted[i] != 0u {
+    value = excess_of(i);
+  }
+  join_workgroup(value, local);
+  if local == 0u {
+    excess[i / WORKGROUP] = parts[0];
+  }
+}
+
+@compute @workgroup_size(WORKGROUP)
+fn join_excess(@builtin(local_invocation_index) local: u32) {
+  let count = (view.splats + WORKGROUP - 1u) / WORKGROUP;
+  var value = vec4f(0.0);
+  for (var n = local; n < count; n += WORKGROUP) {
+    value = join_both(value, excess[n]);
+  }
+  join_workgroup(value, local);
+  if local == 0u {
+    norms[0] = parts[0].x * sqrt(parts[0].y);
+    norms[1] = parts[0].z * sqrt(parts[0].w);
+  }
+}
+
+// Before Adam, a thread for each wanted row: the gradients of the limits, the row's step count and what follows from
+// it, and the statistics of density control.
+@compute @workgroup_size(WORKGROUP)
+fn prepare(thread: Thread) {
+  let i = thread_number(thread);
+  if i >= view.splats || wanted[i] == 0u {
+    return;
+  }
+  limit_scale(i);
+  limit_distance(i);
+  let at = i * splat_stride(view);
+  let visible = sigmoid(splats[at + OPACITY_LOGIT]);
+  gradients[at + OPACITY_LOGIT] += step.opacity_weight * traits[i].y * visible * (1.0 - visible);
+  count_step(i);
+  if step.statistics == 1u {
+    history[3u * i + 1u] = bitcast<u32>(bitcast<f32>(history[3u * i + 1u]) + screen[i]);
+    history[3u * i + 2u] = bitcast<u32>(bitcast<f32>(history[3u * i + 2u]) + 1.0);
+  }
+}
+
+// The gradient of scale_weight · ‖ReLU(scale − limit)‖₂.
+fn limit_scale(i: u32) {
+  if !(step.scale_weight > 0.0 && norms[0] > 0.0) {
+    return;
+  }
+  let at = i * splat_stride(view) + LOG_SCALE;
+  let limit = limits[3u * face[i] + select(0u, 1u, traits[i].x > 0.0)];
+  for (var c = 0u; c < 3u; c++) {
+    let scale = bounded_exp(splats[at + c]);
+    gradients[at + c] += step.scale_weight / norms[0] * max(0.0, scale - limit) * scale;
+  }
+}
+
+// The gradient of distance_weight · ‖ReLU(|xyz| − limit)‖₂ over the bound splats.
+fn limit_distance(i: u32) {
+  if !(step.distance_weight > 0.0 && norms[1] > 0.0) || traits[i].x > 0.0 {
+    return;
+  }
+  let at = i * splat_stride(view) + XYZ;
+  let away = length(vec3f(splats[at], splats[at + 1u], splats[at + 2u]));
+  let over = away - limits[3u * face[i] + 2u];
+  if over > 0.0 {
+    for (var c = 0u; c < 3u; c++) {
+      gradients[at + c] += step.distance_weight / norms[1] * (over / away) * splats[at + c];
+    }
+  }
+}
+
+fn count_step(i: u32) {
+  let count = history[3u * i] + 1u;
+  history[3u * i] = count;
+  corrections[i] = vec4u(bitcast<vec3u>(corrections_at(step, count)), broken_fields(i));
+}
+
+// Bit f is set where a gradient of field f is not finite, or so large that Adam cannot square it.
+fn broken_fields(i: u32) -> u32 {
+  let stride = splat_stride(view);
+  var broken = 0u;
+  for (var c = 0u; c < stride; c++) {
+    broken |= select(0u, 1u << field_of(view, c), is_too_large(gradients[i * stride + c]));
+  }
+  return broken;
+}
+
+// Advance the moments of a value; returns what its step takes from it.
+fn adam_step(n: u32, gradient: f32, rate: f32, correct: vec3f) -> f32 {
+  let m = step.beta1 * first[n] + (1.0 - step.beta1) * gradient;
+  let v = step.beta2 * second[n] + (1.0 - step.beta2) * gradient * gradient;
+  first[n] = m;
+  second[n] = v;
+  return rate * m * correct.x / (sqrt(v) * correct.y + step.epsilon);
+}
+
+// One step of Adam on the wanted rows, a thread a value.
+@compute @workgroup_size(WORKGROUP)
+fn adam(thread: Thread) {
+  let n = thread_number(thread);
+  let stride = splat_stride(view);
+  let i = n / stride;
+  if i >= view.splats || wanted[i] == 0u {
+    return;
+  }
+  let column = n % stride;
+  let field = field_of(view, column);
+  if ((corrections[i].w >> field) & 1u) == 1u {
+    return;
+  }
+  let correct = bitcast<vec3f>(corrections[i].xyz);
+  let is_rest = column >= SH + 3u && column < SH + 3u * view.coefficients;
+  let rate = select(field, REST_RATE, is_rest);
+  let value = splats[n] - adam_step(n, gradients[n], step.rates[rate / 4u][rate % 4u], correct);
+  splats[n] = value;
+  average[n] += correct.z * (value - average[n]);
+}
+
+// One step of Adam on a driven offset's coefficients, a thread a triangle, before the limits change the splats'
+// gradients.
+@compute @workgroup_size(WORKGROUP)
+fn step_offset(thread: Thread) {
+  let f = thread_number(thread);
+  if f >= step.triangles {
+    return;
+  }
+  var moved = vec3f(0.0); // a triangle moves all its splats alike, so its gradient is their sum
+  var is_wanted = false;
+  for (var n = splats_of[f]; n < splats_of[f + 1u]; n++) {
+    let i = splats_of[n];
+    if wanted[i] != 0u {
+      let at = i * splat_stride(view) + XYZ;
+      moved += vec3f(gradients[at], gradients[at + 1u], gradients[at + 2u]);
+      is_wanted = true;
+    }
+  }
+  if !is_wanted {
+    return;
+  }
+  steps[f] += 1u;
+  if !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z)) {
+    return;
+  }
+  var broken = false;
+  for (var c = 0u; c < 3u * SIGNALS; c++) {
+    broken = broken || is_too_large(driving[f * SIGNALS + c / 3u] * moved[c % 3u]);
+  }
+  if broken {
+    return;
+  }
+  let correct = corrections_at(step, steps[f]);
+  for (var c = 0u; c < 3u * SIGNALS; c++) {
+    let n = 3u * SIGNALS * f + c;
+    let gradient = driving[f * SIGNALS + c / 3u] * moved[c % 3u];
+    let stepped = coefficients[n] - adam_step(n, gradient, RATE_SHARE * step.rates[0].x, correct);
+    coefficients[n] = stepped;
+    average[n] += correct.z * (stepped - average[n]);
+  }
 }

@@ -1,4 +1,8 @@
-"""Rendering on a WebGPU device: splats and a camera to an image, and its gradient back to the splats."""
+"""Rendering on a WebGPU device: splats and a camera to an image, and its gradient back to the splats.
+
+Three stages, a WGSL file each: `project` places and colors splats, `tiles` lists those of a tile, `blend` draws them.
+They share tables, by the names of `layout.py`; a function that records a stage adds its own to those given.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,18 +11,27 @@ from typing import Any
 import numpy as np
 
 from ...capture.camera import Camera
-from ..cpu.layout import TILE, CameraFrames, Parameters
+from ..cpu.layout import PROJECTED, TILE, CameraFrames, Parameters
 from ..cpu.rasterize import tile_grid
-from . import blend, tiles
-from . import project as projection
-from .blend import blend_backward, blend_forward
-from .device import Device, Recording
-from .layout import COUNTS, NEEDED, OVERFLOWED, SH, VIEW, splat_rows
-from .project import ProjectedSplats, project, project_backward, projected_tables
-from .tiles import PairLists, Tiles, choose_tiles, counts_buffer, list_pairs
+from .device import Device, Groups, Recording
+from .layout import (
+    COUNTS,
+    DIGIT_BITS,
+    NEEDED,
+    OVERFLOWED,
+    PAIR_GROUPS,
+    SH,
+    SORT_BLOCK,
+    SORT_GROUPS,
+    VIEW,
+    WORKGROUP,
+    splat_rows,
+)
 
 INITIAL_PAIR_CAPACITY = 1 << 18
 """Pairs that a rasterizer has room for at first: 14 MB."""
+DEPTH_BITS, MAX_TILE_BITS = 32, 22
+Tables = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -58,23 +71,6 @@ class ViewOptions:
     reach: int = 0
 
 
-@dataclass(frozen=True)
-class Rendering:
-    """An image and what its backward pass needs, tables of `layout.py`; valid until the device's next one.
-
-    image (3, H, W) over the background; pixels (H, W, 2) with the transmittance; undefined where nothing is rendered.
-    """
-
-    image: Any
-    pixels: Any
-    projected: Any
-    tile_table: Tiles
-    lists: PairLists
-    view: Any
-    frames: Any
-    tiles: int
-
-
 class Rasterizer:
     """Renders on one device, forward and backward, with room for `capacity` pairs.
 
@@ -86,52 +82,50 @@ class Rasterizer:
         self.capacity = INITIAL_PAIR_CAPACITY
 
     def forward(
-        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, view: Any,
-        focus: Any | None = None,
-    ) -> Rendering:  # fmt: skip
-        """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if `options.focused`."""
-        seen = projected_tables(self.device, splats.count)
-        project(work, splats.count, seen, view=view, splats=splats.rows, face=splats.face, frames=frames)
-        return self.draw(work, seen, splats.count, options.camera, view, frames, focus)
+        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, view: Any, focus: Any = None
+    ) -> Tables:
+        """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if `options.focused`.
 
-    def draw(
-        self, work: Recording, seen: ProjectedSplats, count: int, camera: Camera, view: Any, frames: Any = None,
-        focus: Any | None = None,
-    ) -> Rendering:  # fmt: skip
-        """Record the rendering of `count` projected splats; frames: kept for the backward pass."""
+        Returns its tables, valid until the device's next rendering: the image (3, H, W) over the background and those
+        of `layout.py`.
+        """
+        tables = projected_tables(self.device, splats.count)
+        tables |= {"view": view, "splats": splats.rows, "face": splats.face, "frames": frames}
+        work.dispatch("project.forward", splats.count, tables)
+        return self.draw(work, tables, splats.count, options.camera, focus)
+
+    def draw(self, work: Recording, tables: Tables, count: int, camera: Camera, focus: Any = None) -> Tables:
+        """Record the rendering of `count` projected splats, with the view in `tables`."""
         columns, rows = tile_grid(camera.width, camera.height)
-        tiles = columns * rows
-        tile_table = choose_tiles(work, count, tiles, rect=seen.rect, view=view, focus=focus)
-        lists = list_pairs(
-            work, count, tiles, self.capacity, tile_table=tile_table, focus=focus, view=view, **seen._asdict()
-        )
-        image, pixels = blend_forward(
-            work, camera.width * camera.height, tiles, view=view, rendered=tile_table.rendered,
-            tile_range=tile_table.tile_range, pair_slot=lists.pair_slot, slot_splat=lists.slot_splat,
-            projected=seen.projected,
-        )  # fmt: skip
-        return Rendering(image, pixels, seen.projected, tile_table, lists, view, frames, tiles)
+        tables["focus"] = tables["rect"] if focus is None else focus
+        choose_tiles(work, count, columns * rows, tables, focus is not None)
+        list_pairs(work, count, columns * rows, self.capacity, tables)
+        blend(work, camera, tables)
+        return tables
 
     def backward(
-        self, work: Recording, rendering: Rendering, splats: SplatTable, v_image: Any, gradients: Any,
-        v_transmittance: Any | None = None,
+        self, work: Recording, rendering: Tables, splats: SplatTable, camera: Camera, v_image: Any, gradients: Any,
+        v_transmittance: Any = None,
     ) -> Any:  # fmt: skip
         """Record the gradient of a scalar with respect to the splats, from that with respect to the image.
 
         v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the wanted rows of `gradients`. Returns
-        `screen`, see `project_backward`.
+        `screen` (N,): for these rows, the length of the gradient with respect to the projected center in units of half
+        the image.
         """
-        lists, tile_table = rendering.lists, rendering.tile_table
-        shared = {"view": rendering.view, "projected": rendering.projected}
-        pair_gradients = blend_backward(
-            work, self.capacity, rendering.tiles, v_image=v_image, v_transmittance=v_transmittance,
-            touched=tile_table.touched, tile_range=tile_table.tile_range, pair_slot=lists.pair_slot,
-            slot_splat=lists.slot_splat, pixels=rendering.pixels, **shared,
-        )  # fmt: skip
-        return project_backward(
-            work, splats.count, splats=splats.rows, face=splats.face, frames=rendering.frames, wanted=lists.wanted,
-            slots=lists.slots, pair_gradients=pair_gradients, gradients=gradients, **shared,
-        )  # fmt: skip
+        columns, rows = tile_grid(camera.width, camera.height)
+        tables = {
+            **rendering,
+            "v_image": v_image,
+            "v_transmittance": v_image if v_transmittance is None else v_transmittance,
+            "pair_gradients": self.device.buffer("pair_gradients", PROJECTED * self.capacity),
+            "gradients": gradients,
+            "screen": self.device.buffer("screen", splats.count),
+        }
+        constants = {"HAS_V_TRANSMITTANCE": True} if v_transmittance is not None else {}
+        work.dispatch("blend.backward", Device.groups_of(columns * rows), tables, **constants)
+        work.dispatch("project.backward", splats.count, tables)
+        return tables["screen"]
 
     def pairs_fit(self) -> bool:
         """Wait for the submitted work; whether its pairs fitted. If not, room for them is made."""
@@ -161,18 +155,9 @@ class Rasterizer:
             *(camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height, columns, rows),
             *to_world.ravel(),
             *options.background,
-            splats.count,
-            splats.coefficients,
-            splats.strain_colors,
-            options.degree,
-            min(options.strains, splats.strain_colors),
-            options.strains,
-            options.depth_as_color,
-            options.antialiased,
-            options.focused,
-            -(-options.reach // TILE),
-            self.capacity,
-            first,
+            *(splats.count, splats.coefficients, splats.strain_colors, options.degree),
+            *(min(options.strains, splats.strain_colors), options.strains, options.depth_as_color),
+            *(options.antialiased, options.focused, -(-options.reach // TILE), self.capacity, first),
         )
         view[...] = values
         return self.device.upload(name, view, "uniform")
@@ -182,10 +167,8 @@ def upload_splats(device: Device, splats: Parameters, face: np.ndarray, layer: s
     """Numpy arrays of splats as a table on the device; layer: part of its name where there are several."""
     rows = splat_rows(splats)
     strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
-    return SplatTable(
-        device.upload(f"splats{layer}", rows), device.upload(f"face{layer}", face.astype(np.uint32)), len(rows),
-        splats.sh.shape[1], strain_colors,
-    )  # fmt: skip
+    on_device = device.upload(f"splats{layer}", rows), device.upload(f"face{layer}", face.astype(np.uint32))
+    return SplatTable(*on_device, len(rows), splats.sh.shape[1], strain_colors)
 
 
 def upload_frames(device: Device, frames: CameraFrames, layer: str = "") -> Any:
@@ -195,7 +178,93 @@ def upload_frames(device: Device, frames: CameraFrames, layer: str = "") -> Any:
     return device.upload(f"frames{layer}", np.concatenate(parts, axis=1, dtype=np.float32))
 
 
-def compile_kernels(device: Device) -> None:
-    """Compile what a `Rasterizer` dispatches in training."""
-    for stage in (projection, tiles, blend):
-        stage.compile_kernels(device)
+def counts_buffer(device: Device) -> Any:
+    """The counts of pairs, see `layout.py`."""
+    return device.buffer("counts", COUNTS, "indirect")
+
+
+def mark_focus(work: Recording, splats: SplatTable, view: Any, selected: Any) -> Any:
+    """Record which splats ride on a selected triangle: (N,) 0 or 1; selected (F,): uploaded as bytes."""
+    focus = work.device.buffer("focus", splats.count)
+    tables = {"view": view, "face": splats.face, "selected": selected, "focus": focus}
+    work.dispatch("project.mark_focus", splats.count, tables)
+    return focus
+
+
+def projected_tables(device: Device, count: int) -> Tables:
+    """Room for `count` projected splats."""
+    words = {"projected": PROJECTED, "depth_key": 1, "rect": 4}
+    return {name: device.buffer(name, count * each) for name, each in words.items()}
+
+
+def choose_tiles(work: Recording, count: int, tiles: int, tables: Tables, focused: bool) -> None:
+    """Record which of `tiles` tiles are rendered of `count` splats, by view, rect and, if there is one, the focus."""
+    buffer = work.device.buffer
+    tables |= {"touched": buffer("touched", tiles), "rendered": buffer("rendered", tiles)}
+    tables["tile_range"] = buffer("ranges", 2 * tiles)
+    if focused:
+        work.clear(tables["touched"], tiles)
+        work.dispatch("tiles.mark_touched", count, tables)
+    work.dispatch("tiles.choose_rendered", tiles, tables)
+
+
+def list_pairs(work: Recording, count: int, tiles: int, capacity: int, tables: Tables) -> None:
+    """Record every rendered tile's list of pairs, near to far, with room for `capacity` pairs.
+
+    Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable sort by tile keeps. A
+    splat has a pair with each tile that its outline reaches; its bounding box would count more. How many pairs there
+    are is known on the device only, so everything that follows is dispatched indirectly.
+    """
+    buffer, counts = work.device.buffer, counts_buffer(work.device)
+    _, tables["order"] = sort_keys(work, tables["depth_key"], count, DEPTH_BITS, tables["view"])
+    words = {"pairs_until": count + -(-count // WORKGROUP), "wanted": count, "slots": 2 * count}
+    words |= {"slot_tile": capacity, "slot_splat": capacity}
+    tables |= {name: buffer(name, each) for name, each in words.items()} | {"counts": counts}
+    work.dispatch("tiles.count_pairs", count, tables)
+    work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
+    work.dispatch("tiles.fill_pairs", count, tables)
+    keys, bits = tables["slot_tile"], tiles.bit_length()
+    tables["pair_tile"], tables["pair_slot"] = sort_keys(work, keys, capacity, bits, tables["view"], of_pairs=True)
+    work.dispatch("tiles.find_ranges", (counts, 4 * PAIR_GROUPS), tables)
+
+
+def sort_keys(
+    work: Recording, keys: Any, room: int, bits: int, view: Any, *, of_pairs: bool = False
+) -> tuple[Any, Any]:
+    """Record sorting of the keys, of which the lowest `bits` count; equal keys keep their order.
+
+    There are as many keys as splats, or as pairs, and room for so many. Returns buffers of the sorted keys and of
+    their numbers before; `keys` may be overwritten.
+    """
+    counts, buffer, blocks = counts_buffer(work.device), work.device.buffer, -(-room // SORT_BLOCK)
+    groups: Groups = (counts, 4 * SORT_GROUPS) if of_pairs else (blocks, 1, 1)
+    name, values = "pair" if of_pairs else "splat", counts  # the first pass reads no values
+    # The gradients of the pairs are written when the sorted tiles have been read.
+    first = "pair_gradients" if of_pairs else "splat_keys"
+    targets = [(buffer(first, room), buffer(f"{name}_numbers", room))]
+    if bits > DIGIT_BITS:
+        targets.append((keys, buffer(f"{name}_numbers 2", room)))
+    for n, constants in enumerate(sort_passes(bits, of_pairs)):
+        tables = {
+            "view": view, "counts": counts, "keys": keys, "values": values, "sorted_keys": targets[n % 2][0],
+            "sorted_values": targets[n % 2][1], "block_digits": buffer("block_digits", blocks << DIGIT_BITS),
+            "digit_totals": buffer("digit_totals", 1 << DIGIT_BITS),
+        }  # fmt: skip
+        work.dispatch("sort.count", groups, tables, **constants)
+        work.dispatch("sort.place", 1 << DIGIT_BITS, tables, **constants)
+        work.dispatch("sort.scatter", groups, tables, **constants)
+        keys, values = targets[n % 2]
+    return keys, values
+
+
+def sort_passes(bits: int, of_pairs: bool) -> list[dict[str, Any]]:
+    """The constants of sort.wgsl in each pass."""
+    return [{"SHIFT": shift, "FIRST": shift == 0, "OF_PAIRS": of_pairs} for shift in range(0, bits, DIGIT_BITS)]
+
+
+def blend(work: Recording, camera: Camera, tables: Tables) -> None:
+    """Record the blending of the rendered tiles; image and pixels are undefined in others."""
+    area, (columns, rows) = camera.width * camera.height, tile_grid(camera.width, camera.height)
+    buffer = work.device.buffer
+    tables |= {"image": buffer("image", 3 * area), "pixels": buffer("pixels", 2 * area)}
+    work.dispatch("blend.forward", Device.groups_of(columns * rows), tables)

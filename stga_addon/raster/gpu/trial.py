@@ -93,7 +93,7 @@ def _on_device(
         view = rasterizer.upload_view(table, options)
         with device.record() as work:
             rendering = rasterizer.forward(work, table, on_device, options, view)
-            rasterizer.backward(work, rendering, table, cotangents, gradients)
+            rasterizer.backward(work, rendering, table, camera, cotangents, gradients)
 
     once()
     while not rasterizer.pairs_fit():

@@ -1,15 +1,28 @@
-"""Node groups that compute triangle frames of the head (`avatar.embedding.face_frames`) and place splats by them."""
+"""Node groups that compute triangles' frames and strain on the head, and place splats by them."""
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Collection
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import bpy
 
 from ...avatar.embedding import MIN_AREA_RATIO, UPRIGHT_COSINE
+from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, STRAIN_GAIN
 from .display_modes import WORLD_ROTATION, WORLD_SCALE
 from .node_builder import NodeGroup, Nodes
-from .splat_attributes import FACE, NEUTRAL_AREA, ROTATION, SCALE, XYZ
+from .splat_attributes import (
+    DRIVEN_OFFSET,
+    FACE,
+    GRAM,
+    NEUTRAL_AREA,
+    PLANE,
+    RANGE,
+    ROTATION,
+    SCALE,
+    TENSOR,
+    TENSOR_HALVES,
+    XYZ,
+)
 
 # Temporary attributes on the head's faces.
 _FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = "stga_frame_origin", "stga_frame_rotation", "stga_frame_size"
@@ -42,7 +55,13 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
     rotation = nodes.attribute(ROTATION, "QUATERNION")
     scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
     if convention is not None:
-        origin, frame_rotation, size = _sampled_frames(nodes, mesh, convention)
+        face = nodes.attribute(FACE, "INT")
+
+        def sample(name: str, data_type: str) -> Any:  # of each splat's triangle
+            return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
+
+        size = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
+        origin, frame_rotation = sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION")
         xyz = nodes.out("FunctionNodeRotateVector", {"Vector": nodes.scale(xyz, size), "Rotation": frame_rotation})
         xyz = nodes.vector("ADD", xyz, origin)
         rotations = {"Rotation": rotation, "Rotate By": frame_rotation}
@@ -51,17 +70,6 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
     splats = nodes.out("GeometryNodeSetPosition", {"Geometry": splats, "Position": xyz})
     splats = nodes.store(splats, WORLD_ROTATION, rotation, "QUATERNION")
     return nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
-
-
-def _sampled_frames(nodes: Nodes, mesh: Any, convention: str) -> tuple[Any, Any, Any]:
-    """Origin, rotation and scale of each splat's triangle."""
-    face = nodes.attribute(FACE, "INT")
-
-    def sample(name: str, data_type: str) -> Any:
-        return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
-
-    scale = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
-    return sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION"), scale
 
 
 def _frame_scale(nodes: Nodes, size: Any, convention: str) -> Any:
@@ -145,3 +153,103 @@ PLACED: dict[str | None, NodeGroup] = {
     for convention in (None, *_FRAMES)
 }
 """Splats (and the mesh with frames) -> splats in object space, by convention; None for world space."""
+
+
+SMOOTHED_STRAIN = "stga_smoothed_strain"
+"""Vector on the faces of the mesh from SMOOTHED."""
+# Temporary attributes on the faces of the deformed neutral mesh.
+_GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
+
+
+def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
+    """The neutral mesh moved to the posed vertices, with each face's deformation tensor (`avatar.strain`) stored."""
+    position, index = nodes.out("GeometryNodeInputPosition"), nodes.out("GeometryNodeInputIndex")
+    moved = nodes.sample(posed, position, index, "FLOAT_VECTOR", "POINT")
+    mesh = nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
+    p0, p1, p2 = nodes.triangle_corners()
+    e1, e2 = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    gram = nodes.combine(*(nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2))))
+    change = nodes.vector("SUBTRACT", gram, nodes.attribute(GRAM, "FLOAT_VECTOR"))
+    mesh = nodes.store(mesh, _GRAM_CHANGE, change, "FLOAT_VECTOR", "FACE")
+    changes = nodes.components(nodes.attribute(_GRAM_CHANGE, "FLOAT_VECTOR"))
+    for half in TENSOR_HALVES:
+        columns = (nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR") for k in range(STRAIN_COMPONENTS))
+        tensor = nodes.sum(*(nodes.scale(column, by) for column, by in zip(columns, changes, strict=True)))
+        mesh = nodes.store(mesh, half, tensor, "FLOAT_VECTOR", "FACE")
+    return mesh
+
+
+def _strained(nodes: Nodes, mesh: Any) -> Any:
+    """The mesh with each triangle's strain (`avatar.strain.face_strain`) stored; mesh: from `_deformed`."""
+    # Faces to points and back: the mean over the triangles that touch a triangle.
+    means = [nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT") for half in TENSOR_HALVES]
+    strains = []
+    for index in range(STRAIN_COMPONENTS):
+        plane = (nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES)
+        products = [nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)]
+        strains.append(nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN))
+    return nodes.store(mesh, _STRAIN, _in_range(nodes, nodes.combine(*strains)), "FLOAT_VECTOR", "FACE")
+
+
+def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
+    """Strain of each splat's triangle as a vector; mesh: from `_strained`."""
+    return nodes.sample(mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR")
+
+
+def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
+    """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
+    change = nodes.vector("SUBTRACT", nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0)))
+    # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge with it.
+    inputs = {"Value": change, "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}
+    smoothed = nodes.out("GeometryNodeBlurAttribute", inputs, data_type="FLOAT_VECTOR")
+    return nodes.store(mesh, SMOOTHED_STRAIN, smoothed, "FLOAT_VECTOR", "FACE")
+
+
+def _in_range(nodes: Nodes, strain: Any) -> Any:
+    lowest, highest = (nodes.attribute(name, "FLOAT_VECTOR") for name in RANGE)
+    return nodes.vector("MAXIMUM", nodes.vector("MINIMUM", strain, highest), lowest)
+
+
+DEFORMED = NodeGroup("STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed)
+STRAIN = NodeGroup("STGA Triangle Strain", {"Deformed": "Geometry"}, "Geometry", _strained)
+SAMPLED_STRAIN = NodeGroup("STGA Sampled Strain", {"Strain": "Geometry"}, "Vector", _sampled_strain)
+SMOOTHED = NodeGroup("STGA Smoothed Strain", {"Strain": "Geometry"}, "Geometry", _with_smoothed_strain)
+
+
+class SignalNodes(NamedTuple):
+    """How nodes compute the signal of a driven offset, of three components at most.
+
+    label      in names of node trees, short
+    group      the mesh from STRAIN -> the same with the signal stored on its faces
+    attribute  the vector that is stored
+    """
+
+    label: str
+    group: NodeGroup
+    attribute: str
+
+
+SIGNALS = {"strain_position": SignalNodes("position", SMOOTHED, SMOOTHED_STRAIN)}
+"""Driven offset -> its signal; those without are displayed as trained only."""
+
+
+def displayed_offsets(names: Collection[str]) -> tuple[str, ...]:
+    """Those of the driven offsets that nodes display, in the order of SIGNALS."""
+    return tuple(name for name in SIGNALS if name in names)
+
+
+@cache
+def shifted(offset: str, convention: str) -> NodeGroup:
+    """The group that moves frames by an offset: a mesh from STRAIN with FRAMES to the same mesh."""
+    name = f"STGA Driven Offset ({SIGNALS[offset].label}, {convention})"
+    return NodeGroup(name, {"Frames": "Geometry"}, "Geometry", partial(_shifted, offset, convention))
+
+
+def _shifted(offset: str, convention: str, nodes: Nodes, mesh: Any) -> Any:
+    mesh = nodes.group(SIGNALS[offset].group, mesh)
+    signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute, "FLOAT_VECTOR"))
+    terms = (
+        nodes.scale(nodes.attribute(DRIVEN_OFFSET.format(offset, index), "FLOAT_VECTOR"), factor)
+        for index, factor in enumerate(signal)
+    )
+    return shifted_frames(nodes, mesh, nodes.sum(*terms), convention)

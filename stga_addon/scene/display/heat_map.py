@@ -67,13 +67,12 @@ def _node_group() -> Any:
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
     nodes = Nodes(tree)
-    geometry, material = nodes.out("NodeGroupInput"), new_material(MODIFIER, _heat_shader)
+    geometry, material = nodes.out("NodeGroupInput"), new_material(MODIFIER, _unlit)
     colored = nodes.out("GeometryNodeSetMaterial", {"Geometry": geometry, "Material": material})
     nodes.finish("NodeGroupOutput", {"Geometry": colored})
     return tree
 
 
-def _heat_shader(nodes: Nodes) -> Any:
-    """The colors unlit."""
+def _unlit(nodes: Nodes) -> Any:
     color = nodes.add("ShaderNodeAttribute", attribute_name=HEAT).outputs["Color"]
     return nodes.out("ShaderNodeEmission", {"Color": color})

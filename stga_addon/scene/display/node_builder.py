@@ -54,8 +54,7 @@ class NodeGroup:
 
     def tree(self) -> bpy.types.NodeTree:
         """The group's tree, built where the file has none."""
-        existing = find_tree(f".{self.name}")
-        if existing is not None:
+        if (existing := find_tree(f".{self.name}")) is not None:
             return existing
         tree = new_tree(f".{self.name}")
         tree.interface.new_socket(self.output, in_out="OUTPUT", socket_type=f"NodeSocket{self.output}")
@@ -161,21 +160,15 @@ class Nodes:
         """A field interpolated to another domain: faces to points and back are means of the touching elements."""
         return self.out("GeometryNodeFieldOnDomain", {"Value": value}, data_type=data_type, domain=domain)
 
-    def at_point(self, value: Any, index: Any) -> bpy.types.NodeSocket:
-        """A vector field of the points, evaluated at the point `index`."""
-        inputs = {"Index": index, "Value": value}
-        return self.out("GeometryNodeFieldAtIndex", inputs, data_type="FLOAT_VECTOR", domain="POINT")
-
-    def corner_point(self, corner: int) -> bpy.types.NodeSocket:
-        """Index of the point at a face's corner 0, 1 or 2, in the order in which the face lists its vertices."""
-        corner_index = self.out("GeometryNodeCornersOfFace", {"Sort Index": corner})
-        return self.out("GeometryNodeVertexOfCorner", {"Corner Index": corner_index})
-
-    def triangle_corners(self) -> tuple[Any, Any, Any]:
-        """Positions of the three corners of each face."""
-        position = self.out("GeometryNodeInputPosition")
-        first, second, third = (self.at_point(position, self.corner_point(corner)) for corner in range(3))
-        return first, second, third
+    def triangle_corners(self) -> list[bpy.types.NodeSocket]:
+        """Positions of the three corners of each face, in the order in which it lists its vertices."""
+        position, found = self.out("GeometryNodeInputPosition"), []
+        for number in range(3):
+            corner = self.out("GeometryNodeCornersOfFace", {"Sort Index": number})
+            point = self.out("GeometryNodeVertexOfCorner", {"Corner Index": corner})
+            inputs = {"Index": point, "Value": position}
+            found.append(self.out("GeometryNodeFieldAtIndex", inputs, data_type="FLOAT_VECTOR", domain="POINT"))
+        return found
 
     def object_info(self, obj: Any, space: str = "RELATIVE") -> bpy.types.Node:
         """Object Info: "RELATIVE" gives geometry and location in the space of the object that has the modifier."""

@@ -1,5 +1,6 @@
-"""Splats as attributes of a Blender mesh: their names, how they are written, how they are read back."""
+"""Splats and their light as attributes of Blender meshes: names, how they are written, how they are read back."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,7 @@ ROTATION = "stga_rotation"
 SCALE = "stga_scale"  # standard deviations, linear
 OPACITY = "stga_opacity"  # 0 to 1
 COLOR = "stga_color"  # constant part, scene-linear: all the nodes need for splats of SH degree 0 without strain
-RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame (`render.frame_colors`): where it is there, it counts
+RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame (`render.scene_splats`): where it is there, it counts
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"
@@ -135,21 +136,16 @@ def read_splats(mesh: Any) -> Splats:
         )
 
 
-def read_strain_range(neutral: Any) -> np.ndarray | None:
-    """`Avatar.strain_range` as stored in a neutral mesh; None where it is not."""
-    return _read_vectors(neutral, RANGE)
-
-
 def read_driven_offsets(neutral: Any) -> dict[str, np.ndarray]:
     """`Avatar.driven_offsets` as stored in a neutral mesh."""
     found = {
-        name: _read_vectors(neutral, [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)])
+        name: read_vectors(neutral, [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)])
         for name, offset in OFFSETS.items()
     }
     return {name: coefficients for name, coefficients in found.items() if coefficients is not None}
 
 
-def _read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
+def read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
     """(F, len(names), 3) of vector attributes; None where the mesh lacks one."""
     if not all(name in mesh.attributes for name in names):
         return None
@@ -170,3 +166,52 @@ def _strain_vectors(basis: StrainBasis) -> Iterator[tuple[str, np.ndarray]]:
         for index in range(STRAIN_COMPONENTS):
             for start, half in zip((0, 3), TENSOR_HALVES, strict=True):
                 yield name.format(index, half), tensors[:, index, start : start + 3]
+
+
+PROPERTY = "stga_light"
+"""On the neutral mesh: JSON of what is not by vertex."""
+VECTORS = ("stga_transfer_0", "stga_transfer_1", "stga_transfer_2", "stga_irradiance")
+NUMBERS = ("stga_occlusion", "stga_roughness")
+REST = ("residual", "damping", "source")
+
+
+def write_light(mesh: Any, light: AvatarLight | None) -> None:
+    """Store the light in a neutral mesh; None removes what it has."""
+    if light is None:
+        for name in (*VECTORS, *NUMBERS):
+            if name in mesh.attributes:
+                mesh.attributes.remove(mesh.attributes[name])
+        if PROPERTY in mesh:
+            del mesh[PROPERTY]
+        return
+    transfer = light.transfer
+    vectors = transfer[:, :3], transfer[:, 3:6], transfer[:, 6:], light.irradiance
+    for name, values in zip(VECTORS, vectors, strict=True):
+        _write(mesh, name, "FLOAT_VECTOR", "vector", values)
+    for name, values in zip(NUMBERS, (light.occlusion, light.roughness), strict=True):
+        _write(mesh, name, "FLOAT", "value", values)
+    rest: dict[str, Any] = {name: getattr(light, name) for name in REST}
+    mesh[PROPERTY] = json.dumps(rest | {"radiance": light.radiance.ravel().tolist()})
+
+
+def read_light(mesh: Any) -> AvatarLight | None:
+    """What `write_light` stored; None where it is not there."""
+    names = (*VECTORS, *NUMBERS)
+    if PROPERTY not in mesh or not all(name in mesh.attributes for name in names):
+        return None
+    rest = json.loads(mesh[PROPERTY])
+    vectors = [read_values(mesh.attributes[name].data, "vector", 3) for name in VECTORS]
+    occlusion, roughness = (read_values(mesh.attributes[name].data, "value", 1)[:, 0] for name in NUMBERS)
+    return AvatarLight(
+        radiance=np.array(rest["radiance"], np.float32).reshape(9, 3),
+        transfer=np.concatenate(vectors[:3], axis=1),
+        occlusion=occlusion,
+        irradiance=vectors[3],
+        roughness=roughness,
+        **{name: rest[name] for name in REST},
+    )
+
+
+def _write(mesh: Any, name: str, data_type: str, field: str, values: np.ndarray) -> None:
+    attribute = mesh.attributes.get(name) or mesh.attributes.new(name, data_type, "POINT")
+    attribute.data.foreach_set(field, flat_floats(values))

@@ -13,13 +13,10 @@ from .. import tags
 from ..compat import NATIVE_SPLATS
 from ..layers import FROZEN_COLOR
 from .color_nodes import LINEAR_TO_SRGB, SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
-from .display_modes import AS_TRAINED, MODES, NATIVE_GROUPS, displayed
-from .frame_nodes import FRAMES, PLACED
-from .materials import DISPLAY_COLOR
+from .display_modes import AS_TRAINED, DISPLAY_COLOR, MODES, NATIVE_GROUPS, displayed
+from .frame_nodes import DEFORMED, FRAMES, PLACED, SAMPLED_STRAIN, SIGNALS, STRAIN, shifted
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
-from .offset_nodes import SIGNALS, shifted
 from .splat_attributes import COLOR, FACE, OPACITY, RELIT_COLOR
-from .strain_nodes import DEFORMED, SAMPLED_STRAIN, STRAIN
 
 # Inputs of the modifier, by their displayed names.
 HEAD = "Head"
@@ -58,8 +55,7 @@ class TreeOptions(NamedTuple):
 
 def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
     """The node tree for splats of this kind. Built once per file."""
-    existing = find_splat_tree(options)
-    if existing is not None:
+    if (existing := find_splat_tree(options)) is not None:
         return existing
     tree = new_tree(options.tree_name)
     tree.is_modifier = True
@@ -134,15 +130,24 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
 
 def _build(nodes: Nodes, options: TreeOptions) -> None:
     inputs = nodes.add("NodeGroupInput").outputs
-    splats, visible = inputs["Geometry"], _visible(nodes, inputs)
+    splats = inputs["Geometry"]
+    opaque = nodes.compare("GREATER_EQUAL", nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD])
+    # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
+    random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
+    visible = nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", random, inputs[PERCENTAGE]))
     strain, gray = None, False
     if options.convention is None:
         splats = nodes.group(PLACED[None], splats)
         color = _color(nodes, inputs, None, options.degree)
     else:
-        head = nodes.object_info(inputs[HEAD]).outputs["Geometry"]
-        strained = _strained(nodes, inputs, head) if options.strain_color or options.offsets else None
-        frames = _frames(nodes, head, strained, options.convention, options.offsets)
+        head, strained = nodes.object_info(inputs[HEAD]).outputs["Geometry"], None
+        if options.strain_color or options.offsets:
+            # The neutral mesh, deformed as the head is, with strain on its triangles.
+            neutral = nodes.object_info(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
+            strained = nodes.group(STRAIN, nodes.group(DEFORMED, head, neutral))
+        frames = nodes.group(FRAMES[options.convention], strained if options.offsets else head)
+        for name in options.offsets:
+            frames = nodes.group(shifted(name, options.convention), frames)
         splats = nodes.group(PLACED[options.convention], splats, frames)
         strain = nodes.group(SAMPLED_STRAIN, strained) if options.strain_color else None
         color = _color(nodes, inputs, strain, options.degree)
@@ -163,22 +168,6 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     display.default_value = AS_TRAINED  # the menu has items only once it is linked
 
 
-def _frames(nodes: Nodes, head: Any, strained: Any, convention: str, offsets: tuple[str, ...]) -> Any:
-    """The mesh with the frames that place splats; strained: from `_strained`, where there are driven offsets."""
-    if not offsets:
-        return nodes.group(FRAMES[convention], head)
-    mesh = nodes.group(FRAMES[convention], strained)
-    for name in offsets:
-        mesh = nodes.group(shifted(name, convention), mesh)
-    return mesh
-
-
-def _strained(nodes: Nodes, inputs: Any, head: Any) -> Any:
-    """The neutral mesh, deformed as the head is, with strain on its triangles."""
-    neutral = nodes.object_info(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
-    return nodes.group(STRAIN, nodes.group(DEFORMED, head, neutral))
-
-
 def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
     """Scene-linear color of each splat; strain: a vector field, None where colors do not follow it."""
     color = nodes.attribute(COLOR, "FLOAT_COLOR")
@@ -192,14 +181,6 @@ def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
     direction, has_camera = view_direction(nodes, nodes.out("GeometryNodeInputPosition"))
     from_camera = nodes.group(SRGB_TO_LINEAR, view_color(nodes, srgb, degree, direction))
     return nodes.switch("RGBA", nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera), color, from_camera)
-
-
-def _visible(nodes: Nodes, inputs: Any) -> bpy.types.NodeSocket:
-    """Field: splats of sufficient opacity that are in the random part."""
-    opaque = nodes.compare("GREATER_EQUAL", nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD])
-    # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
-    random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
-    return nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", random, inputs[PERCENTAGE]))
 
 
 def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:

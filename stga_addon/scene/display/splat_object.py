@@ -15,21 +15,46 @@ from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
 from . import splat_nodes
 from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
-from .hints import use_transparent_bounces
+from .frame_nodes import displayed_offsets
 from .node_builder import is_splat_tree
-from .offset_nodes import displayed_offsets
 from .splat_attributes import (
+    RANGE,
     Attributes,
     SplatAttributes,
     avatar_attributes,
     read_driven_offsets,
+    read_light,
     read_splats,
-    read_strain_range,
+    read_vectors,
     splat_attributes,
     write_attributes,
+    write_light,
     write_splats,
 )
-from .stored_light import read_light, write_light
+
+TRANSPARENT_BOUNCES = 64
+"""Layers of overlapping splats that Cycles has to see through; behind its default of 8 is black."""
+
+
+def view_transform_hint(scene: bpy.types.Scene) -> str | None:
+    """A sentence where the view transform changes the colors of splats that EEVEE and Cycles render, else None."""
+    if scene.view_settings.view_transform == "Standard":
+        return None
+    return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"
+
+
+def shows_nodes(scene: bpy.types.Scene) -> bool:
+    """Whether the scene is rendered by EEVEE or Cycles, which show what geometry nodes make of splats."""
+    return scene.render.engine == "CYCLES" or scene.render.engine.startswith("BLENDER_EEVEE")
+
+
+def use_transparent_bounces(scene: bpy.types.Scene) -> None:
+    """Let Cycles, where its add-on is enabled, see through overlapping splats without ending rays between them at
+    random; limits that are higher stay."""
+    cycles = getattr(scene, "cycles", None)
+    for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
+        setattr(cycles, limit, max(getattr(cycles, limit), TRANSPARENT_BOUNCES))
+
 
 SETTING_NAMES = {
     splat_nodes.SIZE: "size",
@@ -57,8 +82,9 @@ def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: Sp
     _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
-    neutral = _neutral_object(f"{splat_object.name} neutral", avatar, prepared)
-    set_input(splat_object, splat_nodes.NEUTRAL, neutral)
+    neutral = triangle_mesh(f"{splat_object.name} neutral", avatar.neutral, avatar.faces)
+    _write_neutral(neutral, prepared)
+    set_input(splat_object, splat_nodes.NEUTRAL, bpy.data.objects.new(neutral.name, neutral))
     # A sibling of the head: both have the same object space.
     splat_object.parent = head.parent
     splat_object.matrix_parent_inverse = head.matrix_parent_inverse
@@ -200,7 +226,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         neutral=mesh_vertices(neutral.data),
         faces=mesh_triangles(neutral.data),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
-        strain_range=read_strain_range(neutral.data),
+        strain_range=read_vectors(neutral.data, RANGE),
         driven_offsets=read_driven_offsets(neutral.data),
         light=read_light(neutral.data),
     )
@@ -241,12 +267,6 @@ def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
     return splat_object
 
 
-def _neutral_object(name: str, avatar: Avatar, prepared: SplatAttributes) -> Any:
-    mesh = triangle_mesh(name, avatar.neutral, avatar.faces)
-    _write_neutral(mesh, prepared)
-    return bpy.data.objects.new(name, mesh)
-
-
 def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
     write_attributes(mesh, prepared.neutral, "FACE")
     write_light(mesh, prepared.light)
@@ -256,9 +276,7 @@ def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
 def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
     modifier = splat_object.modifiers.new("STGA Splats", "NODES")
     modifier.node_group = splat_nodes.splat_tree(options)
-    set_input(
-        splat_object, splat_nodes.DISPLAY, AS_TRAINED
-    )  # a menu's default reaches the modifier in some versions only
+    set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)  # the default reaches it in some versions only
     for scene in splat_object.users_scene:
         use_transparent_bounces(scene)
 

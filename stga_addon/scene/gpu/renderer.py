@@ -3,31 +3,172 @@
 Needs a GPU context: a viewport's drawing, or a render engine with `bl_use_gpu_context`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
+import bpy
 import gpu
 import numpy as np
 from gpu.types import Buffer, GPUBatch, GPUFrameBuffer, GPUIndexBuf, GPUTexture, GPUVertBuf, GPUVertFormat
+from mathutils import Vector
 
 from ...avatar.embedding import FaceFrames
+from ...light.lamps import MAP_SIZE
 from ...raster.posed_splats import ComposedImage
 from ..layers import SceneLayer
 from . import packing
-from .front_bones import NO_BONES
-from .packing import StaticSplats, View
-from .relit_renderer import RelitTextures
-from .relit_shaders import RELIT_TEXTURES
+from .packing import RelitScene, ShadowView, StaticSplats, View, relit_scene, surface, with_eye
 from .shaders import (
     BLOCK_SPLATS,
+    EXACT,
+    MAP_COLUMNS,
+    NOTHING,
     PACKED_TEXTURES,
     PROJECTED_TEXTURES,
+    RELIT_TEXTURES,
+    TEXTURE_WIDTH,
     composite_shader,
     projection_shader,
+    shadow_map_shader,
     splat_shader,
+    texture,
+    texture_rows,
 )  # fmt: skip
-from .textures import EXACT, TEXTURE_WIDTH, texture, texture_rows
+
+NEAR_PER_SQUARE = 3e-4
+"""Meters from a lamp at which its map begins, over the squared distance of the head: float32 then tells depths there
+0.2 mm apart, and less where the map begins nearer. What is nearer throws no shadow."""
+
+
+class RelitTextures:
+    """What the shaders read of light for the layers drawn last."""
+
+    def __init__(self) -> None:
+        self._shader = shadow_map_shader()
+        self._surface_of: tuple[Any, ...] = ()
+        self._scene_of: tuple[Any, ...] = ()
+        self._kept: tuple[Any, ...] = ()
+        self._scene: RelitScene | None = None
+        self._atlas: tuple[int, Any, Any, Any] | None = None
+        self._batches: dict[tuple[int, int], tuple[Any, Any]] = {}
+        self.textures: dict[str, Any] = {}
+
+    def update(self, layers: Sequence[SceneLayer], eye: np.ndarray) -> dict[str, Any]:
+        """The textures by name, for a camera at eye (3,); must be called before a framebuffer is bound."""
+        relighters = tuple((id(layer.splats), layer.relit and id(layer.relit.relighter)) for layer in layers)
+        if relighters != self._surface_of:
+            self.textures["surface"], self._surface_of = texture(surface(layers)), relighters
+        scene_of = tuple(id(layer.relit) for layer in layers)
+        if self._scene is None or scene_of != self._scene_of:
+            self._scene = relit_scene(layers)
+            self.textures["vertices"] = texture(self._scene.vertices)
+            self.textures["shadows"] = self._draw_maps(self._scene.maps)
+            self._scene_of = scene_of
+            self._kept = tuple(layers)  # whose identity was compared
+        self.textures["lights"] = texture(with_eye(self._scene, layers, eye))
+        return self.textures
+
+    def _draw_maps(self, maps: Sequence[ShadowView]) -> Any:
+        rows = max(1, -(-len(maps) // MAP_COLUMNS))
+        if self._atlas is None or self._atlas[0] != rows:
+            size = MAP_SIZE * MAP_COLUMNS, MAP_SIZE * rows
+            depths, tested = GPUTexture(size, format="R32F"), GPUTexture(size, format="DEPTH_COMPONENT32F")
+            target = GPUFrameBuffer(depth_slot=tested, color_slots=(depths,))
+            self._atlas = rows, depths, target, tested  # a framebuffer does not keep its textures alive
+        _, depths, target, _ = self._atlas
+        known, self._batches = self._batches, {}
+        with target.bind():
+            target.clear(color=(NOTHING, 0.0, 0.0, 0.0), depth=1.0)
+            gpu.state.depth_test_set("LESS_EQUAL")
+            gpu.state.depth_mask_set(True)
+            gpu.state.blend_set("NONE")
+            gpu.state.face_culling_set("NONE")
+            for index, drawn in enumerate(maps):
+                x, y = MAP_SIZE * (index % MAP_COLUMNS), MAP_SIZE * (index // MAP_COLUMNS)
+                gpu.state.viewport_set(x, y, MAP_SIZE, MAP_SIZE)
+                self._draw_map(drawn, known)
+            gpu.state.viewport_set(0, 0, MAP_SIZE * MAP_COLUMNS, MAP_SIZE * rows)
+            gpu.state.depth_test_set("NONE")
+            gpu.state.depth_mask_set(False)
+        return depths
+
+    def _draw_map(self, drawn: ShadowView, known: dict[tuple[int, int], tuple[Any, Any]]) -> None:
+        shader, view = self._shader, drawn.view
+        shader.bind()
+        for name, axis in zip(("row_x", "row_y", "row_z"), view.axes.T, strict=True):
+            shader.uniform_float(name, (*axis, -float(view.origin @ axis)))
+        distance = float(((drawn.meshes[0][0] - view.origin) @ view.axes[:, 2]).max())
+        near = min(max(1e-3, NEAR_PER_SQUARE * distance**2), abs(distance) / 2)
+        shader.uniform_float("lens", (2 * view.scale / view.size, float(view.is_parallel), near, 0.0))
+        for mesh in drawn.meshes:
+            key = id(mesh[0]), id(mesh[1])
+            if key not in self._batches:
+                self._batches[key] = known.get(key) or (mesh, _triangles(*mesh))
+            self._batches[key][1].draw(shader)
+
+
+def _triangles(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    layout = GPUVertFormat()
+    layout.attr_add(id="position", comp_type="F32", len=3, fetch_mode="FLOAT")
+    buffer = GPUVertBuf(len=len(vertices), format=layout)
+    buffer.attr_fill(id="position", data=np.ascontiguousarray(vertices, np.float32))
+    indices = GPUIndexBuf(type="TRIS", seq=np.ascontiguousarray(faces, np.uint32))
+    return GPUBatch(type="TRIS", buf=buffer, elem=indices)
+
+
+NO_BONES = np.zeros((0, 2, 4), np.float32)
+MAX_SHAPES = 256
+"""Bones looked for in each pixel; those of a larger rig are covered by splats."""
+WIDTH_SHARE, MARGIN_PX = 0.15, 6.0
+"""Half the width of a bone as a share of its length, and what is added for outlines."""
+
+
+def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
+    """(M, 2, 4) float32: for each bone two ends in pixels (x0, y0, x1, y1), and a radius beside three zeros.
+
+    space, region: the SpaceView3D and RegionView3D, drawn with width × height pixels, from the bottom left.
+    """
+    overlay = space.overlay
+    if not (overlay.show_overlays and overlay.show_bones):
+        return NO_BONES
+    rigs = [
+        rig
+        for rig in bpy.context.view_layer.objects
+        if rig.type == "ARMATURE" and rig.show_in_front and rig.visible_get(viewport=space)
+    ]
+    spheres = [ends for rig in rigs for ends in _bone_ends(rig)][:MAX_SHAPES]
+    if not spheres:
+        return NO_BONES
+    ends = np.array([[(*point, 1.0) for point in pair[:2]] for pair in spheres])
+    radius = np.array([pair[2] for pair in spheres])
+    clip = ends @ np.array(region.perspective_matrix, np.float64).T
+    before = (clip[..., 3] > 0).all(1)  # the camera; a bone with an end behind it is left out
+    clip, radius = clip[before], radius[before]
+    half = np.array([width, height]) / 2
+    shapes = np.zeros((len(clip), 2, 4), np.float32)
+    shapes[:, 0] = ((clip[..., :2] / clip[..., 3:] + 1) * half).reshape(-1, 4)
+    scale = np.abs(np.array(region.window_matrix[1][1])) * half[1] / clip[..., 3].min(1)
+    shapes[:, 1, 0] = radius * scale + MARGIN_PX
+    return shapes
+
+
+def _bone_ends(rig: Any) -> Iterator[tuple[Any, Any, float]]:
+    """Head, tail and half the width, in the world, of each visible bone; of one with a shape, a sphere around that."""
+    matrix = rig.matrix_world
+    size = matrix.median_scale
+    for bone in rig.pose.bones:
+        if bone.bone.hide or getattr(bone, "hide", False):
+            continue
+        shape = bone.custom_shape if rig.data.show_bone_custom_shapes else None
+        if shape is None:
+            yield matrix @ bone.head, matrix @ bone.tail, size * bone.length * WIDTH_SHARE
+            continue
+        owner = bone.custom_shape_transform or bone
+        center = matrix @ owner.matrix @ bone.custom_shape_translation
+        reach = max(Vector(corner).length for corner in shape.bound_box) * max(map(abs, bone.custom_shape_scale_xyz))
+        yield center, center, size * reach * (bone.length if bone.use_custom_shape_bone_size else 1.0)
+
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
 OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
@@ -72,7 +213,11 @@ class SplatRenderer:
         In two passes: the first projects and colors each splat, into a texel of the projected textures; the second
         reads these and draws the splats from far to near.
         """
-        self._resize(view.camera.width, view.camera.height)
+        size = view.camera.width, view.camera.height
+        if self._size != size:
+            self._size, self._color = size, GPUTexture(size, format=self._color_format)
+            self._depth = GPUTexture(size, format=DEPTH_FORMAT)
+            self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
         gpu.state.depth_test_set("NONE")
         gpu.state.depth_mask_set(False)
         count = self._project(layers, view) if layers else 0
@@ -151,26 +296,16 @@ class SplatRenderer:
         self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
         return self._static
 
-    def _frame_blocks(self, layers: Sequence[SceneLayer]) -> list[np.ndarray]:
-        """`packing.frame_block` of each layer, computed again only for frames that are new."""
+    def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
+        """Project and color the splats, farthest first, into the projected textures; returns how many there are."""
+        static = self._update_static(layers)
+        # Blocks are computed again only for frames that are new.
         known = self._blocks
         self._blocks = {
             id(layer.frames): known.get(id(layer.frames)) or (layer.frames, packing.frame_block(layer.frames))
             for layer in layers
         }
-        return [self._blocks[id(layer.frames)][1] for layer in layers]
-
-    def _resize(self, width: int, height: int) -> None:
-        if self._size != (width, height):
-            self._size = width, height
-            self._color = GPUTexture((width, height), format=self._color_format)
-            self._depth = GPUTexture((width, height), format=DEPTH_FORMAT)
-            self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
-
-    def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
-        """Project and color the splats, farthest first, into the projected textures; returns how many there are."""
-        static = self._update_static(layers)
-        frames = packing.posed_frames(layers, self._frame_blocks(layers), view)
+        frames = packing.posed_frames(layers, [self._blocks[id(layer.frames)][1] for layer in layers], view)
         order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0

@@ -1,7 +1,6 @@
-"""The light of a Blender scene for each of its avatars."""
+"""The light of a Blender scene for each of its avatars, and heads' shadows onto the scene."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -15,11 +14,11 @@ from ..arrays import mesh_vertices, read_values
 from ..display import splat_nodes
 from ..display.splat_object import get_input
 from ..layers import Relit
-from .lights import in_avatar_space, is_linked, light_of
+from .lights import WorldLight, in_avatar_space, is_linked, light_of, split_world, world_light
 from .settings import current_settings, lighting_settings
-from .world import WorldLight, split_world, world_light
 
 MAX_KEPT = 64
+COPIED_SETTINGS = ("mode", "mix", "exposure", "roughness", "specular", "shadows")
 
 
 class SceneLight:
@@ -44,11 +43,11 @@ class SceneLight:
             return None
         lighting = self.lighting(settings, (splat_object, head), to_world, visible, depsgraph)
         casters = self.casters.of(head, to_world, visible, depsgraph) if lighting.shadows else ()
-        relighter = self._relighter(splat_object.session_uid, avatar)
-        key, place = (
-            (_key(lighting), id(relighter), id(vertices), id(casters)),
-            (splat_object.session_uid, to_world.tobytes()),
-        )
+        uid = splat_object.session_uid
+        relighter = self._relighters.get(uid)
+        if relighter is None or relighter.avatar is not avatar:
+            relighter = self._relighters[uid] = Relighter(avatar)
+        key, place = (_key(lighting), id(relighter), id(vertices), id(casters)), (uid, to_world.tobytes())
         known = self._relit.get(place)
         if known is None or known[0] != key:
             if len(self._relit) > MAX_KEPT:  # objects that move leave an entry at each place
@@ -75,13 +74,8 @@ class SceneLight:
         return Lighting(
             world=world,
             lights=(*lights, *suns),
-            mode=settings.mode,
-            mix=settings.mix,
-            exposure=settings.exposure,
             white=(red, green, blue),
-            roughness=settings.roughness,
-            specular=settings.specular,
-            shadows=settings.shadows,
+            **{name: getattr(settings, name) for name in COPIED_SETTINGS},
         )
 
     def _world(self, depsgraph: Any, to_world: np.ndarray) -> tuple[np.ndarray, tuple[Light, ...]]:
@@ -100,22 +94,12 @@ class SceneLight:
         u, _, v = np.linalg.svd(to_world[:3, :3])
         return rotated(world, (u @ v).T), tuple(in_avatar_space(sun, to_world) for sun in suns)
 
-    def _relighter(self, uid: int, avatar: Avatar) -> Relighter:
-        if uid not in self._relighters or self._relighters[uid].avatar is not avatar:
-            self._relighters[uid] = Relighter(avatar)
-        return self._relighters[uid]
-
 
 def _key(lighting: Lighting) -> tuple[Any, ...]:
     """Equal for lightings of the same values."""
-    return (
-        *(_value(getattr(lighting, field.name)) for field in fields(lighting) if field.name != "lights"),
-        *(_value(getattr(light, field.name)) for light in lighting.lights for field in fields(light)),
-    )
-
-
-def _value(value: Any) -> Any:
-    return value.tobytes() if isinstance(value, np.ndarray) else value
+    values = [value for name, value in vars(lighting).items() if name != "lights"]
+    values += [value for light in lighting.lights for value in vars(light).values()]
+    return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in values)
 
 
 class Casters:
@@ -174,3 +158,22 @@ def _read(owner: Any, matrix: Any, depsgraph: Any) -> Caster:
 
 def _moved(caster: Caster, matrix: np.ndarray) -> Caster:
     return Caster(caster.vertices @ matrix[:3, :3].T + matrix[:3, 3], caster.faces)
+
+
+HIDDEN_RAYS = ("camera", "diffuse", "glossy", "transmission", "volume_scatter")
+"""Rays that do not see a head which only throws shadows."""
+
+
+def throws_shadow(splat_object: Any) -> bool:
+    """Whether the head of a splat object is set up to throw its shadow, and nothing else, in images."""
+    head = get_input(splat_object, splat_nodes.HEAD)
+    return head is not None and not head.hide_render and not head.visible_camera and bool(head.visible_shadow)
+
+
+def throw_shadow(splat_object: Any, is_on: bool) -> None:
+    """Let the head's mesh throw its shadow onto the scene without being seen, or hide it from images again."""
+    head = get_input(splat_object, splat_nodes.HEAD)
+    head.hide_render = not is_on
+    head.visible_shadow = True
+    for ray in HIDDEN_RAYS:
+        setattr(head, f"visible_{ray}", not is_on)

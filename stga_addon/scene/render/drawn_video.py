@@ -5,7 +5,6 @@ import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...files import replacing
-from ...render.recording import finished, is_video
+from ...render.video import finished, is_video
 from ..compat import choose_video_file, sequencer_strips
 from ..layers import SceneLayer
 from .engine import draw_image
@@ -75,7 +74,13 @@ def _encode(images: Sequence[Path], fps: float) -> Path:
         for image in images[1:]:
             strip.elements.append(image.name)
         scene.frame_start, scene.frame_end = 1, len(images)
-        _set_up_render(scene.render, width, height, fps)
+        render = scene.render
+        render.resolution_x, render.resolution_y = width + width % 2, height + height % 2  # even, as the format needs
+        render.resolution_percentage = 100
+        render.fps = max(round(fps), 1)
+        render.fps_base = render.fps / fps
+        render.use_sequencer, render.use_file_extension = True, True
+        choose_video_file(render)
         scene.view_settings.view_transform = "Standard"
         scene.render.filepath = str(video)
         bpy.ops.render.render(animation=True, scene=scene.name)
@@ -86,12 +91,3 @@ def _encode(images: Sequence[Path], fps: float) -> Path:
     if not video.is_file():
         raise StgaError("Blender could not encode the video; see the console")
     return video
-
-
-def _set_up_render(render: Any, width: int, height: int, fps: float) -> None:
-    render.resolution_x, render.resolution_y = width + width % 2, height + height % 2  # even, as the format needs
-    render.resolution_percentage = 100
-    render.fps = max(round(fps), 1)
-    render.fps_base = render.fps / fps
-    render.use_sequencer, render.use_file_extension = True, True
-    choose_video_file(render)

@@ -16,18 +16,15 @@ from bpy.app.handlers import persistent
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...raster.posed_splats import ComposedImage
+from ..cameras import render_camera
 from ..gpu.context import has_gpu_context
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer
 from ..gpu.shaders import MIN_ALPHA
 from ..layers import SceneLayer
-from . import redraw
-from .camera import render_camera
-from .composite import combined, scene_background
-from .engine_viewport import EngineViewport
-from .rasterizer import Rasterizer
+from .engine_viewport import EngineViewport, Rasterizer, redraw_when_rendered, stop_redraws
 from .scene_splats import SplatCache, visible_layers
-from .view_transform import inverse_view, measure, needs_inverse
+from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background
 from .viewport_display import ENGINE
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
@@ -102,7 +99,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         result = self.begin_result(0, 0, *size, layer=depsgraph.view_layer.name)
         for render_pass in result.layers[0].passes:
             if render_pass.name in passes:
-                _write_pass(render_pass, passes[render_pass.name])
+                from_bottom = np.ascontiguousarray(passes[render_pass.name][::-1], np.float32)
+                render_pass.rect.foreach_set(from_bottom.ravel())
         self.end_result(result)
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
@@ -115,7 +113,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             return
         renderer = viewport.renderer
         if viewport.request_image(context, depsgraph):
-            redraw.redraw_when_rendered(renderer, self)
+            redraw_when_rendered(renderer, self)
         self.update_stats("", renderer.error)
         if renderer.image is not None:
             self.bind_display_space_shader(depsgraph.scene)
@@ -150,11 +148,6 @@ def _border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
     return left, low, right - left, high - low
 
 
-def _write_pass(render_pass: Any, values: np.ndarray) -> None:
-    """Fill a render pass with (H, W, channels), top row first; Blender's rows start at the bottom."""
-    render_pass.rect.foreach_set(np.ascontiguousarray(values[::-1], np.float32).ravel())
-
-
 @persistent
 def _before_render(*_: Any) -> None:
     """Measure the view transforms of all scenes that a render may ask this engine for; a compositor may ask for any."""
@@ -169,35 +162,20 @@ def register(find_python: Callable[[], str], find_device: Callable[[], str] = la
     _rasterizer = Rasterizer(find_python, find_device)
     bpy.utils.register_class(SplatsEngine)
     bpy.app.handlers.render_pre.append(_before_render)
-    add_engine()
+    for panel in _panels_by_engine():
+        if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in SHARED_PANELS:
+            panel.COMPAT_ENGINES.add(ENGINE)
 
 
 def unregister() -> None:
-    remove_engine()
-    bpy.app.handlers.render_pre.remove(_before_render)
-    bpy.utils.unregister_class(SplatsEngine)
-    redraw.stop()
-    _rasterizer.client.close()
-
-
-def add_engine() -> None:
-    for panel in _shared_panels():
-        panel.COMPAT_ENGINES.add(ENGINE)
-
-
-def remove_engine() -> None:
     for panel in _panels_by_engine():
         panel.COMPAT_ENGINES.discard(ENGINE)
+    bpy.app.handlers.render_pre.remove(_before_render)
+    bpy.utils.unregister_class(SplatsEngine)
+    stop_redraws()
+    _rasterizer.client.close()
 
 
 def _panels_by_engine() -> list[Any]:
     """The panels that list the engines they are for."""
     return [panel for panel in bpy.types.Panel.__subclasses__() if hasattr(panel, "COMPAT_ENGINES")]
-
-
-def _shared_panels() -> list[Any]:
-    return [
-        panel
-        for panel in _panels_by_engine()
-        if "BLENDER_RENDER" in panel.COMPAT_ENGINES or panel.__name__ in SHARED_PANELS
-    ]

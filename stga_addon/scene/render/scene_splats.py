@@ -1,4 +1,4 @@
-"""The splats of a scene's visible objects, posed at its frame: what the GPU display and the render engine draw."""
+"""The splats of a scene's visible objects, posed at its frame, and their relit colors stored for EEVEE and Cycles."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -12,12 +12,13 @@ from ...avatar.file import Avatar
 from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
-from ..arrays import mesh_vertices
+from ..arrays import flat_floats, mesh_vertices
 from ..display import splat_nodes
-from ..display.splat_attributes import read_splats
-from ..display.splat_object import display_settings, get_input, splat_modifier, stored_avatar
+from ..display.splat_attributes import RELIT_COLOR, read_splats, write_attributes
+from ..display.splat_object import display_settings, get_input, splat_modifier, stored_avatar, stored_light
 from ..layers import SceneLayer
 from ..light.scene_light import SceneLight
+from ..light.settings import lighting_settings
 from ..vertex_groups import frame_selection
 
 
@@ -75,26 +76,16 @@ def visible_layers(
     view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects.
     Raises StgaError where the head of an object is gone or has other triangles than its splats.
     """
-    shown = list(_visible_objects(depsgraph, view))
+    if view is None:
+        visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
+    else:
+        visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
+    shown = [found for each in visible for found in _with_instances(each, depsgraph, Matrix())]
     return [
         _layer(visible, matrix, depsgraph, cache, shown)
         for visible, matrix in shown
         if visible.get(tags.KIND) == tags.SPLATS and is_wanted(visible)
     ]
-
-
-def _visible_objects(depsgraph: Any, view: Any) -> Iterator[tuple[Any, Matrix]]:
-    """Objects that viewports or final images show, with their world matrices; members of an instanced collection once
-    per instance.
-
-    view: the 3D viewport (a SpaceView3D) that shows them, None for a final image.
-    """
-    if view is None:
-        visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
-    else:
-        visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
-    for each in visible:
-        yield from _with_instances(each, depsgraph, Matrix())
 
 
 def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
@@ -112,6 +103,7 @@ def _is_rendered(candidate: Any, depsgraph: Any) -> bool:
 
 
 def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iterator[tuple[Any, Matrix]]:
+    """An object and its world matrix; of an instanced collection also its members, once per instance."""
     matrix = parent_matrix @ visible.evaluated_get(depsgraph).matrix_world
     yield visible, matrix
     collection = visible.instance_collection if visible.instance_type == "COLLECTION" else None
@@ -156,3 +148,48 @@ def _head_vertices(splat_object: Any, head: Any, n_faces: int, depsgraph: Any) -
     to_splats = splat_object.evaluated_get(depsgraph).matrix_world.inverted_safe() @ posed.matrix_world
     matrix = np.array(to_splats, np.float64)
     return mesh_vertices(posed.data) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def relight_frame(splat_object: Any, scene: Any) -> None:
+    """Store the splats' scene-linear colors in the scene's light, at its frame and from its camera.
+
+    Raises StgaError where the lighting is as recorded, or the avatar does not know its light.
+    """
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    layers = visible_layers(depsgraph, SplatCache(), is_wanted=lambda shown: shown == splat_object)
+    if not layers or layers[0].relit is None:
+        raise StgaError(f"{splat_object.name}: is lit as recorded; choose Scene or Mix in the panel Lighting")
+    if scene.camera is None:
+        raise StgaError("The scene has no camera, from which highlights are seen")
+    eye = layers[0].eye_in_avatar(np.array(scene.camera.evaluated_get(depsgraph).matrix_world)[:3, 3])
+    relit = layers[0].relit
+    color = relit.relighter.radiance(relit.mesh, eye, relit.lighting, relit.casters)
+    values = flat_floats(np.concatenate([np.maximum(color, 0), np.ones((len(color), 1))], axis=1))
+    write_attributes(splat_object.data, {RELIT_COLOR: ("FLOAT_COLOR", "color", values)}, "POINT")
+    splat_object.data[tags.RELIT_FRAME] = scene.frame_current
+    splat_object.data.update()
+
+
+def forget_frame(splat_object: Any) -> bool:
+    """Show recorded colors again; whether there were others."""
+    attribute = splat_object.data.attributes.get(RELIT_COLOR)
+    if attribute is not None:
+        splat_object.data.attributes.remove(attribute)
+        splat_object.data.pop(tags.RELIT_FRAME, None)
+        splat_object.data.update()
+    return attribute is not None
+
+
+def light_hint(scene: Any) -> str | None:
+    """A sentence where EEVEE and Cycles show splats in another light than the scene's at its frame, else None."""
+    settings = lighting_settings(scene)
+    if settings is None or settings.mode == "recorded":
+        return None
+    for shown in scene.objects:
+        if tags.CONVENTION not in shown or shown.hide_render or stored_light(shown) is None:
+            continue
+        frame = shown.data.get(tags.RELIT_FRAME) if RELIT_COLOR in shown.data.attributes else None
+        if frame != scene.frame_current:
+            now = "colors as recorded" if frame is None else f"the light of frame {frame}"
+            return f"EEVEE and Cycles render {now}; Relight Frame gives them the light of this frame"
+    return None

@@ -1,4 +1,4 @@
-"""The inverse of a scene's view transform: scene-linear colors that it shows as given sRGB colors.
+"""Scene-linear colors of splats: the inverse of a scene's view transform, and what lies behind them.
 
 Blender's own color management converts a grid of scene-linear colors to a picture; that table is inverted.
 """
@@ -13,7 +13,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..compat import REC709, choose_image_file, working_space
+from ...capture.color import linear_to_srgb, srgb_to_linear
+from ..compat import REC709, choose_image_file, working_space, world_nodes
 
 DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
@@ -193,3 +194,65 @@ def _read(path: Path, count: int) -> np.ndarray:
         return values
     finally:
         bpy.data.images.remove(image)
+
+
+def combined(
+    rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] | None, view: InverseView | None = None
+) -> np.ndarray:
+    """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W), alpha (H, W).
+
+    Splats are blended in sRGB. So `background`, scene-linear (3,), is added as the sRGB that it is shown as, before the
+    conversion. Where it is None the image stays transparent, and the color is converted as if it covered its pixel.
+    view: the inverse of the view transform, None where that shows sRGB as it is.
+    """
+    to_linear = srgb_to_linear if view is None else view.to_linear
+    image, covered = np.zeros((*alpha.shape, 4), np.float32), alpha > 0
+    color, share = rgb[:, covered].T, alpha[covered][:, None]
+    if background is None:
+        image[covered, :3], image[..., 3] = to_linear(color / share) * share, alpha
+    else:
+        linear = np.array(background, np.float32)
+        behind = linear_to_srgb(np.clip(linear, 0, 1)) if view is None else view.show(linear)
+        image[...] = *background, 1
+        image[covered, :3] = to_linear(np.clip(color + (1 - share) * behind, 0, 1))
+    return image
+
+
+def srgb_background(scene: Any) -> tuple[float, float, float] | None:
+    """Color behind the splats as in `scene_background`, in sRGB 0…1."""
+    linear = scene_background(scene)
+    return None if linear is None else srgb(linear)
+
+
+def srgb(linear: Any) -> tuple[float, float, float]:
+    """sRGB 0…1 of a scene-linear color."""
+    red, green, blue = linear_to_srgb(np.clip(np.array(linear, np.float64), 0, 1)).tolist()
+    return red, green, blue
+
+
+def scene_background(scene: Any) -> tuple[float, ...] | None:
+    """Scene-linear color behind the splats, None where the film is transparent.
+
+    From the world's Background node if its inputs are constants, else its viewport color; black without a world.
+    """
+    if scene.render.film_transparent:
+        return None
+    color = world_color(scene)
+    return tuple(scene.world.color) if color is None else color
+
+
+def world_color(scene: Any) -> tuple[float, ...] | None:
+    """Scene-linear color of the scene's world, None where it is not one color; black without a world."""
+    world = scene.world
+    if world is None:
+        return 0.0, 0.0, 0.0
+    tree = world_nodes(world)
+    output = tree.get_output_node("ALL") if tree else None
+    links = output.inputs["Surface"].links if output else ()
+    if not links:
+        return tuple(world.color)
+    if links[0].from_node.type == "BACKGROUND":
+        color, strength = (links[0].from_node.inputs[name] for name in ("Color", "Strength"))
+        if not color.is_linked and not strength.is_linked:
+            return tuple(channel * strength.default_value for channel in color.default_value[:3])
+    return None

@@ -13,19 +13,16 @@ import gpu
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ...capture.color import linear_to_srgb
 from ...errors import StgaError
 from ...scene import tags
-from ..compat import world_nodes
+from ..cameras import viewport_camera
 from ..display import splat_nodes
 from ..display.display_modes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
-from ..gpu.front_bones import NO_BONES, front_bones
 from ..gpu.packing import NEAR_M, View
-from ..gpu.renderer import SplatRenderer, fastest_format
-from .camera import viewport_camera
+from ..gpu.renderer import NO_BONES, SplatRenderer, fastest_format, front_bones
 from .scene_splats import SplatCache, visible_layers
-from .view_transform import keeps_colors
+from .view_transform import keeps_colors, srgb, world_color
 
 ENGINE = "STGA_SPLATS"
 """The render engine, which draws all splats in *Rendered* mode."""
@@ -67,8 +64,8 @@ class GpuDisplay:
         self._renderer, self._scene_target, self._cache = None, None, SplatCache()
         self.problem = self.problem if self.failed else ""
 
-    def forget_casters(self) -> None:
-        """Read what throws shadows onto heads again: the scene has changed."""
+    def scene_changed(self, *_: Any) -> None:
+        """Read what throws shadows onto heads again."""
         self._cache.light.casters.forget()
 
     def _before(self) -> None:
@@ -175,12 +172,12 @@ def expected_background(context: Any) -> tuple[float, ...] | None:
     if source == "THEME":
         return None if theme.background_type == "RADIAL" else tuple(theme.high_gradient)
     if source == "VIEWPORT":
-        return _srgb(shading.background_color)
+        return srgb(shading.background_color)
     if source == "WORLD":
-        return _srgb(context.scene.world.color) if context.scene.world else (0.0, 0.0, 0.0)
+        return srgb(context.scene.world.color) if context.scene.world else (0.0, 0.0, 0.0)
     if source == "SCENE" and keeps_colors(context.scene) and not context.scene.render.film_transparent:
         color = world_color(context.scene)
-        return None if color is None else _srgb(color)
+        return None if color is None else srgb(color)
     return None
 
 
@@ -201,27 +198,6 @@ def background_source(context: Any) -> str:
     return "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
 
 
-def world_color(scene: Any) -> tuple[float, ...] | None:
-    """Scene-linear color of the scene's world, None where it is not one color; black without a world."""
-    world = scene.world
-    if world is None:
-        return 0.0, 0.0, 0.0
-    tree = world_nodes(world)
-    output = tree.get_output_node("ALL") if tree else None
-    links = output.inputs["Surface"].links if output else ()
-    if not links:
-        return tuple(world.color)
-    if links[0].from_node.type == "BACKGROUND":
-        color, strength = (links[0].from_node.inputs[name] for name in ("Color", "Strength"))
-        if not color.is_linked and not strength.is_linked:
-            return tuple(channel * strength.default_value for channel in color.default_value[:3])
-    return None
-
-
-def _srgb(linear: Any) -> tuple[float, ...]:
-    return tuple(linear_to_srgb(np.clip(np.array(linear, np.float64), 0, 1)).tolist())
-
-
 @persistent
 def _forget_file(*_: Any) -> None:
     display.forget()
@@ -229,7 +205,7 @@ def _forget_file(*_: Any) -> None:
 
 @persistent
 def _scene_changed(*_: Any) -> None:
-    display.forget_casters()
+    display.scene_changed()
 
 
 def register() -> None:

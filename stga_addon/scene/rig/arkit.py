@@ -6,13 +6,20 @@ from typing import Any
 import numpy as np
 
 from ...driving.head_map import PRODUCTS, HeadMap
-from ...driving.names import ARKIT_SHAPES, COLUMN, COUNT, arkit_name
+from ...driving.performance import ARKIT_SHAPES, COLUMN, COUNT, arkit_name
 from ...driving.shapes import MOUTH_CLOSE
 from ...errors import StgaError
 from ..animation import add_driver, write_curve
 from ..compat import action_curves, push_down_action
-from .keyframes import check_keyable, key_turns, start_action
-from .names import expression_key, key_value_path, property_path, rotation_path
+from .keyframes import (
+    check_keyable,
+    expression_key,
+    key_turns,
+    key_value_path,
+    property_path,
+    rotation_path,
+    start_action,
+)
 
 SUMS = "stga_arkit_sums"
 """Property of the rig: partial sums of the expressions, and the axis-angles of jaw and eyes."""
@@ -97,18 +104,6 @@ def shape_key_names(head: Any) -> dict[int, str]:
     return {COLUMN[name]: block for block in reversed(blocks) if (name := arkit_name(block)) is not None}
 
 
-def key_weights(owner: Any, paths: dict[int, str], numbers: Sequence[int], weights: np.ndarray) -> None:
-    """Add keyframes of weights (T, 52) at the frames `numbers` to the active action of `owner`.
-
-    paths  column -> data path of its value; a shape that never moves gets a single keyframe
-    """
-    curves, at = action_curves(owner), np.asarray(numbers)
-    for column, path in paths.items():
-        values = weights[:, column]
-        keyed = slice(None) if (values != values[0]).any() else slice(1)
-        write_curve(curves, path, 0, at[keyed], values[keyed])
-
-
 def apply_weights(
     owner: Any,
     paths: dict[int, str],
@@ -129,7 +124,11 @@ def apply_weights(
     replaced = {*paths.values(), *map(rotation_path, bones)}
     start_action(owner, f"{owner.name} {name}", lambda path: path in replaced, as_strip)
     numbers = range(start, start + len(weights))
-    key_weights(owner, paths, numbers, weights)
+    curves, at = action_curves(owner), np.asarray(numbers)
+    for column, path in paths.items():
+        values = weights[:, column]
+        keyed = slice(None) if (values != values[0]).any() else slice(1)  # a shape that never moves: once
+        write_curve(curves, path, 0, at[keyed], values[keyed])
     if neck is not None:
         key_turns(owner, "neck", numbers, neck)
     owner.animation_data.action.use_fake_user = True
@@ -157,21 +156,17 @@ def _parts(linear: np.ndarray, products: np.ndarray) -> list[tuple[str, list[int
     columns: list[int] = []
     for column in np.flatnonzero(np.abs(linear) + np.abs(products) > NEGLIGIBLE).tolist():
         for _ in range(2):
-            term = _term(VARIABLES[len(columns)], column, float(linear[column]), float(products[column]))
+            variable, factor, product = VARIABLES[len(columns)], float(linear[column]), float(products[column])
+            # mouthClose counts up to jawOpen (`effective_weights`).
+            value = f"min({variable},max(o,0))" if column == MOUTH_CLOSE else variable
+            has_product = abs(product) > NEGLIGIBLE
+            term = f"+{value}*({factor:.4e}{product:+.4e}*o)" if has_product else f"{factor:+.4e}*{value}"
             if len(text) + len(term) <= MAX_EXPRESSION and len(columns) + 1 < len(VARIABLES):
                 break
             found.append((text, columns))
             text, columns = "", []
         text, columns = text + term, [*columns, column]
     return [*found, (text, columns)] if columns else found
-
-
-def _term(variable: str, column: int, linear: float, product: float) -> str:
-    """One shape's share; mouthClose counts up to jawOpen (`effective_weights`)."""
-    value = f"min({variable},max(o,0))" if column == MOUTH_CLOSE else variable
-    if abs(product) <= NEGLIGIBLE:
-        return f"{linear:+.4e}*{value}"
-    return f"+{value}*({linear:.4e}{product:+.4e}*o)"
 
 
 def _drive_joint(rig: Any, joint: str, terms: Sequence[Sequence[str]]) -> None:

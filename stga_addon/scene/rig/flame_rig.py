@@ -25,10 +25,12 @@ from .. import tags
 from ..animation import add_driver
 from ..arrays import flat_floats
 from ..objects import Warn, leave_edit_mode, log_warning, place, remove
-from .keyframes import MAX_SLIDER, key_motion, key_tracked_offsets
-from .names import (
+from .keyframes import (
     EXPRESSION_NAMES,
+    MAX_SLIDER,
     deform_bone,
+    key_motion,
+    key_tracked_offsets,
     key_value_path,
     location_path,
     offset_key,
@@ -154,27 +156,19 @@ def _armature(name: str, joints: np.ndarray, parents: np.ndarray, displaced: Seq
         above = _skinning_bone(parent, displaced) if parent >= 0 else None
         chain = [parent_bone(bone), bone, deform_bone(bone)] if displaced[joint] else [bone]
         for link in chain:
-            _add_edit_bone(armature, link, above, joints[joint].tolist())
+            edited, head = armature.edit_bones.new(link), joints[joint].tolist()
+            # Along +Y without roll it has the identity as rest orientation: its rotation is FLAME's own.
+            edited.head, edited.tail, edited.roll = head, (head[0], head[1] + BONE_LENGTH, head[2]), 0.0
+            edited.parent = armature.edit_bones[above] if above else None
             above = link
     bpy.ops.object.mode_set(mode="OBJECT")
     layer.objects.active = active
     bpy.data.objects.remove(temporary)
-    _hide_helper_bones(armature)
-    return armature
-
-
-def _add_edit_bone(armature: Any, name: str, parent: str | None, head: Sequence[float]) -> None:
-    """A bone along +Y without roll has the identity as rest orientation: its rotation is FLAME's own."""
-    bone = armature.edit_bones.new(name)
-    bone.head, bone.tail, bone.roll = head, (head[0], head[1] + BONE_LENGTH, head[2]), 0.0
-    bone.parent = armature.edit_bones[parent] if parent else None
-
-
-def _hide_helper_bones(armature: Any) -> None:
     visible, hidden = armature.collections.new("Joints"), armature.collections.new("Helpers")
     hidden.is_visible = False
-    for bone in armature.bones:
-        (visible if bone.name in JOINTS else hidden).assign(bone)
+    for made in armature.bones:
+        (visible if made.name in JOINTS else hidden).assign(made)
+    return armature
 
 
 def _skinning_bone(joint: int, displaced: Sequence[bool]) -> str:

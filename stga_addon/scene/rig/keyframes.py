@@ -1,4 +1,4 @@
-"""Keyframes of a FLAME head: expressions, joint rotations, translation and tracked per-frame offsets."""
+"""Keyframes of a FLAME head, and the names and data paths of what they move."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,26 +6,68 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...driving.performance import ARKIT_SHAPES
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, joint_positions
-from ...flame.model import JOINTS
+from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import continuous, from_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
 from ..animation import write_curve, write_triangle_curves
 from ..compat import action_curves, copy_action, push_down_action
 from ..objects import Warn, log_warning
-from .names import (
-    PART_JOINTS,
-    ROOT_LOCATION,
-    expression_key,
-    is_expression_key,
-    key_value_path,
-    offset_key,
-    offset_keys,
-    offset_property,
-    property_path,
-    rotation_path,
-)
+
+IDENTITY_SLIDERS = 10
+# Prefixes of shape keys; the number after one is the component, or the timestep.
+EXPRESSION_KEY, IDENTITY_KEY, OFFSET_KEY = "expr_", "identity_", "offset_t"
+EXPRESSION_NAMES = "stga_expressions"
+"""Property of a head whose expressions have ARKit's names: these, separated by commas."""
+# The joints that each part of a motion (`flame.motion.PARTS`) rotates.
+PART_JOINTS = {"jaw": ("jaw",), "eyes": ("left_eye", "right_eye"), "neck": ("neck",), "head": ("root",)}
+ROOT_LOCATION = 'pose.bones["root"].location'
+identity_key = f"{IDENTITY_KEY}{{:03d}}".format
+offset_key = f"{OFFSET_KEY}{{:05d}}".format
+# The hidden bones of a joint whose position depends on the sliders: that moves its bone, and that its vertices follow.
+parent_bone, deform_bone = "{}_joint".format, "{}_deform".format
+# Properties of the rig: partial sums of the joint's displacement by the sliders, and that by tracked vertex offsets.
+sum_property, offset_property = "stga_{}_sums".format, "stga_{}_offset".format
+# Data paths of a property, of bones, and of a shape key.
+property_path, key_value_path = '["{}"]'.format, 'key_blocks["{}"].value'.format
+rotation_path, location_path = 'pose.bones["{}"].rotation_quaternion'.format, 'pose.bones["{}"].location'.format
+
+
+def expression_key(head: Any, component: int) -> str:
+    """The head's shape key of an expression component."""
+    named = head.get(EXPRESSION_NAMES)
+    return named.split(",")[component] if named else f"{EXPRESSION_KEY}{component:03d}"
+
+
+def is_expression_key(name: str) -> bool:
+    """Whether a head with a FLAME rig has the shape key for one of its expression components."""
+    return name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES
+
+
+def slider_components(model: FlameModel) -> dict[str, int]:
+    """Shape key -> component of `model.shapedirs`: every expression, and the first `IDENTITY_SLIDERS` of identity."""
+    names = model.expression_names or [f"{EXPRESSION_KEY}{k:03d}" for k in range(model.n_expression)]
+    expressions = {name: model.n_identity + k for k, name in enumerate(names)}
+    return expressions | {identity_key(k): k for k in range(min(IDENTITY_SLIDERS, model.n_identity))}
+
+
+def offset_keys(head: Any) -> list[Any]:
+    """The shape keys that hold tracked per-frame vertex offsets."""
+    return [key for key in head.data.shape_keys.key_blocks if key.name.startswith(OFFSET_KEY)]
+
+
+def is_of_parts(data_path: str, parts: Sequence[str]) -> bool:
+    """Whether an f-curve of the rig or the shape keys animates one of the parts (`flame.motion.PARTS`)."""
+    prefixes = [f'pose.bones["{bone}"].rotation_' for part in parts for bone in PART_JOINTS.get(part, ())]
+    prefixes += [ROOT_LOCATION] if "head" in parts else []
+    # The tracked per-frame offsets belong to the tracked expressions.
+    if "expression" in parts:
+        prefixes += [f'key_blocks["{EXPRESSION_KEY}', f'key_blocks["{OFFSET_KEY}', '["stga_']
+        prefixes += [f'key_blocks["{name}"]' for name in ARKIT_SHAPES]
+    return data_path.startswith(tuple(prefixes))
+
 
 UNCHANGED = 1e-6
 """Change of a slider's value below which it is not keyframed."""

@@ -1,4 +1,4 @@
-"""Motion of a FLAME head: applied from another recording, and sampled as it plays in the scene."""
+"""Motion of a FLAME head: applied, sampled, set live, and compared with what its avatar was trained on."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -7,18 +7,35 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...driving.open_motion import PART_FIELDS, TrainedRange, outside
+from ...driving.performance import ARKIT_SHAPES
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
-from ...flame.quaternions import to_axis_angle
+from ...flame.quaternions import from_axis_angle, to_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
 from ..arrays import evaluated_vertices, read_values
+from ..blend_file import iterate_frames
 from ..compat import push_down_action
 from ..objects import Warn, log_warning
-from ..timeline import iterate_frames
+from .arkit import has_controls, shape_key_names
 from .flame_rig import rig_of
-from .keyframes import animated_by, check_keyable, key_motion, key_tracked_offsets, key_zero_offsets, start_action
-from .names import expression_key, is_expression_key, is_of_parts, offset_keys, parent_bone, slider_components
+from .keyframes import (
+    OFFSET_KEY,
+    animated_by,
+    check_keyable,
+    expression_key,
+    is_expression_key,
+    is_of_parts,
+    key_motion,
+    key_tracked_offsets,
+    key_zero_offsets,
+    offset_keys,
+    offset_property,
+    parent_bone,
+    slider_components,
+    start_action,
+)
 
 MESH_TOLERANCE = 1e-4
 """Metres that the mesh in the scene may differ from FLAME's forward pass of the sampled parameters."""
@@ -43,8 +60,16 @@ def apply_motion(
     one that cannot take the motion; nothing is changed then.
     """
     rig = rig_of(head)
-    _check_rig(head, rig, frames, parts)
-    frames = [replace(frame, expr=_for_all_sliders(head, frame.expr)) for frame in frames]
+    check_keyable(rig, JOINTS)
+    check_keyable(head.data.shape_keys)
+    used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
+    for component in np.flatnonzero(used).tolist():
+        if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
+            raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
+    # Coefficients of the sliders that the motion lacks are zero.
+    sliders = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
+    padded = [np.pad(frame.expr[:sliders], (0, max(0, sliders - len(frame.expr)))) for frame in frames]
+    frames = [replace(frame, expr=expr) for frame, expr in zip(frames, padded, strict=True)]
     owners = animated_by(head, rig, parts)
     for owner in owners:
         start_action(owner, f"{owner.name} {name}", lambda path: is_of_parts(path, parts), as_strip)
@@ -62,21 +87,6 @@ def apply_motion(
             push_down_action(owner, extrapolation="NOTHING")
 
 
-def _for_all_sliders(head: Any, expr: np.ndarray) -> np.ndarray:
-    """(K,) coefficients of the head's K expression sliders; those that `expr` lacks are zero."""
-    count = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
-    return np.pad(expr[:count], (0, max(0, count - len(expr))))
-
-
-def _check_rig(head: Any, rig: Any, frames: Sequence[FlameFrame], parts: Sequence[str]) -> None:
-    check_keyable(rig, JOINTS)
-    check_keyable(head.data.shape_keys)
-    used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
-    for component in np.flatnonzero(used).tolist():
-        if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
-            raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
-
-
 def sample_motion(
     head: Any, sequence: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning
 ) -> FlameSequence:
@@ -91,7 +101,11 @@ def sample_motion(
     shape, largest_error = sequence.shape, 0.0
     for _ in iterate_frames(numbers):
         frame = _sample_frame(head, rig, sequence.model)
-        shape = shape if frames else _identity(head, sequence)
+        if not frames:
+            shape = shape.copy()
+            for name, component in slider_components(sequence.model).items():
+                if component < sequence.model.n_identity:
+                    shape[component] += _key_value(head, name)
         vertices = flame_forward(sequence.model, shape, frame, sequence.static_offset)
         largest_error = max(largest_error, float(np.abs(vertices - evaluated_vertices(head)).max()))
         frames.append(frame)
@@ -128,14 +142,6 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
     )
 
 
-def _identity(head: Any, sequence: FlameSequence) -> np.ndarray:
-    shape = sequence.shape.copy()
-    for name, component in slider_components(sequence.model).items():
-        if component < sequence.model.n_identity:
-            shape[component] += _key_value(head, name)
-    return np.asarray(shape)
-
-
 def _key_value(head: Any, name: str) -> float:
     key = head.data.shape_keys.key_blocks.get(name)
     return 0.0 if key is None or key.mute else float(key.value)
@@ -154,3 +160,126 @@ def _dynamic_offset(head: Any) -> np.ndarray | None:
 
 def _key_points(key: Any) -> np.ndarray:
     return read_values(key.points, "co", 3).astype(np.float64)
+
+
+LIVE_JOINTS = ("neck", "jaw", "left_eye", "right_eye")
+WEIGHT_RANGE = (-1.0, 2.0)
+
+
+class LivePose:
+    """What a head's sliders, bones and controls held before, and how live values are set on them.
+
+    Objects are looked up by name each time: references to them do not survive undo.
+    """
+
+    def __init__(self, head: Any, rig: Any) -> None:
+        """rig: the head's FLAME rig; None for a head that has shape keys with ARKit's names."""
+        self._head, self._rig = head.name, None if rig is None else rig.name
+        self.takes_frames = rig is not None and not has_controls(rig)
+        keys = head.data.shape_keys.key_blocks
+        self._sliders = np.empty(len(keys), np.float32)
+        keys.foreach_get("value", self._sliders)
+        self._values = self._sliders.copy()
+        names = [key.name for key in keys]
+        self._turns: dict[str, tuple[float, ...]] = {}
+        self._properties: dict[str, Any] = {}
+        self._offsets: list[str] = []
+        if rig is None:
+            self._rows = {column: names.index(name) for column, name in shape_key_names(head).items()}
+            return
+        self._values[[is_expression_key(name) or name.startswith(OFFSET_KEY) for name in names]] = 0.0
+        self._rows = dict(enumerate(row for row, name in enumerate(names) if is_expression_key(name)))
+        self._turns = {joint: tuple(rig.pose.bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
+        self._offsets = [name for joint in JOINTS if (name := offset_property(joint)) in rig]
+        controls = [] if self.takes_frames else list(ARKIT_SHAPES)
+        self._properties = {name: tuple(rig[name]) for name in self._offsets} | {name: rig[name] for name in controls}
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the head, and its rig, are still in the file, with as many sliders."""
+        head = bpy.data.objects.get(self._head)
+        keys = head.data.shape_keys if head is not None and head.type == "MESH" else None
+        has_rig = self._rig is None or self._rig in bpy.data.objects
+        return keys is not None and has_rig and len(keys.key_blocks) == len(self._sliders)
+
+    def set_frame(self, frame: FlameFrame) -> None:
+        """Pose a FLAME head: expressions, jaw, eyes and neck; tracked per-frame offsets are switched off."""
+        for component, row in self._rows.items():
+            self._values[row] = frame.expr[component] if component < len(frame.expr) else 0.0
+        self._set_sliders(self._values)
+        turns = [frame.neck_pose, frame.jaw_pose, frame.eyes_pose[:3], frame.eyes_pose[3:]]
+        self._set_turns(dict(zip(LIVE_JOINTS, from_axis_angle(np.stack(turns)), strict=True)))
+
+    def set_weights(self, weights: Sequence[float] | np.ndarray, neck: np.ndarray) -> None:
+        """Set the 52 weights on controls or shape keys, and turn the neck of a FLAME head by an axis-angle (3,)."""
+        limited = np.clip(weights, *WEIGHT_RANGE)
+        if self._rig is None:
+            for column, row in self._rows.items():
+                self._values[row] = limited[column]
+            self._set_sliders(self._values)
+            return
+        rig = bpy.data.objects[self._rig]
+        for name, value in zip(ARKIT_SHAPES, limited.tolist(), strict=True):
+            rig[name] = value
+        self._set_turns({"neck": from_axis_angle(neck[None])[0]})
+
+    def restore(self) -> None:
+        """Give back what was there before the first live pose."""
+        self._set_sliders(self._sliders)
+        if self._rig is not None:
+            rig = bpy.data.objects[self._rig]
+            for name, value in self._properties.items():
+                rig[name] = value
+            self._set_turns(self._turns, clear_offsets=False)
+
+    def _set_sliders(self, values: np.ndarray) -> None:
+        mesh = bpy.data.objects[self._head].data
+        mesh.shape_keys.key_blocks.foreach_set("value", values)
+        mesh.shape_keys.update_tag()
+        mesh.update_tag()
+
+    def _set_turns(self, turns: dict[str, Any], clear_offsets: bool = True) -> None:
+        rig = bpy.data.objects[self._rig]
+        for joint, quaternion in turns.items():
+            rig.pose.bones[joint].rotation_quaternion = quaternion
+        for name in self._offsets if clear_offsets else ():
+            rig[name] = (0.0, 0.0, 0.0)
+        rig.update_tag()
+
+
+TRAINED = "stga_trained"
+"""Property of the head: the arrays of a `TrainedRange`, by field and part."""
+FIELDS = ("middle", "width", "quiet", "first")
+
+
+def store_range(head: Any, trained: TrainedRange) -> None:
+    """Keep the range with the head, in its file."""
+    head[TRAINED] = {
+        f"{field} {part}": getattr(trained, field)[part].astype(float).tolist()
+        for field in FIELDS
+        for part in PART_FIELDS
+    }
+
+
+def stored_range(head: Any) -> TrainedRange | None:
+    """The range that was kept with the head; None where there is none."""
+    kept = head.get(TRAINED)
+    if kept is None:
+        return None
+    values = {name: np.array(kept[name], np.float64) for name in kept.keys()}  # noqa: SIM118, an IDPropertyGroup
+    if set(values) != {f"{field} {part}" for field in FIELDS for part in PART_FIELDS}:
+        return None
+    return TrainedRange(*({part: values[f"{field} {part}"] for part in PART_FIELDS} for field in FIELDS))
+
+
+def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
+    """Part -> how far outside the range the head is as it is posed now (`transfer.outside`)."""
+    keys, bones = head.data.shape_keys.key_blocks, rig.pose.bones
+    names = [expression_key(head, k) for k in range(len(trained.middle["face"]))]
+    expr = np.array([keys[name].value if name in keys else 0.0 for name in names])
+    jaw, left, right = (
+        to_axis_angle(np.array(bones[bone].rotation_quaternion)) for bone in ("jaw", "left_eye", "right_eye")
+    )
+    zero = np.zeros(3)
+    frame = FlameFrame(expr, zero, zero, jaw, zero, np.concatenate([left, right]))
+    return {part: float(values[0]) for part, values in outside([frame], trained).items()}

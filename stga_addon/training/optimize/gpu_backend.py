@@ -11,20 +11,21 @@ from ...avatar.offsets import OFFSETS
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.cpu.layout import Parameters
-from ...raster.gpu import driven_offsets as offset_stage
-from ...raster.gpu import frames as frame_stage
-from ...raster.gpu import image_loss as loss_stage
-from ...raster.gpu import optimizer as optimizer_stage
-from ...raster.gpu import rasterize as raster_stage
+from ...raster.gpu import optimizer
 from ...raster.gpu.device import Device, Readback, Recording
-from ...raster.gpu.driven_offsets import OffsetTables, splats_by_triangle
 from ...raster.gpu.frames import Embedding
 from ...raster.gpu.image_loss import image_loss, upload_target
 from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
-from ...raster.gpu.optimizer import OptimizerTables, optimize, upload_step
-from ...raster.gpu.project import mark_focus
-from ...raster.gpu.rasterize import Rasterizer, Rendering, SplatTable, ViewOptions, upload_splats
-from ...raster.gpu.tiles import counts_buffer
+from ...raster.gpu.optimizer import OffsetTables, OptimizerTables
+from ...raster.gpu.rasterize import (
+    Rasterizer,
+    SplatTable,
+    Tables,
+    ViewOptions,
+    counts_buffer,
+    mark_focus,
+    upload_splats,
+)
 from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, image_epsilon
 from .backend import Batch
@@ -47,12 +48,6 @@ class _Queued:
     loss: float | None = None
 
 
-def compile_kernels(device: Device) -> None:
-    """Compile what an iteration dispatches, before the time that is given to training."""
-    for stage in (frame_stage, raster_stage, loss_stage, optimizer_stage, offset_stage):
-        stage.compile_kernels(device)
-
-
 class GpuBackend:
     """Trains asynchronously: `step` records an iteration, submits it at once and returns without waiting for it.
 
@@ -72,7 +67,7 @@ class GpuBackend:
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)
-        compile_kernels(device)
+        optimizer.compile_kernels(device)
         self.state = state
 
     def __len__(self) -> int:
@@ -125,10 +120,10 @@ class GpuBackend:
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
         self._splats = upload_splats(self.device, state.parameters, state.face)
-        splats_of = upload("splats by triangle", splats_by_triangle(state.face, self._triangles))
+        splats_of = upload("splats by triangle", optimizer.splats_by_triangle(state.face, self._triangles))
         self._offsets = {
-            name: OffsetTables(
-                **{part: upload(f"{name} {part}", table) for part, table in vars(offset).items()}, splats_of=splats_of
+            name: OffsetTables._make(
+                [*(upload(f"{name} {part}", each) for part, each in vars(offset).items()), splats_of]
             )
             for name, offset in state.driven_offsets.items()
         }
@@ -154,7 +149,7 @@ class GpuBackend:
             with self.device.record() as work:
                 rendering = self._render(work, average, moved, view, background, sh_degree)
             if self._rasterizer.pairs_fit():
-                return self.device.read(rendering.image, (3, view.camera.height, view.camera.width))
+                return self.device.read(rendering["image"], (3, view.camera.height, view.camera.width))
 
     def _finish_all(self) -> None:
         """Wait until all queued iterations are done."""
@@ -185,29 +180,25 @@ class GpuBackend:
         self._upload_step(batch)
         with self.device.record() as work:
             splats, camera = self._splats, batch.view.camera
-            moved = {name: tables.value for name, tables in self._offsets.items()}
+            moved = {name: tables.coefficients for name, tables in self._offsets.items()}
             rendering = self._render(work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected)
             v_image, loss = image_loss(
-                work, camera.width, camera.height, view=rendering.view, image=rendering.image,
-                touched=rendering.tile_table.touched, whole=whole,
+                work, camera.width, camera.height, view=rendering["view"], image=rendering["image"],
+                touched=rendering["touched"], whole=whole,
             )  # fmt: skip
-            screen = self._rasterizer.backward(work, rendering, splats, v_image, self._gradients)
-            offset_stage.step(
-                work, self._triangles, self._offsets, self._embedding.signals, view=rendering.view,
-                wanted=rendering.lists.wanted, gradients=self._gradients,
-            )  # fmt: skip
+            screen = self._rasterizer.backward(work, rendering, splats, camera, v_image, self._gradients)
+            given = {"view": rendering["view"], "wanted": rendering["wanted"], "gradients": self._gradients}
+            optimizer.step_offsets(work, self._triangles, self._offsets, self._embedding.signals, **given)
             limited = bool(self._settings.scale_weight or self._settings.distance_weight)
-            optimize(
-                work, splats.count, splats.stride, self._tables, limited, view=rendering.view, splats=splats.rows,
-                gradients=self._gradients, face=splats.face, wanted=rendering.lists.wanted, screen=screen,
-            )  # fmt: skip
+            given |= {"splats": splats.rows, "face": splats.face, "screen": screen}
+            optimizer.optimize(work, splats.count, splats.stride, limited, self._tables, **given)
             queued.readback.copy_from(work, (counts_buffer(self.device), COUNTS), (loss, 1))
         queued.readback.start()
 
     def _render(
         self, work: Recording, splats: SplatTable, offsets: Mapping[str, Any], view: View, background: np.ndarray,
         sh_degree: int, selected: np.ndarray | None = None,
-    ) -> Rendering:  # fmt: skip
+    ) -> Tables:  # fmt: skip
         """Record a view of the splats, moved by driven offsets with these coefficients (F, S, 3) on the device.
 
         Only the tiles around the splats on the selected triangles, if any are given.
@@ -221,7 +212,7 @@ class GpuBackend:
         focus = None
         if selected is not None:
             marked = self.device.upload("selected", selected)
-            focus = mark_focus(work, splats.count, view=uniform, face=splats.face, selected=marked)
+            focus = mark_focus(work, splats, uniform, marked)
         frames = self._embedding.compose(work, offsets)
         return self._rasterizer.forward(work, splats, frames, options, uniform, focus)
 
@@ -233,7 +224,7 @@ class GpuBackend:
         settings = self._settings
         epsilon = float(image_epsilon(settings.adam_epsilon, batch.view.camera))
         weights = settings.scale_weight, settings.distance_weight, settings.unseen_opacity_weight / max(len(self), 1)
-        upload_step(
+        optimizer.upload_step(
             self.device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
             statistics=batch.accumulate, triangles=self._triangles,
         )  # fmt: skip
@@ -241,7 +232,7 @@ class GpuBackend:
     def _read_offset(self, name: str) -> OffsetState:
         read, tables, shape = self.device.read, self._offsets[name], (self._triangles, OFFSETS[name].signals, 3)
         return OffsetState(
-            value=read(tables.value, shape),
+            value=read(tables.coefficients, shape),
             first=read(tables.first, shape),
             second=read(tables.second, shape),
             average=read(tables.average, shape),

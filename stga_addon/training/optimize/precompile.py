@@ -39,7 +39,7 @@ def precompile_kernels(device: str = "cpu") -> None:
     compile_for_cpu()
     if device != "cpu":
         from ...raster.gpu.device import Device
-        from .gpu_backend import compile_kernels
+        from ...raster.gpu.optimizer import compile_kernels
 
         compile_kernels(Device(adapter_name(device)))
 

@@ -163,7 +163,7 @@ def make_backend(device: str, settings: TrainingSettings, frames: FrameStore, st
     if settings.tracking:
         raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
     from ...raster.gpu.device import Device  # needs wgpu, which training on the CPU does without
-    from ...raster.gpu.driven_offsets import SIGNALS
+    from ...raster.gpu.frames import SIGNALS
     from .gpu_backend import GpuBackend
 
     for name in state.driven_offsets:

@@ -12,7 +12,7 @@ from stga_addon.driving import read_performance
 from stga_addon.driving.head_map import head_turns
 from stga_addon.driving.live import live_link_face as link
 from stga_addon.driving.live import vmc
-from stga_addon.driving.names import ARKIT_SHAPES, COLUMN
+from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN
 
 from . import wire
 

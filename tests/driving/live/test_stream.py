@@ -7,9 +7,18 @@ import numpy as np
 import pytest
 
 from stga_addon.driving.inverse import write_performance
-from stga_addon.driving.live.sources import SOURCES, Receiver, leaves_this_machine
-from stga_addon.driving.live.stream import MAX_SENDERS, Recording, Stream, eased, resting, row_of
-from stga_addon.driving.names import COLUMN
+from stga_addon.driving.live.sources import (
+    MAX_SENDERS,
+    SOURCES,
+    Receiver,
+    Recording,
+    Stream,
+    eased,
+    leaves_this_machine,
+    resting,
+    row_of,
+)
+from stga_addon.driving.performance import COLUMN
 from stga_addon.driving.read_performance import read_performance
 from stga_addon.errors import StgaError
 

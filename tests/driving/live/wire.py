@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 
-from stga_addon.driving.names import ARKIT_SHAPES
+from stga_addon.driving.performance import ARKIT_SHAPES
 
 UDP_ORDER = list(ARKIT_SHAPES)
 for pair in ("jaw", "mouth"):

@@ -13,7 +13,7 @@ from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import data_file
 from stga_addon.light.harmonics import rotated, uniform
 from stga_addon.light.relight import Relighter
-from stga_addon.light.transfer import Bounce, transfer_of
+from stga_addon.light.surface import Bounce, transfer_of
 from stga_addon.light.values import Light, Lighting
 from stga_addon.render.render import render_colors, to_uint8
 

@@ -16,8 +16,7 @@ import pytest
 from export.web.browser import Browser
 from stga_addon.driving.head_map import head_map, page_controls
 from stga_addon.driving.inverse import write_performance
-from stga_addon.driving.names import ARKIT_SHAPES, COLUMN, COUNT
-from stga_addon.driving.performance import Performance
+from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.page import ELEMENT, write_web
 from stga_addon.flame.forward import FlameFrame, flame_forward

@@ -1,4 +1,4 @@
-"""Transfer and ambient occlusion against rays cast at every triangle, and against a sphere's closed form."""
+"""Transfer and occlusion, against cast rays."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from light.scenes import ball_and_plate, blocked
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import LAMBERT, basis, even_directions
 from stga_addon.light.lamps import LIFT_M
-from stga_addon.light.transfer import transfer_of
+from stga_addon.light.surface import transfer_of
 
 
 def test_transfer_and_occlusion_are_those_of_cast_rays():
