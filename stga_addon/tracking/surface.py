@@ -165,7 +165,7 @@ def _solved(
     base: HeadModel, fit: HeadFit, take: RecordedTake, points: SurfacePoints, seen: Mapping[int, SeenSurface]
 ) -> tuple[HeadFit, dict[int, SeenSurface]]:
     """Scale, identity, expressions and poses that fit surface and landmarks; and the surface in the new scale."""
-    share = _landmark_shares(base, take.places, LANDMARK_SHARE)
+    share = _landmark_shares(base, take.places)
     together = [_joined(_landmarks(fit, t, take), share, own) for t, own in seen.items()]
     starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
     identity = solve_identity(base, _both(take.places, points), together, starts, take.metric)
@@ -233,8 +233,9 @@ def _whole_take(
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     near = [near_landmarks(fit.head, on, take) for on in points]
-    usual = TAKE_LANDMARK_SHARE if len(fit.parameters) > 1 else LANDMARK_SHARE
-    share = _landmark_shares(fit.head, take.places, usual)
+    share = np.full(len(take.reliable), TAKE_LANDMARK_SHARE)
+    if len(fit.parameters) == 1:
+        share = _landmark_shares(fit.head, take.places)
     parts = [
         (*excerpt(rough, take, part), [corrected[t] for t in part], share, points, near)
         for part in parts_of(timesteps, PART_TIMESTEPS)
@@ -296,10 +297,10 @@ def _landmarks(fit: HeadFit, timestep: int, take: RecordedTake) -> Observation:
     )
 
 
-def _landmark_shares(head: HeadModel, places: SurfacePoints, usual: float) -> np.ndarray:
-    """(N,) of the landmarks' weights: LIPS_LANDMARK_SHARE where the model says where its lips are, else `usual`."""
+def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:
+    """(N,) of the landmarks' weights: LIPS_LANDMARK_SHARE where the model's lips are, else LANDMARK_SHARE."""
     lips = faces_within(head.model.faces, head.model.masks.get("lips", np.zeros(0, np.int64)))
-    return np.where(lips[places.face], LIPS_LANDMARK_SHARE, usual)
+    return np.where(lips[places.face], LIPS_LANDMARK_SHARE, LANDMARK_SHARE)
 
 
 def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> Observation:
