@@ -1,12 +1,12 @@
 """Accuracy of `stga track`: distances of the tracked head from a capture's own meshes.
 
-    python benchmarks/tracking_accuracy.py CAPTURE --model HEAD [--flame FILE] [--timesteps 8]
+    python benchmarks/tracking_accuracy.py CAPTURE [--model HEAD] [--flame FILE] [--timesteps 8]
 
 CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the model that they were
 made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of FLAME's open template (`v_template`,
-`shapedirs`, `faces`). Prints in millimeters, over the vertices within 9 cm of the face's landmarks: distances from the
-capture's surface and, where both have the same topology, from its vertices. Landmarks are detected, or
-read from the folder of --landmarks.
+`shapedirs`, `faces`); without it, the bundled head. Prints in millimeters, within 9 cm of the landmarks' center: how
+far what the cameras see of the capture's mesh, by its triangles' centers, is from the tracked surface and, where both
+have the same topology, vertices from each other. Landmarks are detected, or read from the folder of --landmarks.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from time import perf_counter
 
 import numpy as np
 
+from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.teeth import TEETH_VERTICES
@@ -25,14 +26,17 @@ from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_places
+from stga_addon.tracking.photo_consistency import facing, in_sight
 from stga_addon.tracking.track import track
 
 FACE_RADIUS_M = 0.09
+MIN_COSINE = 0.2
+"""Of the angle between normal and camera, from which on a camera sees a triangle."""
 
 
-def head_file(path: Path, folder: Path) -> Path:
+def head_file(path: Path | None, folder: Path) -> Path | None:
     """The head model, or FLAME's open template written as a linear model."""
-    if path.suffix == ".npz":
+    if path is not None and path.suffix == ".npz":
         arrays = read_npz(path)
         if "v_template" in arrays and "posedirs" not in arrays:
             linear = {"mean": arrays["v_template"], "faces": arrays["faces"], "identity": arrays["shapedirs"]}
@@ -44,7 +48,7 @@ def head_file(path: Path, folder: Path) -> Path:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
-    parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--model", type=Path)
     parser.add_argument("--flame", type=Path)
     parser.add_argument("--landmarks", type=Path)
     parser.add_argument("--timesteps", type=int)
@@ -73,9 +77,15 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         camera, known = first[0], footage.cameras[0].camera
         local = found.mesh(timestep) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         local = (local / result.scale - known.world_to_camera[:3, 3]) @ known.world_to_camera[:3, :3]
-        distance = 1000 * nearest_points(true.mesh(timestep), true.faces, local[face])[1]
-        same = len(found.faces) == len(true.faces) or len(true.mesh(timestep)) - len(local) == TEETH_VERTICES
-        shift = 1000 * np.linalg.norm(local[face] - true.mesh(timestep)[face], axis=1).mean() if same else np.nan
+        mesh, middle = true.mesh(timestep), places.on(local, found.faces)[used].mean(0)
+        centers, normals = mesh[true.faces].mean(1), vertex_normals(mesh, true.faces)[true.faces].mean(1)
+        seen = np.zeros(len(centers), bool)
+        for view in (own.camera for own in footage.cameras if timestep in own.timesteps):
+            seen |= (facing(view, centers, normals) > MIN_COSINE) & in_sight(view, mesh, true.faces, centers)
+        seen &= np.linalg.norm(centers - middle, axis=1) < FACE_RADIUS_M / result.scale
+        distance = 1000 * nearest_points(local, found.faces, centers[seen])[1]
+        same = len(found.faces) == len(true.faces) or len(mesh) - len(local) == TEETH_VERTICES
+        shift = 1000 * np.linalg.norm(local[face] - mesh[face], axis=1).mean() if same else np.nan
         print(f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |")
     print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
     print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")

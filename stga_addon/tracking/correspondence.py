@@ -1,17 +1,20 @@
 """Where a detector's landmarks lie on a head model, found with the detector itself on pictures of the model."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from ..capture.camera import Camera, look_at
 from ..errors import StgaError
+from ..flame.forward import flame_forward, neutral_frame
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
 from .fit import MIN_LANDMARKS
 from .mesh_image import shaded_image
 from .posed_points import SurfacePoints
-from .triangulation import triangulate
+from .seen_surface import large_parts
+from .triangulation import Triangulation, triangulate
 
 DIRECTIONS_DEG = ((0, 0), (-25, 0), (25, 0), (-50, 0), (50, 0), (0, 20), (0, -20), (-30, 15), (30, 15))
 """Azimuth and elevation of the pictures."""
@@ -19,6 +22,11 @@ PICTURE_SIZE = 512
 PICTURE_DISTANCE, PICTURE_FOCAL = 3.5, 3.0
 """In extents of the head, and in image widths: the head fills most of the picture, with little perspective."""
 MIN_PICTURES = 3
+OPEN_JAW_WEIGHT, OPEN_JAW_RAD = 0.4, 0.2
+"""Of ARKit's jawOpen, or of the jaw joint, by which lips part: on a closed mouth, the lower lip's
+inner landmarks are as near to the upper lip."""
+MIN_OPEN_GAIN = 0.25
+"""Share of its squared distances in both pictures that a place leaves that is better than another."""
 MAX_SURFACE_DISTANCE = 0.02
 """Share of the head's extent: a landmark farther from the surface than this (6 mm) is not used."""
 MAX_RESIDUAL = 0.013
@@ -31,21 +39,24 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
     """The detector's landmarks on the neutral head: their places, and (N,) bool which of them are reliable.
 
     Renders the template from nine directions, triangulates what the detector finds and takes the nearest points of the
-    surface. The model looks along +z with y up; `name` is what errors call it. Raises StgaError where the detector does
-    not see a face.
+    skin, or of an eyeball for the irises; with the mouth opened too, where the model can. The model looks along +z with
+    y up; `name` is what errors call it. Raises StgaError where the detector does not see a face.
     """
-    cameras = picture_cameras(model.v_template)
-    found = [(camera, detector.detect(shaded_image(model.v_template, model.faces, camera))) for camera in cameras]
-    seen = [(camera, faces[0]) for camera, faces in found if faces]
-    if len(seen) < MIN_PICTURES:
+    neutral, faces = model.v_template, model.faces
+    located, count = _located(neutral, faces, detector)
+    if located is None:
         raise StgaError(
-            f"{name}: shows a face in {len(seen)} of {len(cameras)} pictures from the front, expected at least "
+            f"{name}: shows a face in {count} of {len(DIRECTIONS_DEG)} pictures from the front, expected at least "
             f"{MIN_PICTURES}; it must look along +z with y up"
         )
-    points = np.stack([face for _, face in seen])
-    located = triangulate([camera for camera, _ in seen], points, np.ones(points.shape[:2]))
-    places, distance = nearest_points(model.v_template, model.faces, located.position)
-    extent = float(np.ptp(model.v_template, axis=0).max())
+    skin = np.flatnonzero(large_parts(model))
+    places = _on_skin(neutral, faces, skin, located.position)
+    opened = _open_mouth(model)
+    parted = None if opened is None else _located(opened, faces, detector)[0]
+    if opened is not None and parted is not None:
+        places = _on_own_lips(neutral, opened, faces, skin, places, located, parted)
+    distance = np.linalg.norm(places.on(neutral, faces) - located.position, axis=1)
+    extent = float(np.ptp(neutral, axis=0).max())
     reliable = (distance < MAX_SURFACE_DISTANCE * extent) & (located.residual < MAX_RESIDUAL * extent)
     if len(reliable) == MESH_POINTS:
         reliable[FIRST_IRIS_POINT:] = False
@@ -57,6 +68,58 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
             f"expected at least {MIN_LANDMARKS}"
         )
     return places, reliable
+
+
+def _located(vertices: np.ndarray, faces: np.ndarray, detector: Detector) -> tuple[Triangulation | None, int]:
+    """The landmarks in pictures of a mesh, and how many of these show a face; None where too few do."""
+    pictures = [(camera, shaded_image(vertices, faces, camera)) for camera in picture_cameras(vertices)]
+    found = [(camera, detector.detect(picture)) for camera, picture in pictures]
+    seen = [(camera, shown[0]) for camera, shown in found if shown]
+    if len(seen) < MIN_PICTURES:
+        return None, len(seen)
+    points = np.stack([face for _, face in seen])
+    return triangulate([camera for camera, _ in seen], points, np.ones(points.shape[:2])), len(seen)
+
+
+def _on_skin(vertices: np.ndarray, faces: np.ndarray, skin: np.ndarray, positions: np.ndarray) -> SurfacePoints:
+    """The nearest points of the triangles `skin`: those of lids would lie on the eyeball, which does not blink."""
+    on, _ = nearest_points(vertices, faces[skin], positions)
+    return SurfacePoints(skin[on.face], on.barycentric)
+
+
+def _on_own_lips(
+    neutral: np.ndarray, opened: np.ndarray, faces: np.ndarray, skin: np.ndarray, places: SurfacePoints,
+    located: Triangulation, parted: Triangulation,
+) -> SurfacePoints:  # fmt: skip
+    """The places, where they do not open with the landmarks moved to the nearest skin that does.
+
+    neutral, opened (V, 3): the head with closed and open mouth, on which `located` and `parted` are.
+    """
+    others = _on_skin(opened, faces, skin, parted.position)
+    pairs = ((neutral, located), (opened, parted))
+    before, after = (
+        np.sum([((on.on(mesh, faces) - seen.position) ** 2).sum(1) for mesh, seen in pairs], axis=0)
+        for on in (places, others)
+    )
+    motion = opened - neutral
+    moves = motion[faces[skin]].mean(1)
+    face, barycentric = places.face.copy(), places.barycentric.copy()
+    for row in np.flatnonzero(after < MIN_OPEN_GAIN * before):
+        wrong, right = (np.linalg.norm(moves - on.on(motion, faces)[row], axis=1) for on in (places, others))
+        found = _on_skin(neutral, faces, skin[right < wrong], located.position[row : row + 1])
+        face[row], barycentric[row] = found.face[0], found.barycentric[0]
+    return SurfacePoints(face, barycentric)
+
+
+def _open_mouth(model: FlameModel) -> np.ndarray | None:
+    """The neutral head's vertices (V, 3) with the mouth open; None where no shape or joint is known to open it."""
+    frame = neutral_frame(model)
+    if "jawOpen" in model.expression_names:
+        weights = OPEN_JAW_WEIGHT * (np.array(model.expression_names) == "jawOpen")
+        return flame_forward(model, np.zeros(model.n_identity), replace(frame, expr=weights))
+    if not model.weights[:, JOINTS.index("jaw")].any():
+        return None
+    return flame_forward(model, np.zeros(model.n_identity), replace(frame, jaw_pose=np.array([OPEN_JAW_RAD, 0, 0])))
 
 
 def picture_cameras(vertices: np.ndarray) -> list[Camera]:

@@ -57,7 +57,7 @@ class DenseHead:
         self.head = replace(person, model=replace(model, shapedirs=dirs, expression_names=names))
         self.count = model.n_expression
         self.landmarks = PosedPoints(self.head.model, places)
-        self.skin = large_parts(person)[places.face]
+        self.skin = large_parts(model)[places.face]
         """(L,) bool: landmarks that are not on eyeballs or teeth."""
         skin = reliable & self.skin
         self.points = _face_points(person, places, skin if skin.any() else reliable)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import connected_parts, vertex_normals
+from ..flame.model import FlameModel
 from .fit import HeadFit, TimestepLandmarks
 from .head_model import HeadModel
 from .outline import outline_offsets
@@ -77,16 +78,16 @@ def excerpt(fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]) -> tuple
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:
     """Centers of about `count` triangles, spread evenly over the area of the head's large connected parts."""
     vertices, faces = head.model.v_template, head.model.faces
-    large = large_parts(head)
+    large = large_parts(head.model)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.cumsum(np.where(large, np.linalg.norm(np.cross(b - a, c - a), axis=1), 0.0))
     face = np.unique(np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1]))
     return SurfacePoints(face, np.full((len(face), 3), 1 / 3))
 
 
-def large_parts(head: HeadModel) -> np.ndarray:
+def large_parts(model: FlameModel) -> np.ndarray:
     """(F,) bool: triangles of connected parts larger than eyeballs and teeth."""
-    vertices, faces = head.model.v_template, head.model.faces
+    vertices, faces = model.v_template, model.faces
     numbers, part = np.unique(connected_parts(len(vertices), faces), return_inverse=True)
     extent = np.array([np.ptp(vertices[part == number], axis=0).max() for number in range(len(numbers))])
     return np.asarray((extent > MIN_PART_SHARE * np.ptp(vertices, axis=0).max())[part[faces[:, 0]]])

@@ -13,6 +13,8 @@ SMOOTHING_M = 0.009
 OFFSET_SIGMA_M = 0.03
 """Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
 OFFSET_ITERATIONS = 5
+MAX_COTANGENT = 5.0
+"""Of an angle, 11°: those of needles would outweigh all others."""
 SURFACE_SIGMA_M = 0.0005
 
 
@@ -32,7 +34,7 @@ def smooth_offsets(
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     share = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     area = np.bincount(faces.ravel(), np.repeat(share, 3), count)
-    laplacian = _laplacian(vertices, faces)
+    laplacian = _laplacian(vertices, faces, area)
     prior = OFFSET_DENSITY * (
         SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
         + diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))
@@ -45,15 +47,18 @@ def smooth_offsets(
     return np.asarray(values)
 
 
-def _laplacian(vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """Sparse (V, V), in 1/m²: difference from the mean of a vertex's neighbors, over their mean squared distance."""
-    from scipy.sparse import coo_array, diags_array, eye_array
+def _laplacian(vertices: np.ndarray, faces: np.ndarray, area: np.ndarray) -> Any:
+    """Sparse (V, V), in 1/m²: the cotangent Laplacian (Pinkall and Polthier 1993), which depends on
+    the surface alone, not on its triangles; 0 at the mesh's edge. area (V,) of the vertices."""
+    from scipy.sparse import coo_array, diags_array
 
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
-    size = (len(vertices),) * 2
-    length = ((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1)
-    degree = np.maximum(np.bincount(edges[:, 0], minlength=size[0]), 1)
-    squared = np.maximum(np.bincount(edges[:, 0], length, size[0]) / degree, 1e-8)
-    mean = coo_array((1 / degree[edges[:, 0]], edges.T), shape=size)
-    return (diags_array(4 / squared) @ (mean - eye_array(size[0]))).tocsr()
+    size, corners = (len(vertices),) * 2, vertices[faces]
+    ends = corners[:, [1, 2, 0]] - corners, corners[:, [2, 0, 1]] - corners
+    sine = np.linalg.norm(np.cross(*ends), axis=2)
+    weight = np.clip((ends[0] * ends[1]).sum(2) / np.maximum(sine, 1e-20), -MAX_COTANGENT, MAX_COTANGENT) / 2
+    across = np.stack([faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()])  # from its angle
+    half = coo_array((weight.ravel(), across), shape=size).tocsr()
+    around = half + half.T
+    edges, count = np.unique(np.sort(across, axis=0), axis=1, return_counts=True)
+    inner = ~np.isin(np.arange(len(vertices)), edges[:, count == 1])
+    return (diags_array(inner / np.maximum(area, 1e-9)) @ (around - diags_array(around.sum(axis=1)))).tocsr()

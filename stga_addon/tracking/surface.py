@@ -8,6 +8,7 @@ import numpy as np
 from ..capture.mesh_geometry import vertex_normals
 from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
+from ..flame.model import faces_within
 from ..worker.helpers import Helpers, Step
 from .fit import HeadFit, LandmarkVisibility, observed_landmarks, rigid_start, triangulated
 from .head_model import HeadModel
@@ -40,11 +41,13 @@ SURFACE_POINTS = 2000
 """Points over the whole head."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
-LANDMARK_SHARE = 0.05
+LANDMARK_SHARE = 0.1
 """Weight of landmarks beside surface points: a detector's errors are the same in every frame and stay."""
 TAKE_LANDMARK_SHARE = 0.2
 """The same once these errors are taken off, which takes several timesteps: where skin slides along itself, as brows do,
 only landmarks show it."""
+LIPS_LANDMARK_SHARE = 1.0
+"""Weight of the lips' landmarks, beside which the surface does not show whether lips touch."""
 MIN_SEEN_POINTS = 150
 """Points of the surface that have to be found at a timestep; below it, landmarks are the better evidence."""
 MIN_SEEN_SHARE = 0.5
@@ -162,7 +165,8 @@ def _solved(
     base: HeadModel, fit: HeadFit, take: RecordedTake, points: SurfacePoints, seen: Mapping[int, SeenSurface]
 ) -> tuple[HeadFit, dict[int, SeenSurface]]:
     """Scale, identity, expressions and poses that fit surface and landmarks; and the surface in the new scale."""
-    together = [_joined(_landmarks(fit, t, take), LANDMARK_SHARE, own) for t, own in seen.items()]
+    share = _landmark_shares(base, take.places)
+    together = [_joined(_landmarks(fit, t, take), share, own) for t, own in seen.items()]
     starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
     identity = solve_identity(base, _both(take.places, points), together, starts, take.metric)
     world = fit.to_capture
@@ -229,7 +233,9 @@ def _whole_take(
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     near = [near_landmarks(fit.head, on, take) for on in points]
-    share = TAKE_LANDMARK_SHARE if len(fit.parameters) > 1 else LANDMARK_SHARE
+    share = np.full(len(take.reliable), TAKE_LANDMARK_SHARE)
+    if len(fit.parameters) == 1:
+        share = _landmark_shares(fit.head, take.places)
     parts = [
         (*excerpt(rough, take, part), [corrected[t] for t in part], share, points, near)
         for part in parts_of(timesteps, PART_TIMESTEPS)
@@ -243,7 +249,7 @@ def _found_part(
     fit: HeadFit,
     take: RecordedTake,
     landmarks: Sequence[Observation],
-    share: float,
+    share: np.ndarray,
     points: Sequence[SurfacePoints],
     near: Sequence[np.ndarray],
     step: Step,
@@ -291,8 +297,14 @@ def _landmarks(fit: HeadFit, timestep: int, take: RecordedTake) -> Observation:
     )
 
 
-def _joined(landmarks: Observation, share: float, surface: SeenSurface) -> Observation:
-    """Both as one observation, landmarks at a share of their weight; the surface counts along its normal."""
+def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:
+    """(N,) of the landmarks' weights: LIPS_LANDMARK_SHARE where the model's lips are, else LANDMARK_SHARE."""
+    lips = faces_within(head.model.faces, head.model.masks.get("lips", np.zeros(0, np.int64)))
+    return np.where(lips[places.face], LIPS_LANDMARK_SHARE, LANDMARK_SHARE)
+
+
+def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> Observation:
+    """Both as one observation, landmarks at shares (N,) of their weight; the surface counts along its normal."""
     root = LANDMARK_SIGMA_M / SURFACE_SIGMA_M * surface.normal[:, :, None] * surface.normal[:, None, :]
     return Observation(
         np.concatenate([landmarks.position, surface.position]),

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from stga_addon.development.demo.head import synthetic_flame
-from stga_addon.tracking.correspondence import picture_cameras
-from stga_addon.tracking.face_networks import SCORE_NAMES, FaceNetworks
+from stga_addon.flame.model import EYEBALL_WEIGHT
+from stga_addon.flame.teeth import flame_model
+from stga_addon.tracking.correspondence import calibrate, picture_cameras
+from stga_addon.tracking.face_networks import IRIS_CENTERS, SCORE_NAMES, FaceNetworks
 from stga_addon.tracking.mesh_image import shaded_image
 
 cv2 = pytest.importorskip("cv2")
@@ -46,3 +48,20 @@ def test_two_faces_and_none(pictures):
     assert len(FaceNetworks().detect(front)) == 1
     assert FaceNetworks().detect(np.full_like(front, 128)) == []
     assert FaceNetworks().score(np.full_like(front, 128)) is None
+
+
+def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():
+    """Catches the lower lip's landmarks on the upper lip, which they touch while the mouth is closed, and those of lids
+    on the eyeballs: an open mouth would be tracked as closed, and a blink as half of one."""
+    model = flame_model(None)
+    places, _ = calibrate(model, FaceNetworks(), "head")
+
+    def moved(name):
+        shape = model.shapedirs[:, :, model.n_identity + model.expression_names.index(name)]
+        return np.linalg.norm(places.on(shape, model.faces), axis=1)
+
+    upper, lower = moved("jawOpen")[[80, 82, 13, 312, 310]], moved("jawOpen")[[88, 87, 14, 317, 318]]
+    assert upper.max() < 0.01 < 0.025 < lower.min()
+    on_eyeballs = (model.weights[model.faces, 3:] > EYEBALL_WEIGHT).any((1, 2))[places.face]
+    assert np.flatnonzero(on_eyeballs).tolist() == sorted(IRIS_CENTERS)
+    assert moved("eyeBlinkLeft")[[385, 386, 387]].min() > 0.003

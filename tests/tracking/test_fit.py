@@ -23,6 +23,7 @@ from stga_addon.tracking.fit import (
 from stga_addon.tracking.head_model import HeadModel, linear_model
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints
 from stga_addon.tracking.solve import (
+    LID_SHAPES,
     WEIGHT_EXCESS_SIGMA,
     Observation,
     in_order,
@@ -320,17 +321,24 @@ def test_nearest_points_of_a_mesh(head):
 
 
 def test_prior_keeps_weights_between_0_and_1():
-    """Catches a pull of the wrong sign or size, and one on models whose coefficients are no weights: the right-hand
-    side is minus the slope of the penalty, by differences."""
+    """Catches a pull of the wrong sign or size, one on models whose coefficients are no weights, and lids that close
+    beyond each other: the right-hand side is minus the slope of the penalty, by differences."""
     named = HeadModel(flame_model(None), "flame")
+    lids = [[named.model.expression_names.index(name) for name in lid] for lid in LID_SHAPES]
     count, rng = named.model.n_expression, np.random.default_rng(0)
     values = np.concatenate([rng.uniform(-1, 2, count), np.zeros(RIGID_SIZE)])
+    values[lids[0]] = 0.9, 0.8  # each in its range
+    pulled = (values[:count] < 0) | (values[:count] > 1)
+    pulled[lids[0]] = True
+    pulled[lids[1]] |= values[lids[1]].sum() > 1
 
     def penalty(head, at):
         total = (parameter_precision(head) * at**2).sum() / 2
         if head.model.expression_names:
             beyond = np.maximum(at[:count] - 1, 0) + np.maximum(-at[:count], 0)
             total += (beyond**2).sum() / 2 / WEIGHT_EXCESS_SIGMA**2
+            for lid in lids:
+                total += max(at[lid].sum() - 1, 0) ** 2 / 2 / WEIGHT_EXCESS_SIGMA**2
         return total
 
     for head in (named, replace(named, model=replace(named.model, expression_names=()))):
@@ -340,6 +348,4 @@ def test_prior_keeps_weights_between_0_and_1():
             step[column] = 1e-6
             slope = (penalty(head, values + step) - penalty(head, values - step)) / 2e-6
             assert right[column] == pytest.approx(-slope, rel=1e-4, abs=1e-6)
-        assert ((precision[:count] > 1) == ((values[:count] < 0) | (values[:count] > 1))).all() == bool(
-            head.model.expression_names
-        )
+        assert ((precision[:count] > 1) == pulled).all() == bool(head.model.expression_names)
