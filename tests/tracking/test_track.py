@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flame.small_head import small_head, write_flame
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from stga_addon.perform.perform import perform
@@ -18,7 +19,6 @@ from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
 from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
@@ -46,7 +46,7 @@ from .test_sequences import write_folders
 
 @pytest.fixture(scope="module")
 def head():
-    return HeadModel(synthetic_flame(0), "flame")
+    return HeadModel(small_head(0), "flame")
 
 
 @pytest.fixture(scope="module")
