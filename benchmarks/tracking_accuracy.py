@@ -1,12 +1,12 @@
 """Accuracy of `stga track`: distances of the tracked head from a capture's own meshes.
 
-    python benchmarks/tracking_accuracy.py CAPTURE --model HEAD [--flame FILE] [--timesteps 8]
+    python benchmarks/tracking_accuracy.py CAPTURE [--model HEAD] [--flame FILE] [--timesteps 8]
 
 CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the model that they were
-made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of FLAME's open template (`v_template`,
-`shapedirs`, `faces`). Prints in millimeters, over the vertices within 9 cm of the face's landmarks: distances from the
-capture's surface and, where both have the same topology, from its vertices. Landmarks are detected, or
-read from the folder of --landmarks.
+made with. HEAD is what is fitted, by default the bundled head: a FLAME model, a linear model, or an npz of FLAME's open
+template (`v_template`, `shapedirs`, `faces`). Prints in millimeters, over the vertices within 9 cm of the face's
+landmarks: distances from the capture's surface and, where both have the same topology, from its vertices. Landmarks are
+detected, or read from the folder of --landmarks.
 """
 
 import argparse
@@ -30,9 +30,9 @@ from stga_addon.tracking.track import track
 FACE_RADIUS_M = 0.09
 
 
-def head_file(path: Path, folder: Path) -> Path:
+def head_file(path: Path | None, folder: Path) -> Path | None:
     """The head model, or FLAME's open template written as a linear model."""
-    if path.suffix == ".npz":
+    if path is not None and path.suffix == ".npz":
         arrays = read_npz(path)
         if "v_template" in arrays and "posedirs" not in arrays:
             linear = {"mean": arrays["v_template"], "faces": arrays["faces"], "identity": arrays["shapedirs"]}
@@ -44,7 +44,7 @@ def head_file(path: Path, folder: Path) -> Path:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
-    parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--model", type=Path)
     parser.add_argument("--flame", type=Path)
     parser.add_argument("--landmarks", type=Path)
     parser.add_argument("--timesteps", type=int)
