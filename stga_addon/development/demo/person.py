@@ -244,7 +244,9 @@ class _Paint:
         """Density (N,) of lashes at points (N, 3): 1 where the upper lids' skin touches the eyeball."""
         away = at - np.where(at[:, :1] > 0, self.eye_at, self.eye_at * [-1, 1, 1])
         gap = np.linalg.norm(away, axis=1) - self.eye_radius
-        return ((gap < LID_EDGE_CM) & (abs(away[:, 0]) < LID_HALF_WIDTH_CM) & (away[:, 1] > 0)).astype(float)
+        return np.asarray(
+            ((gap < LID_EDGE_CM) & (abs(away[:, 0]) < LID_HALF_WIDTH_CM) & (away[:, 1] > 0)).astype(float)
+        )
 
 
 def _scatter(
