@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 from zipfile import ZipFile
 
-from ...capture.flame_capture import BUNDLED_MODEL
+from ...capture.open import BUNDLED_MODEL
 from ...errors import StgaError
 from ...flame.model import BUNDLED_HEAD
 

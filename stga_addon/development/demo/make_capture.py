@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ...capture.camera import Camera, look_at
-from ...capture.flame_capture import CANONICAL_NAME, PARAMETERS
+from ...capture.open import CANONICAL_NAME, PARAMETERS
 from ...capture.transforms import camera_entry
 from ...files import read_npz, replacing, write_json, write_npz
 from ...flame.forward import FlameFrame, flame_forward, neutral_frame
