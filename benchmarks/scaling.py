@@ -2,7 +2,7 @@
 
     python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png] [--model] [--splats 60000]
 
-The demo's head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at 802×550, all in one
+The bundled head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at 802×550, all in one
 process. More splats are smaller ones, as on a real head: their size falls with the square root of their number. Run it
 on an idle machine. Prints every figure, with the (splat, tile) pairs of the view, and draws them.
 
@@ -28,7 +28,7 @@ from unittest.mock import patch
 
 import matplotlib
 import numpy as np
-from iteration import demo_head, device_step, front_camera, median_ms, two_regions
+from iteration import bundled_head, device_step, front_camera, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.raster.cpu import kernel_jit
@@ -61,7 +61,7 @@ class Point:
 def measure(x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, share: float | None = None) -> Point:
     """An iteration of `splats` splats at `zoom` times the image size; share: of the splats, selected; None: global."""
     rng = np.random.default_rng(0)
-    head, mesh, faces = demo_head(splats, rng)
+    head, mesh, faces = bundled_head(splats, rng)
     camera = front_camera(round(zoom * WIDTH), round(zoom * HEIGHT))
     target = rng.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)
     step, batch = device_step("cpu", head, mesh, faces, camera, target)
@@ -234,7 +234,7 @@ def measure_latency(repeats: int) -> Latency:
 def model(splats: int, repeats: int) -> None:
     """Print what an iteration would take on more threads, and of the most threads each kernel's part."""
     rng = np.random.default_rng(0)
-    head, mesh, faces = demo_head(splats, rng)
+    head, mesh, faces = bundled_head(splats, rng)
     camera = front_camera(WIDTH, HEIGHT)
     target = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     backend, batch = device_step("cpu", head, mesh, faces, camera, target)

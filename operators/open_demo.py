@@ -1,4 +1,4 @@
-"""Opens the capture of a generated head that the complete edition brings."""
+"""Opens the capture of a generated person that the complete edition brings."""
 
 import shutil
 from pathlib import Path
@@ -18,7 +18,7 @@ MINUTES = 1.0
 
 
 class OpenDemo(bpy.types.Operator):
-    """Open a small capture of a generated head, to try training in a minute"""
+    """Open a small capture of a generated person, to try training in a minute"""
 
     bl_idname = ids.OPEN_DEMO
     bl_label = "Open Demo Capture"

@@ -9,17 +9,16 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.flame_rig import rig_of
+from ..stga_addon.scene.rig.keyframes import posing_bone
 from . import ids
 from .common import head_of, needs_rig, reporting
 
-JAW = "jaw"
-
 
 class PoseHead(bpy.types.Operator):
-    """Show the bones and select the jaw in Pose mode; again: back to Object mode. R turns a bone, I keeps its pose"""
+    """Show the bones and select one in Pose mode; again: back to Object mode. R turns a bone, I keeps its pose"""
 
     bl_idname = ids.POSE_HEAD
-    bl_label = "Pose the Jaw"
+    bl_label = "Pose the Head"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     poll = classmethod(needs_rig)
@@ -41,8 +40,9 @@ class PoseHead(bpy.types.Operator):
         rig.select_set(True)
         objects.active = rig
         bpy.ops.object.mode_set(mode="POSE")
-        select_bones(rig, {JAW})
-        rig.data.bones.active = rig.data.bones[JAW]
+        bone = posing_bone(head)
+        select_bones(rig, {bone})
+        rig.data.bones.active = rig.data.bones[bone]
         if context.area is not None and context.area.type == "VIEW_3D":
             bpy.ops.wm.tool_set_by_id(name="builtin.rotate")
         return {"FINISHED"}

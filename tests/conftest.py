@@ -134,15 +134,15 @@ def toy(toy_root: Path) -> Capture:
 
 @pytest.fixture(scope="session")
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """footage/ of the demo's head, head.npz and its exact landmarks points/, for tests that only read it; in black, so
+    """footage/ of the small head, head.npz and its exact landmarks points/, for tests that only read it; in black, so
     that landmarks alone are tracked, in a third of the time."""
+    from flame.small_head import small_head
     from tracking.recording import record
 
-    from stga_addon.development.demo.head import synthetic_flame
     from stga_addon.tracking.head_model import HeadModel
 
     folder = tmp_path_factory.mktemp("take")
-    record(folder, HeadModel(synthetic_flame(0), "flame"))
+    record(folder, HeadModel(small_head(0), "flame"))
     return folder
 
 

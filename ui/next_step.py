@@ -78,7 +78,7 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
     rig = rig_or_none(settings.head)
     if rig is not None:
         posing = is_posing(context, rig)
-        text = "Done Posing" if posing else "Pose the Jaw"
+        text = "Done Posing" if posing else "Pose the Head"
         column.operator(ids.POSE_HEAD, text=text, icon="ARMATURE_DATA", depress=posing)
         if posing:
             draw_text(column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO")

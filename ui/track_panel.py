@@ -77,7 +77,7 @@ class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
 
 def _draw_keys(layout: Any, context: Any, head: Any) -> None:
     keys = tracking_keys(head)
-    layout.operator(ids.POSE_HEAD, text="Pose the Head", icon="ARMATURE_DATA")
+    layout.operator(ids.POSE_HEAD, icon="ARMATURE_DATA")
     marked = context.scene.frame_current in keys
     text = "Unmark Key" if marked else "Mark as Key"
     layout.operator(ids.MARK_KEY, text=text, icon="KEYFRAME_HLT" if marked else "KEYFRAME", depress=marked)

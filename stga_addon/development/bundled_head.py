@@ -8,6 +8,7 @@ Institute for Creative Technologies.
 
 import heapq
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +50,7 @@ def main(source: Path) -> None:
     """Write the file for the ICT-FaceKit arrays in `source`."""
     arrays = read_npz(source)
     neutral, triangles = arrays["neutral"].astype(np.float64), arrays["tris"].astype(np.int64)
-    row = {str(name): number for number, name in enumerate(arrays["expression_names"])}
-    names = [name for name in ARKIT_SHAPES if name not in OPTIONAL]
-    shapes = np.stack(
-        [sum(arrays["expression"][row[part]].astype(np.float64) for part in ict_names(name)) for name in names]
-    )
+    names, shapes = arkit_displacements(arrays)
     moved = dict(zip(names, np.linalg.norm(shapes, axis=2), strict=True))
     kept, faces = _thinned(neutral, triangles, _detail(moved))
     identity = arrays["identity"][:IDENTITIES, kept].astype(np.float64)
@@ -69,12 +66,20 @@ def main(source: Path) -> None:
             "n_identity": np.array(IDENTITIES),
             "expression_names": np.array(names),
             "J_regressor": _regressor(template, kept).astype(np.float32),
-            "weights": _weights(template, kept).astype(np.float32),
+            "weights": skinning_weights(template, kept).astype(np.float32),
             "kintree_table": np.array([[-1, 0, 1, 1, 1], range(len(JOINTS))]),
             **{f"masks/{name}": np.flatnonzero(of[kept]) for name, of in _masks(neutral, moved).items()},
         },
         compressed=True,
     )
+
+
+def arkit_displacements(arrays: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], np.ndarray]:
+    """ARKit's names of ICT-FaceKit's expressions, and their displacements (E, V, 3) in centimeters."""
+    row = {str(name): number for number, name in enumerate(arrays["expression_names"])}
+    names = tuple(name for name in ARKIT_SHAPES if name not in OPTIONAL)
+    shapes = [sum(arrays["expression"][row[part]].astype(np.float64) for part in ict_names(name)) for name in names]
+    return names, np.stack(shapes)
 
 
 def _within(part: tuple[int, int], ids: np.ndarray) -> np.ndarray:
@@ -208,8 +213,11 @@ def _height(at: np.ndarray) -> np.ndarray:
     return np.asarray(at[..., 1] + NECK_SLOPE * at[..., 2])
 
 
-def _weights(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """(N, 5) skinning weights: root, neck and eyeballs; the jaw is a shape."""
+def skinning_weights(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """(N, 5) skinning weights of vertices `kept` (N,), at `template` (N, 3) in centimeters.
+
+    Root, neck and eyeballs; the jaw is a shape.
+    """
     share = np.clip((_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM), 0, 1)
     share = np.where(_within(SKIN, kept), share * share * (3 - 2 * share), 1.0)
     weights = np.zeros((len(kept), len(JOINTS)))

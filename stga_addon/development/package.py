@@ -17,7 +17,7 @@ from typing import Any
 from ..errors import StgaError, exit_code
 from ..files import replacing
 from .compiled_kernels import compile_kernels
-from .demo.capture import CaptureOptions, make_capture
+from .demo.capture import unpack_capture
 from .editions import DEMO_FOLDER, SMALL, Edition, complete, edition_manifest
 from .wheels import TARGETS, Target, collect_wheels, this_platform
 
@@ -29,8 +29,6 @@ WHEELS = {
     "trimesh-5.2.0-py3-none-any.whl": "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29",
     "tqdm-4.70.1-py3-none-any.whl": "c293e525e6fef9c20e8728fd4612df02a0aa31bb5fe91ecd93e123b1b7bffa73",
 }
-DEMO_SEED, DEMO_OPTIONS = 0, CaptureOptions(train=6, test=2, cameras=8)
-"""Of the capture in the complete edition: that of `make demo`."""
 KERNELS_FOLDER = "stga_addon/raster/cpu/compiled"
 """In the zip; `raster.cpu.bundled.BUNDLE`."""
 ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
@@ -63,7 +61,7 @@ def build_zip(
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     entry = zipfile.ZipInfo(name, ENTRY_TIME)
-    entry.compress_type = zipfile.ZIP_STORED if name.endswith((".whl", ".png")) else zipfile.ZIP_DEFLATED
+    entry.compress_type = zipfile.ZIP_STORED if name.endswith((".whl", ".png", ".webp")) else zipfile.ZIP_DEFLATED
     entry.external_attr = 0o644 << 16
     archive.writestr(entry, data)
 
@@ -171,8 +169,7 @@ def build_editions(options: argparse.Namespace) -> Iterator[Path]:
     demo = options.out / DEMO_FOLDER
     for target in [replace(target, cuda=options.allow_cuda) for target in targets]:
         collect_wheels(wheel_folder(target), target)
-        if not (demo / "transforms.json").exists():
-            make_capture(demo, DEMO_SEED, DEMO_OPTIONS)
+        unpack_capture(demo)
         kernels = compile_kernels(target, wheel_folder(target), shlex.split(options.blender))
         if not kernels:
             print(f"{target.name}: no Python of it is here; kernels are compiled when they are first used")

@@ -8,7 +8,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
+from flame.small_head import small_head, write_flame  # noqa: E402
+
 from stga_addon.driving.head_map import head_map  # noqa: E402
 from stga_addon.driving.inverse import write_performance  # noqa: E402
 from stga_addon.driving.performance import (  # noqa: E402
@@ -29,8 +30,8 @@ RNG = np.random.default_rng(4)
 
 @pytest.fixture
 def scene(tmp_path: Path) -> SimpleNamespace:
-    """The demo's head of another identity, imported from its own short motion; a performance of 7 rows at 30 Hz."""
-    model = synthetic_flame(0)
+    """The small head of another identity, imported from its own short motion; a performance of 7 rows at 30 Hz."""
+    model = small_head(0)
     write_flame(model, tmp_path / "flame.npz")
     shape = np.linspace(-0.5, 0.5, model.n_identity)
     np.savez(tmp_path / "own.npz", expr=RNG.normal(0, 0.3, (3, 10)), jaw_pose=np.zeros((3, 3)), shape=shape)
@@ -100,7 +101,7 @@ def test_controls(scene):
 
 
 def test_curves_come_back_from_an_action(scene, tmp_path):
-    """Catches an action whose curves, exported again, are other than the file that it was made of. The demo's ten
+    """Catches an action whose curves, exported again, are other than the file that it was made of. The small head's ten
     expressions cannot tell all shapes apart, so what the weights do is compared."""
     weights = np.zeros((7, 52))
     for column, name in enumerate(("jawOpen", "mouthSmileLeft", "browInnerUp", "eyeLookUpLeft", "mouthPucker")):

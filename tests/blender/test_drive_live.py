@@ -12,8 +12,8 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from driving.live import wire  # noqa: E402
+from flame.small_head import small_head, write_flame  # noqa: E402
 
-from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
 from stga_addon.driving.head_map import head_map  # noqa: E402
 from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral  # noqa: E402
 from stga_addon.driving.performance import ARKIT_SHAPES, Performance  # noqa: E402
@@ -29,8 +29,8 @@ TOLERANCE_M = 2e-5
 
 @pytest.fixture
 def live(tmp_path: Path, extension) -> SimpleNamespace:
-    """The demo's head, driven by packets that the test sends."""
-    model = synthetic_flame(0)
+    """The small head, driven by packets that the test sends."""
+    model = small_head(0)
     write_flame(model, tmp_path / "flame.npz")
     shape = np.linspace(-0.5, 0.5, model.n_identity)
     rng = np.random.default_rng(4)

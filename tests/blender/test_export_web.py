@@ -9,11 +9,11 @@ bpy = pytest.importorskip("bpy")
 
 from capture.factory import write_flame_capture  # noqa: E402
 from export.web.web_data import posed_mesh, read_web_data  # noqa: E402
+from flame.small_head import small_head, write_flame  # noqa: E402
 
 from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.development.demo.head import synthetic_flame, write_flame  # noqa: E402
 from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.model import JOINTS  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
@@ -25,10 +25,10 @@ BLENDER_TOLERANCE_M = 1e-5
 
 @pytest.fixture
 def demo_head(extension, tmp_path: Path):
-    """The demo's FLAME head in the scene with an avatar; the capture it was imported from."""
+    """The small FLAME head in the scene with an avatar; the capture it was imported from."""
     folder, _ = write_flame_capture(tmp_path / "capture", timesteps=(0, 1, 2))
     model = folder / "demo.npz"
-    write_flame(synthetic_flame(0), model)
+    write_flame(small_head(0), model)
     for file in [*folder.glob("flame_param/*.npz"), folder / "canonical_flame_param.npz"]:
         with np.load(file) as found:  # its offsets are those of another mesh
             kept = {name: found[name] for name in found.files if name != "static_offset"}

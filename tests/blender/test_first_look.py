@@ -9,6 +9,7 @@ bpy = pytest.importorskip("bpy")
 from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
 from mathutils import Vector  # noqa: E402
 
+from stga_addon.development.demo.capture import unpack_capture  # noqa: E402
 from stga_addon.export.ply import write_ply  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.avatar_scene import frame_head  # noqa: E402
@@ -99,6 +100,14 @@ def test_pose_the_jaw_and_back(head):
     assert rig.data.bones.active.name == "jaw"
     assert bpy.ops.stga.pose_head() == {"FINISHED"}
     assert (rig.mode, bones.hide_viewport) == ("OBJECT", True)
+
+
+def test_pose_the_bundled_head(extension, tmp_path):
+    """Catches a button that selects the jaw of a head whose jaw no bone moves."""
+    unpack_capture(tmp_path)
+    bpy.ops.stga.import_capture(directory=str(tmp_path))
+    bpy.ops.stga.pose_head()
+    assert bpy.context.view_layer.objects.active.data.bones.active.name == "neck"
 
 
 def test_heads_without_bones_say_so(extension, tmp_path):

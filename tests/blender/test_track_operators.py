@@ -9,16 +9,16 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from flame.small_head import small_head  # noqa: E402
 from mathutils import Quaternion  # noqa: E402
 from tracking.test_head_model import blender_head  # noqa: E402
 
-from stga_addon.development.demo.head import synthetic_flame  # noqa: E402
 from stga_addon.jobs.perform import perform_in_folder  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.tracking.head_model import HeadModel, read_head_model  # noqa: E402
 
-HEAD = HeadModel(synthetic_flame(0), "flame")
+HEAD = HeadModel(small_head(0), "flame")
 
 
 def track(take, out, **more):

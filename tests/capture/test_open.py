@@ -476,7 +476,7 @@ def test_a_motion_file_is_a_capture_without_views(tmp_path: Path) -> None:
 
 
 def test_a_flame_model_in_the_captures_folder(tmp_path: Path) -> None:
-    """Catches a capture that brings its model, as the demo's does, and still asks for it; and a given one ignored."""
+    """Catches a capture that brings its model and still asks for it; and a given one ignored."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
     own = root / "flame_model.npz"
     shutil.copy(model_file, own)

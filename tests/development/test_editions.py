@@ -99,7 +99,6 @@ def test_only_when_told_to_does_a_zip_have_cuda(
     monkeypatch.setattr("stga_addon.development.wheels.TORCH_CPU_INDEX", index.as_uri())
     package = "stga_addon.development.package"
     monkeypatch.setattr(f"{package}.TARGETS", [LINUX])
-    monkeypatch.setattr(f"{package}.make_capture", lambda demo, *_: demo.mkdir(parents=True))
     monkeypatch.setattr(f"{package}.compile_kernels", lambda *_: [])
 
     def built(name: str, *more: str) -> set[str]:

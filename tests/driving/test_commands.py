@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flame.small_head import small_head, write_flame
 from PIL import Image
 
 from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.camera import look_at
 from stga_addon.cli.main import main
-from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
@@ -23,10 +23,10 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> dict[str, Path]:
-    """The demo's model, an avatar of another identity of it, and ten frames in which head and jaw turn left and the jaw
-    opens."""
+    """The small head's model, an avatar of another identity of it, and ten frames in which head and jaw turn left and
+    the jaw opens."""
     folder = tmp_path_factory.mktemp("drive")
-    model = synthetic_flame(0)
+    model = small_head(0)
     write_flame(model, folder / "flame.npz")
     neutral = flame_forward(model, np.full(model.n_identity, 0.5), neutral_frame(model)).astype(np.float32)
     write_avatar(folder / "a.npz", Avatar(lattice_splats(neutral, model.faces, order=0), "stga", neutral, model.faces))
@@ -51,7 +51,7 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     assert (
         main(["drive", *map(str, (files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out))]) == 0
     )
-    model = synthetic_flame(0)
+    model = small_head(0)
     motion = read_motion(out, model)
     assert len(motion.timesteps) == 19
     drop = sequence_mesh(motion, 18) - sequence_mesh(motion, 0)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flame.small_head import small_head
 from scipy.optimize import least_squares
 
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.driving.head_map import head_map, head_turns
 from stga_addon.driving.inverse import arkit_weights, captured_performance, head_angles, write_performance
 from stga_addon.driving.open_motion import MotionOptions, performed
@@ -29,15 +29,15 @@ def sequence_of(model, shape=None) -> FlameSequence:
 
 @pytest.fixture(scope="module")
 def demo():
-    """The demo's head, whose 10 expressions are not ICT-FaceKit's, and its map."""
-    sequence = sequence_of(synthetic_flame(1))
+    """The small head, whose 10 expressions are not ICT-FaceKit's, and its map."""
+    sequence = sequence_of(small_head(1))
     return sequence, head_map(sequence, "demo")
 
 
 @pytest.fixture(scope="module")
 def rich():
-    """The demo's head with 48 expressions that reach most shapes, of another identity, and its map."""
-    model = with_expressions(synthetic_flame(0), 48)
+    """The small head with 48 expressions that reach most shapes, of another identity, and its map."""
+    model = with_expressions(small_head(0), 48)
     sequence = sequence_of(model, np.random.default_rng(0).normal(0, 0.5, model.n_identity))
     return sequence, head_map(sequence, "rich")
 
@@ -169,7 +169,7 @@ def test_head_turns_are_their_angles():
 
 def test_a_head_without_a_face():
     """Catches a map of nonsense for a model in other units or axes."""
-    model = synthetic_flame(0)
+    model = small_head(0)
     small = replace(model, v_template=model.v_template * 0.001)
     with pytest.raises(StgaError, match="tiny: its eyes lie 0 mm apart"):
         head_map(sequence_of(small), "tiny")

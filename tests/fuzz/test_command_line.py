@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import pytest
 from capture import factory
+from flame.small_head import small_head
 from tracking.recording import record
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import Performance
 from stga_addon.jobs import table as ask
@@ -68,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     splats = ["--iterations", 2, "--device", "cpu", "--effect", "hull-points=off", "--out", case / "splats"]
     assert call(["train", capture, *splats])[0] == 0
     factory.write_mesh_capture(case / "take", (0, 1), range(2))
-    record(case / "footage", HeadModel(synthetic_flame(0), "flame"))
+    record(case / "footage", HeadModel(small_head(0), "flame"))
     assert call(["track", *tracked_footage(case), "--out", case / "footage/out"])[0] == 0
     requests = requests_about(case)
     assert set(requests) == set(REQUESTS)
@@ -96,7 +96,7 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
     """A request of each kind, by its name, about the files of the case."""
     capture, run, footage, once = case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"}
     settings = read_run(case / "run").settings
-    key = np.zeros(synthetic_flame(0).n_expression + 18)
+    key = np.zeros(small_head(0).n_expression + 18)
     avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
     tracking = ask.Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points")
     capture_of_avatar = case / "made/capture"

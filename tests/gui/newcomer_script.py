@@ -19,7 +19,7 @@ FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
 STEP_S, PATIENCE_S = 0.2, 600.0
 LOOK_S = 10.0
 """For which a newcomer looks at the head before Train is clicked."""
-JAW_ANGLE, VIDEO_S = 0.3, 2.0
+NECK_ANGLE, VIDEO_S = 0.3, 2.0
 STARTED = time.monotonic()
 seen: dict[str, Any] = {"version": bpy.app.version_string}
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
@@ -107,9 +107,9 @@ def pose() -> Iterator[Callable[[], bool]]:
     with viewport():
         bpy.ops.stga.pose_head()
     yield lambda: True
-    jaw = bpy.context.view_layer.objects.active.pose.bones["jaw"]
-    side = jaw.bone.matrix_local.to_3x3().inverted() @ Vector((1.0, 0.0, 0.0))
-    jaw.rotation_quaternion = Quaternion(side, JAW_ANGLE)
+    neck = bpy.context.view_layer.objects.active.pose.bones["neck"]
+    side = neck.bone.matrix_local.to_3x3().inverted() @ Vector((1.0, 0.0, 0.0))
+    neck.rotation_quaternion = Quaternion(side, NECK_ANGLE)
     yield lambda: True
     picture("posed")
     with viewport():

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flame.small_head import small_head, write_flame
 
 from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.development.package import build_zip
 
 from .test_scenario import blender
@@ -26,7 +26,7 @@ def test_a_phone_moves_the_head(tmp_path: Path) -> None:
     does not stop it."""
     archive = build_zip(tmp_path)
     blender(tmp_path, "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
-    model = synthetic_flame(0)
+    model = small_head(0)
     write_flame(model, tmp_path / "flame.npz")
     np.savez(tmp_path / "own.npz", expr=np.zeros((3, model.n_expression)))
     splats = lattice_splats(model.v_template, model.faces, order=1)

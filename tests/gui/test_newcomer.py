@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from blender.test_real_blender import blender, complete_zip
 
-from stga_addon.development.demo.capture import make_capture
-from stga_addon.development.package import DEMO_OPTIONS, DEMO_SEED
+from stga_addon.development.demo.capture import unpack_capture
 
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
 pytestmark = pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window")
@@ -21,7 +20,7 @@ SCRIPT = Path(__file__).with_name("newcomer_script.py")
 
 def test_ten_minutes(tmp_path: Path) -> None:
     """Catches a step of the first ten minutes that needs more than its click, and what only a window has."""
-    make_capture(tmp_path / "demo", DEMO_SEED, DEMO_OPTIONS)
+    unpack_capture(tmp_path / "demo")
     archive, home = complete_zip(BLENDER, tmp_path / "dist", tmp_path / "demo"), tmp_path / "home"
     home.mkdir()
     pictures = Path(os.environ.get("STGA_GUI_FOLDER", tmp_path))

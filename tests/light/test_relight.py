@@ -128,8 +128,9 @@ def test_recorded_color_is_a_mean_over_the_directions_that_see_a_splat():
     avatar = lit_avatar(ALBEDO, degree=3)
     sh = np.random.default_rng(0).normal(0, 0.1, avatar.splats.sh.shape).astype(np.float32)
     relighter = Relighter(replace(avatar, splats=replace(avatar.splats, sh=sh)))
-    rotation = avatar.frames(avatar.neutral).rotation[avatar.splats.face]
-    normals = np.einsum("nij,nj->ni", rotation, relighter.normal)[:40]
+    mesh = avatar.neutral.astype(np.float64)
+    normals = np.einsum("nk,nkc->nc", relighter.weights, vertex_normals(mesh, avatar.faces)[relighter.corners])[:40]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     directions = even_directions(4000)
     for normal, coefficients, found in zip(normals, sh, relighter.diffuse_color, strict=False):
         seen = directions[directions @ normal > 0.3]

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+from flame.small_head import small_head
 
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.render.video import video_writer
 from stga_addon.tracking.correspondence import picture_cameras
 from stga_addon.tracking.mesh_image import shaded_image
@@ -12,7 +12,7 @@ from stga_addon.tracking.mesh_image import shaded_image
 
 def write_head_video(path: Path, frames: int, size: int = 256) -> None:
     """The head turns from side to side before a camera that stands still."""
-    model = synthetic_flame(0)
+    model = small_head(0)
     front = picture_cameras(model.v_template)[0]
     center = model.v_template.mean(axis=0)
     with video_writer(path, 25) as write:

@@ -1,10 +1,10 @@
 """The recording of a moving head: its footage, its FLAME file and exact landmarks."""
 
 import numpy as np
+from flame.small_head import write_flame
 from PIL import Image
 
 from stga_addon.capture.camera import look_at
-from stga_addon.development.demo.head import write_flame
 from stga_addon.files import write_json, write_npz
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.landmarks import write_places

@@ -5,10 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
+from flame.small_head import small_head
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward, frame_of
@@ -24,7 +24,7 @@ from stga_addon.tracking.track import track
 from .recording import record
 from .test_fit import frame_at, places_on
 
-HEAD = HeadModel(synthetic_flame(0), "flame")
+HEAD = HeadModel(small_head(0), "flame")
 PERSON = person(HEAD, np.zeros(HEAD.model.n_identity)).model
 JAW = HEAD.model.n_expression + 6
 TAKE = np.stack([frame_at(HEAD, timestep).parameters for timestep in range(30)])

@@ -4,11 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from flame.small_head import EXPRESSIONS, small_head, small_head_colors, subdivided
 
 from stga_addon.capture.camera import look_at
-from stga_addon.development.demo.blend_shapes import EXPRESSIONS
-from stga_addon.development.demo.head import synthetic_head
-from stga_addon.development.demo.paint import paint
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking import dense
 from stga_addon.tracking.appearance import Sample, average_texture, light_basis
@@ -64,7 +62,7 @@ def frame_at(opening, timestep):
 
 
 def skin_texture(rest):
-    """(V, 1) factor of skin's colors: waves of 6 to 30 mm, since the demo's painted chin is of one color."""
+    """(V, 1) factor of skin's colors: waves of 6 to 30 mm, since the small head's painted chin is of one color."""
     rng = np.random.default_rng(3)
     waves = [(0.006, 0.02), (0.010, 0.03), (0.018, 0.03), (0.03, 0.03)] * 4
     phase = [np.sin(2 * np.pi * rest @ (rng.normal(size=3) / 1.7) / length + rng.uniform(0, 6)) for length, _ in waves]
@@ -73,25 +71,26 @@ def skin_texture(rest):
 
 def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.0):
     """brows: by which they are raised at timesteps 3 and 6, or lowered where it is negative."""
-    tracked, pictured = synthetic_head(0, 1), synthetic_head(0, 2)
-    head, rng = HeadModel(tracked.model, "flame"), np.random.default_rng(4)
-    shape = rng.normal(0, 0.5, tracked.model.n_identity)
+    tracked = small_head(0)
+    pictured, tint = subdivided(tracked, small_head_colors())
+    head, rng = HeadModel(tracked, "flame"), np.random.default_rng(4)
+    shape = rng.normal(0, 0.5, tracked.n_identity)
     frames = [frame_at(opening, t) for t, opening in enumerate(openings)]
     for t in (3, 6) if brows else ():
         frames[t].expr[BROWS_UP if brows > 0 else BROWS_DOWN] = abs(brows)
-    colors = np.clip(paint(pictured, 0)[0] ** (1 / 1.8) * skin_texture(pictured.rest), 0, 1)
+    colors = np.clip(tint ** (1 / 1.8) * skin_texture(pictured.v_template), 0, 1)
     cameras = [look_at((1.1 * np.sin(a), 0.05, 1.1 * np.cos(a)), (0, -0.02, 0), *size, 3.7 * size[0]) for a in eyes]
     meshes, landmarks, pictures = [], {}, {}
     places = places_on(head, 300)
     wrong = rng.normal(0, 0.001, (300, 3))
     for t, frame in enumerate(frames):
-        mesh = flame_forward(tracked.model, shape, frame)
-        closed = flame_forward(tracked.model, shape, replace(frame, jaw_pose=np.zeros(3)))
-        points = places.on(mesh - pull * (mesh - closed), tracked.model.faces) + wrong
-        fine = flame_forward(pictured.model, shape, frame)
+        mesh = flame_forward(tracked, shape, frame)
+        closed = flame_forward(tracked, shape, replace(frame, jaw_pose=np.zeros(3)))
+        points = places.on(mesh - pull * (mesh - closed), tracked.faces) + wrong
+        fine = flame_forward(pictured, shape, frame)
         meshes.append(mesh)
         landmarks[t] = seen(cameras, points, noise=0.4, seed=t)
-        pictures[t] = [(c, shaded_image(fine, pictured.model.faces, c, colors)) for c in cameras]
+        pictures[t] = [(c, shaded_image(fine, pictured.faces, c, colors)) for c in cameras]
     return Scene(head, meshes, RecordedTake(places, np.ones(300, bool), landmarks, Pictures(pictures), metric=True))
 
 
@@ -151,7 +150,7 @@ def test_projection_derivative_agrees_with_differences():
 
 def test_smoothing_stays_at_the_solution_of_its_own_terms():
     """Catches terms that are changed while they are used, or a right-hand side of the wrong sign."""
-    head = HeadModel(synthetic_head(0, 1).model, "flame")
+    head = HeadModel(small_head(0), "flame")
     one = person(head, np.zeros(head.model.n_identity))
     places = places_on(head, 60)
     meshes = [flame_forward(head.model, np.zeros(10), frame_at(0.1, t)) for t in range(4)]
@@ -180,7 +179,7 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
     wide = np.argsort(OPENINGS)[-3:]
     before, after = jaw_errors(take, first), jaw_errors(take, found)
     assert before[wide].min() > 8
-    assert after[wide].mean() < 1.0
+    assert after[wide].mean() < 1.2
     assert (after < before + 0.4).all()
     assert set(misfit) == set(REGIONS)
     assert found.static_offset is not None

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flame.small_head import small_head
 
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.model import EYEBALL_WEIGHT
 from stga_addon.flame.teeth import flame_model
 from stga_addon.tracking.correspondence import calibrate, picture_cameras
@@ -21,7 +21,7 @@ REFERENCE = Path(__file__).with_name("mediapipe.npz")
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:
     """From the front, from the side, and turned in the image's plane before a wide dark background."""
-    model = synthetic_flame(0)
+    model = small_head(0)
     mesh, faces = model.v_template, model.faces
     cameras = picture_cameras(mesh)
     front, side = (shaded_image(mesh, faces, cameras[number]) for number in (0, 3))

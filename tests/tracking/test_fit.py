@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from flame.conftest import random_arrays, random_frame
+from flame.small_head import small_head
 
 from stga_addon.capture.camera import look_at
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import RIGID_SIZE, FlameFrame, flame_forward, frame_of
 from stga_addon.flame.teeth import flame_model
 from stga_addon.tracking.correspondence import nearest_points
@@ -42,7 +42,7 @@ WORLD_SCALE, WORLD_ROTATION = 0.23, 1.1
 
 @pytest.fixture(scope="module")
 def head():
-    return HeadModel(synthetic_flame(0), "flame")
+    return HeadModel(small_head(0), "flame")
 
 
 def places_on(head, count, seed=0):

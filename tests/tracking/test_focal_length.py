@@ -4,10 +4,10 @@ import struct
 
 import numpy as np
 import pytest
+from flame.small_head import small_head, write_flame
 from PIL import Image
 
 from stga_addon.capture.camera import camera_from_gl
-from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.tracking.fit import TimestepLandmarks
@@ -149,7 +149,7 @@ def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.6])
 def test_focal_length_of_a_head_that_turns(factor):
     """Catches a head that is taken for one at a phone's distance: its depth would be that much too large or small."""
-    head = HeadModel(synthetic_flame(0), "flame")
+    head = HeadModel(small_head(0), "flame")
     truth = factor * usual_focal(1080, 1920)
     places, take = turning(head, truth, 30)
     found = solved_focal(head, places, np.ones(300, bool), take)
@@ -158,7 +158,7 @@ def test_focal_length_of_a_head_that_turns(factor):
 
 def test_a_head_that_does_not_turn_tells_no_focal_length():
     """Catches the shape of a face taken for perspective, which is off by a factor of two on people who sit still."""
-    head = HeadModel(synthetic_flame(0), "flame")
+    head = HeadModel(small_head(0), "flame")
     places, take = turning(head, 1.6 * usual_focal(1080, 1920), 7)
     assert solved_focal(head, places, np.ones(300, bool), take) is None
 
@@ -168,7 +168,7 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, monkeypat
     capture does not have."""
     pytest.importorskip("av")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # no helping processes, whose decoders would not be seen
-    size, count, head = (108, 192), 8, HeadModel(synthetic_flame(0), "flame")
+    size, count, head = (108, 192), 8, HeadModel(small_head(0), "flame")
     places, take = turning(head, 1.6 * usual_focal(*size), 30, size, count)
     write_video(tmp_path / "phone.mp4", range(60, 60 + 10 * count, 10), size=size, gop=count)
     write_flame(head.model, tmp_path / "head.npz")

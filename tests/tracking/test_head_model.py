@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flame.small_head import small_head, write_flame
 
-from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
 from stga_addon.tracking.head_model import read_head_model, shape_arrays, write_linear_model
 
-MESH = synthetic_flame(0)
+MESH = small_head(0)
 SHAPES = MESH.shapedirs[:, :, [0, 1, -1, -2, -3]]
 NAMES = ("identity 0", "identity 1", "jawOpen", "smile", "brow")
 

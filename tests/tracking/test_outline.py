@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from flame.small_head import small_head
 from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity, rasterize
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.head_model import HeadModel
@@ -70,7 +70,7 @@ def test_what_the_mask_does_not_show_is_left_open():
 
 def test_mattes_that_are_too_wide_are_not_followed():
     """Catches a face that grows by a matte's margin, or by hair: those of real captures are a pixel or two too wide."""
-    head, cameras = HeadModel(synthetic_flame(0), "flame"), rig(5)
+    head, cameras = HeadModel(small_head(0), "flame"), rig(5)
     places, used = places_on(head, 150), np.ones(150, bool)
     shape, frame = np.zeros(head.model.n_identity), frame_at(head, 0)
     mesh, world = flame_forward(head.model, shape, frame), Similarity(1.0, np.eye(3), np.zeros(3))

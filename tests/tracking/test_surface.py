@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from flame.small_head import small_head
 
 from stga_addon.capture.camera import look_at
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.fit import fit_head
 from stga_addon.tracking.head_model import HeadModel
@@ -25,7 +25,7 @@ SWEEP = Sweep(0.004, 0.0005, 0.001)
 
 @pytest.fixture(scope="module")
 def head():
-    return HeadModel(synthetic_flame(0), "flame")
+    return HeadModel(small_head(0), "flame")
 
 
 def rig(count, size=400):

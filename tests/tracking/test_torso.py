@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flame.small_head import small_head, small_head_colors, subdivided, write_flame
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity, rasterize, weighted_procrustes
 from stga_addon.capture.open import open_capture
-from stga_addon.development.demo.head import synthetic_head, write_flame
-from stga_addon.development.demo.paint import paint
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, frame_of, joint_positions
 from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
@@ -61,7 +60,7 @@ def quiet(stage, done, total):
 
 
 def ellipsoid():
-    """Shoulders (V, 3), faces (F, 3) and colors (V, 3) of patterned cloth, below the demo's head."""
+    """Shoulders (V, 3), faces (F, 3) and colors (V, 3) of patterned cloth, below the small head."""
     around, down = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.linspace(0, np.pi, 45), indexing="ij")
     unit = np.stack([np.sin(down) * np.cos(around), np.cos(down), np.sin(down) * np.sin(around)], -1).reshape(-1, 3)
     vertices = unit * CHEST_SIZE_M + CHEST_CENTER_M
@@ -92,24 +91,24 @@ class Frames:
 
 @pytest.fixture(scope="module")
 def head():
-    return HeadModel(synthetic_head(0, 1).model, "flame")
+    return HeadModel(small_head(0), "flame")
 
 
 @pytest.fixture(scope="module")
 def fine_head():
     """With several rows of vertices below the neck, as FLAME has."""
-    return HeadModel(synthetic_head(0, 2).model, "flame")
+    return HeadModel(subdivided(small_head(0))[0], "flame")
 
 
 def take(head, heads, torsos, size=SIZE, shifts=None):
     """Fit, parameters of a head tracked as one, and footage; heads, torsos (T,): degrees about the vertical axis;
     shifts (T, 3) or (T, V, 3): of the shoulders, or of each of their vertices, in meters."""
-    pictured = synthetic_head(0, 2)
-    colors = np.clip(paint(pictured, 0)[0] ** (1 / 1.8), 0, 1)
+    pictured, colors = subdivided(small_head(0), small_head_colors())
+    colors = np.clip(colors ** (1 / 1.8), 0, 1)
     cloth, cloth_faces, cloth_colors = ellipsoid()
-    faces = np.concatenate([pictured.model.faces, cloth_faces + len(pictured.model.v_template)])
+    faces = np.concatenate([pictured.faces, cloth_faces + len(pictured.v_template)])
     cameras = [look_at((np.sin(a), 0.0, np.cos(a)), (0, -0.07, 0), *size, 2.6 * size[0]) for a in (-0.6, 0.0, 0.6)]
-    frames, shape = [Frames() for _ in cameras], np.zeros(pictured.model.n_identity)
+    frames, shape = [Frames() for _ in cameras], np.zeros(pictured.n_identity)
     one = person(head, np.zeros(head.model.n_identity))
     joints = joint_positions(one.model, one.model.v_template)
     parameters = {}
@@ -122,7 +121,7 @@ def take(head, heads, torsos, size=SIZE, shifts=None):
         turn = axis_angle_matrices(frame.rotation[None])[0]
         shoulders = (cloth - joints[ROOT]) @ turn.T + joints[ROOT] + frame.translation
         shoulders += 0 if shifts is None else shifts[timestep]
-        mesh = np.concatenate([flame_forward(pictured.model, shape, frame), shoulders])
+        mesh = np.concatenate([flame_forward(pictured, shape, frame), shoulders])
         for camera, own in zip(cameras, frames, strict=True):
             own.images.append(shaded_image(mesh, faces, camera, np.concatenate([colors, cloth_colors])))
             own.masks.append(np.where(rasterize(mesh, faces, camera)[0] >= 0, 255, 0).astype(np.uint8))

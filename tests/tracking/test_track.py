@@ -8,22 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flame.small_head import small_head, write_flame
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from stga_addon.perform.perform import perform
-from stga_addon.perform.tracking import STAGES
-from stga_addon.requests.values import Track
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
-from stga_addon.development.demo.head import synthetic_flame, write_flame
 from stga_addon.errors import StgaError
 from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward
 from stga_addon.flame.teeth import flame_model
+from stga_addon.jobs.perform import perform
+from stga_addon.jobs.track import STAGES, Track
 from stga_addon.tracking.camera_scale import scale_warnings
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import HeadFit
@@ -46,7 +45,7 @@ from .test_sequences import write_folders
 
 @pytest.fixture(scope="module")
 def head():
-    return HeadModel(synthetic_flame(0), "flame")
+    return HeadModel(small_head(0), "flame")
 
 
 @pytest.fixture(scope="module")

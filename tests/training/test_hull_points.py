@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from flame.small_head import small_head
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -13,7 +14,6 @@ from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
@@ -184,7 +184,7 @@ def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> Non
 @pytest.mark.parametrize("one", [False, True])
 def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -> None:
     """Catches a collar that turns with the chin it lies under, and hair beside the neck that does not."""
-    model = synthetic_flame(0)
+    model = small_head(0)
     frame = replace(neutral_frame(model), rotation=np.array([0.0, 0.4, 0.0]), neck_pose=np.array([0.0, -0.4, 0.0]))
     head = FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame)
     mesh = sequence_mesh(head, TIMESTEP)
@@ -211,7 +211,7 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -
 def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path: Path) -> None:
     """Catches a chest that bulges as the hull of few cameras does, one that loses its place when it turns, and a hull
     of many cameras that is thrown away."""
-    model = synthetic_flame(0)
+    model = small_head(0)
     turned = replace(neutral_frame(model), rotation=np.array([0.0, 0.4, 0.0]), neck_pose=np.array([0.0, -0.4, 0.0]))
     frames = {TIMESTEP: turned, TIMESTEP + 1: neutral_frame(model)}
     head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
@@ -271,7 +271,7 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(
     tmp_path: Path, right: float, up: float, continued: bool
 ) -> None:
     """Catches a chest that ends in the air where the image did, and hair that is continued like one."""
-    model = synthetic_flame(0)
+    model = small_head(0)
     frame = neutral_frame(model)
     head = FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame)
     number = min(range(20), key=lambda n: abs(float(cameras()[n].position[1])))

@@ -1,4 +1,4 @@
-"""Demo: make a synthetic capture, train an avatar on it, show it in Blender and compare the pictures."""
+"""Demo: train an avatar on the demo's capture, show it in Blender and compare the pictures."""
 
 from argparse import ArgumentParser
 from collections.abc import Mapping
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
 from ...avatar.embedding import to_world
 from ...avatar.file import Avatar, read_avatar
@@ -25,12 +24,13 @@ from ...export.playback import Playback
 from ...files import replacing, write_json
 from ...jobs.export import capture_views
 from ...jobs.train import Train
+from ...raster.cpu.precompile import begin_compiling
 from ...render.render import render_avatar, to_uint8
 from ...selection import SelectionOptions, select_capture
 from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import AVATAR, RUN
 from ...training.settings import make_settings
-from .capture import CaptureOptions, make_capture
+from .capture import unpack_capture
 
 SEED = 0
 POSES_PER_SECOND = 1.5
@@ -41,8 +41,8 @@ MAX_POSITION_ERROR_M = 1e-5
 """Largest distance between a splat in Blender and in numpy."""
 
 
-def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | None = None, device: str = "cpu") -> None:
-    """Make a capture of a synthetic head, import it into Blender, select, train, and show the avatar.
+def run_demo(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
+    """Unpack the demo's capture, import it into Blender, select, train, and show the avatar.
 
     budget: the setting that limits training, `seconds` or `iterations`; device: one of `choose_device`.
 
@@ -51,12 +51,13 @@ def run_demo(out: Path, budget: Mapping[str, Any], options: CaptureOptions | Non
     Raises StgaError where the folder cannot be written or Blender places a splat elsewhere than numpy does.
     """
     begin = perf_counter()
+    if device == "cpu":
+        begin_compiling()  # while Blender opens the capture
     folder = out / "capture"
-    with tqdm(desc="Rendering the capture", unit="image") as bar:
-        model = make_capture(folder, SEED, options, progress=lambda done, total: _advance(bar, done, total))
-    capture = open_capture(folder, model)
+    unpack_capture(folder)
+    capture = open_capture(folder)
     head, selection = _import_and_select(capture)
-    avatar = _train(capture, model, out, budget, selection, device)
+    avatar = _train(capture, out, budget, selection, device)
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
@@ -76,16 +77,11 @@ def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
     """
     from ...cli.commands import COMMANDS
 
-    model = ["--model", str(out / "capture/flame_model.npz"), "--cameras", str(out / "capture/transforms.json")]
+    cameras = ["--cameras", str(out / "capture/transforms.json")]
     more = ["--out", str(out / "footage"), "--budget", f"{seconds}s", "--seed", str(SEED), "--device", device]
     parser = ArgumentParser()
     COMMANDS["avatar"].add_arguments(parser, None)
-    COMMANDS["avatar"].carry_out(parser.parse_args([str(out / "capture"), *model, *more]), None)
-
-
-def _advance(bar: "tqdm[None]", done: int, total: int) -> None:
-    bar.total = total
-    bar.update(done - bar.n)
+    COMMANDS["avatar"].carry_out(parser.parse_args([str(out / "capture"), *cameras, *more]), None)
 
 
 def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:
@@ -101,13 +97,13 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 
 
 def _train(
-    capture: Capture, model: Path, out: Path, budget: Mapping[str, Any], selection: dict[int, np.ndarray], device: str
+    capture: Capture, out: Path, budget: Mapping[str, Any], selection: dict[int, np.ndarray], device: str
 ) -> Avatar:
-    # The tracking of a synthetic capture is exact, and Blender shows it unrefined.
+    # The capture's heads are exact, and Blender shows them unrefined.
     settings = make_settings(**budget, seed=SEED, effects={"tracking": "off"})
     folder = out / "run"
     (folder / RUN).unlink(missing_ok=True)  # the demo always starts a new run
-    carry_out(Train(folder, capture.root, settings, model, device=device, selection=selection))
+    carry_out(Train(folder, capture.root, settings, device=device, selection=selection))
     path = folder / AVATAR
     with replacing(out / AVATAR) as partial:
         partial.write_bytes(path.read_bytes())

@@ -41,6 +41,11 @@ def expression_key(head: Any, component: int) -> str:
     return named.split(",")[component] if named else f"{EXPRESSION_KEY}{component:03d}"
 
 
+def posing_bone(head: Any) -> str:
+    """The bone that is turned first: the jaw, or the neck of a head whose jaw is moved by a shape."""
+    return "neck" if EXPRESSION_NAMES in head else "jaw"
+
+
 def is_expression_key(name: str) -> bool:
     """Whether a head with a FLAME rig has the shape key for one of its expression components."""
     return name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES

@@ -1,4 +1,4 @@
-"""Demo at a small size: capture, Blender scene, selection, training, splats that follow the mesh."""
+"""Demo with few of its capture's images: Blender scene, selection, training, splats that follow the mesh."""
 
 import json
 
@@ -8,22 +8,40 @@ from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.cli.main import main
-from stga_addon.development.demo.capture import CaptureOptions
-from stga_addon.development.demo.run import run_demo
+from stga_addon.development.demo import run
+from stga_addon.development.demo.capture import unpack_capture
+from stga_addon.files import read_json, write_json
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
-SMALL = CaptureOptions(train=2, test=1, cameras=6, width=72, height=100, samples=2)
-TINY = CaptureOptions(train=1, test=1, cameras=3, width=36, height=50, samples=1)
+TIMESTEPS, CAMERAS, WIDTH = (0, 1, 7), (2, 3, 4, 5, 6), 96
+
+
+def unpack_few(folder):
+    """The demo's capture with few cameras and timesteps, in small images."""
+    unpack_capture(folder)
+    for path in folder.glob("transforms*.json"):
+        document = read_json(path)
+        few = [f for f in document["frames"] if f["timestep_index"] in TIMESTEPS and f["camera_index"] in CAMERAS]
+        for frame in few:
+            factor = WIDTH / frame["w"]
+            frame |= {name: factor * frame[name] for name in ("fl_x", "fl_y", "cx", "cy")}
+            frame |= {"w": WIDTH, "h": round(factor * frame["h"])}
+            with Image.open(folder / frame["file_path"]) as image:
+                small = image.resize((frame["w"], frame["h"]))
+            small.save(folder / frame["file_path"])
+        write_json(path, {**document, "frames": few})
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     """Folder of a demo."""
     folder = tmp_path_factory.mktemp("demo")
-    run_demo(folder, {"iterations": 60}, SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "unpack_capture", unpack_few)
+        run.run_demo(folder, {"iterations": 60})
     return folder
 
 
@@ -35,7 +53,7 @@ def test_demo_writes_its_files(demo):
     # Far above what the untrained gray lattice reaches on these images (about 15 dB).
     assert metrics["val"]["psnr"] > 20
     assert len(read_avatar(demo / "avatar.npz").splats) == metrics["splats"]
-    assert Image.open(demo / "comparison.png").size == (4 * 72 + 3 * 6, 100)
+    assert Image.open(demo / "comparison.png").size == (4 * WIDTH + 3 * 6, 120)
     selection = np.asarray(Image.open(demo / "selection.png")).astype(int)
     colored = np.ptp(selection, axis=2) > 25
     gray = (np.ptp(selection, axis=2) <= 3) & (selection.max(axis=2) < 250)
@@ -50,9 +68,7 @@ def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, caps
     from raster import gpu_device
 
     adapter = gpu_device.device().name
-    monkeypatch.setattr(
-        "stga_addon.development.demo.run.run_demo", lambda out, budget, device: run_demo(out, budget, TINY, device)
-    )
+    monkeypatch.setattr(run, "unpack_capture", unpack_few)
     assert main(["demo", "--out", str(tmp_path), "--iterations", "4", "--device", f"gpu:{adapter}"]) == 0
     assert f"Training on {adapter}" in capsys.readouterr().out
     assert read_run(tmp_path / "run").device == f"gpu:{adapter}"
@@ -70,7 +86,7 @@ def test_the_blend_file_opens_with_head_groups_and_splats(demo):
     assert len(splats) == 1
     assert heads[0].hide_get(), "the head covers its splats"
     assert [group for group in heads[0].vertex_groups if group.name.startswith("stga_")]
-    assert sum(thing.type == "CAMERA" for thing in bpy.data.objects) == SMALL.cameras
+    assert sum(thing.type == "CAMERA" for thing in bpy.data.objects) == len(CAMERAS)
     views = [area.spaces.active for screen in bpy.data.screens for area in screen.areas if area.type == "VIEW_3D"]
     assert views
     pose = np.array(heads[0].matrix_world)

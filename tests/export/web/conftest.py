@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from avatar.conftest import random_splats
+from flame.small_head import small_head
 
 from export.web.browser import Browser, find_browser
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
-from stga_addon.development.demo.head import synthetic_flame
 from stga_addon.export.playback import Playback, ShapeControls
 from stga_addon.export.web.data_file import WebRig, data_file, flame_rig
 from stga_addon.export.web.page import page
@@ -74,7 +74,7 @@ def make_head(
     strain_position: bool = False,
 ) -> Head:
     """strain: whether colors follow it; strain_position: whether splats move with it, as far as they spread."""
-    model = synthetic_flame(0)
+    model = small_head(0)
     rng = np.random.default_rng(3)
     frames = [
         FlameFrame(

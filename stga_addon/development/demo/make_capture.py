@@ -1,0 +1,169 @@
+"""Makes the demo's capture, `head_capture.zip`: a person of the bundled head model, path-traced by Cycles.
+
+python -m stga_addon.development.demo.make_capture ict_facekit.npz, which `bundled_head.py` describes.
+Needs Blender's bpy. The pictures show more than the bundled head has: twice as many vertices,
+hair, lashes, pores.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
+
+import numpy as np
+from tqdm import tqdm
+
+from ...capture.camera import Camera, look_at
+from ...capture.open import CANONICAL_NAME, PARAMETERS
+from ...capture.transforms import camera_entry
+from ...files import read_npz, replacing, write_json, write_npz
+from ...flame.forward import FlameFrame, flame_forward, neutral_frame
+from ...tracking.folder import SPLIT_FILES, image_name
+from ...tracking.write_capture import moving_arrays
+from .capture import CAPTURE
+from .person import Person, make_person
+from .studio import Studio
+
+CAMERAS, HELD_OUT = 9, 4
+"""On an arc in front of the head; the middle one is `val`."""
+WIDTH, HEIGHT = 320, 400
+FOCAL = 3.7
+"""In image widths."""
+ARC_DEG, ELEVATIONS_DEG = 70.0, (8.0, -9.0)
+DISTANCE_M, AIM_M = 1.1, (0.0, -0.002, 0.0)
+SAMPLES = 10
+WEBP_QUALITY, WEBP_ALPHA_QUALITY = 93, 90
+
+
+@dataclass(frozen=True)
+class Act:
+    """An expression by ARKit's names without sides, and turns of head, neck and eyes in degrees.
+
+    turn: to the person's left and down; gaze: of both eyes, likewise.
+    """
+
+    weights: dict[str, float]
+    turn: tuple[float, float] = (0.0, 0.0)
+    neck: tuple[float, float] = (0.0, 0.0)
+    gaze: tuple[float, float] = (0.0, 0.0)
+
+
+RELAXED = {"eyeBlink": 0.13, "eyeSquint": 0.08, "mouthSmile": 0.18}
+"""What an act has where it says nothing else."""
+CONVERGENCE_DEG = 2.5
+"""By which each eye turns to the nose."""
+TRAIN_ACTS = (
+    Act({}),
+    Act({"mouthSmile": 0.85, "cheekSquint": 0.6, "eyeSquint": 0.3, "mouthDimple": 0.3}, turn=(4, 0)),
+    Act(
+        {"browInnerUp": 0.9, "browOuterUp": 0.8, "eyeWide": 0.6, "jawOpen": 0.5, "eyeBlink": 0, "mouthSmile": 0},
+        neck=(0, -4),
+    ),
+    Act({"eyeBlink": 1.0, "mouthPucker": 0.8, "mouthSmile": 0}, turn=(-3, 2)),
+    Act({"browDown": 0.8, "noseSneer": 0.5, "mouthFrown": 0.5, "mouthSmile": 0}, neck=(-6, 0), gaze=(13, 0)),
+    Act(
+        {"mouthSmile": 0.7, "mouthUpperUp": 0.5, "mouthLowerDown": 0.45, "jawOpen": 0.12, "cheekSquint": 0.5},
+        neck=(4, 2), gaze=(-12, 3),
+    ),
+)  # fmt: skip
+TEST_ACTS = (
+    Act({"mouthSmile": 0.8, "jawOpen": 0.3, "browOuterUp": 0.5, "cheekSquint": 0.4}, turn=(-4, -1), gaze=(6, 0)),
+    Act({"mouthFunnel": 0.6, "jawOpen": 0.15, "browInnerUp": 0.6, "mouthSmile": 0}, neck=(5, 0)),
+)
+
+
+def main(source: Path) -> None:
+    """Make the capture of the ICT-FaceKit arrays in `source`, without its head model."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_capture(folder, source)
+        with replacing(CAPTURE) as partial, ZipFile(partial, "w", ZIP_DEFLATED) as archive:
+            for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+                # Of no date: equal files give an equal zip.
+                archive.writestr(ZipInfo(file.relative_to(folder).as_posix()), file.read_bytes(), ZIP_DEFLATED)
+
+
+def write_capture(out: Path, source: Path) -> None:
+    """Write the capture into the folder `out`."""
+    person = make_person(read_npz(source))
+    frames = [frame_of_act(act, person.model.expression_names) for act in (*TRAIN_ACTS, *TEST_ACTS)]
+    cameras = rig()
+    _write_parameters(out, person, frames)
+    studio = Studio(person, SAMPLES)
+    with tqdm(total=len(frames) * len(cameras), unit="image") as bar:
+        for timestep, frame in enumerate(frames):
+            studio.pose(flame_forward(person.model, person.shape, frame))
+            for number, image in enumerate(studio.pictures(cameras)):
+                with replacing(out / _name(timestep, number)) as partial:
+                    options = {"quality": WEBP_QUALITY, "alpha_quality": WEBP_ALPHA_QUALITY, "method": 6}
+                    image.save(partial, format="WEBP", **options)
+                bar.update()
+    _write_transforms(out, cameras)
+
+
+def frame_of_act(act: Act, names: tuple[str, ...]) -> FlameFrame:
+    """The bundled head's parameters of an act; a weight without side is of both."""
+    weights = RELAXED | act.weights
+    sided = {f"{name}{side}": weight for name, weight in weights.items() for side in ("", "Left", "Right")}
+    expr = np.array([sided.get(name, 0.0) for name in names])
+    yaw, pitch, inwards = np.radians([*act.gaze, CONVERGENCE_DEG])
+
+    def turned(angles: tuple[float, float]) -> np.ndarray:
+        return np.radians([angles[1], angles[0], 0.0])
+
+    zero = np.zeros(3)
+    return FlameFrame(
+        expr=expr,
+        rotation=turned(act.turn),
+        neck_pose=turned(act.neck),
+        jaw_pose=zero,
+        translation=zero,
+        eyes_pose=np.array([pitch, yaw - inwards, 0.0, pitch, yaw + inwards, 0.0]),
+    )
+
+
+def rig() -> list[Camera]:
+    """Cameras on an arc around the head, alternately from below and above."""
+    cameras = []
+    for number, azimuth in enumerate(np.radians(np.linspace(-ARC_DEG, ARC_DEG, CAMERAS))):
+        elevation = np.radians(ELEVATIONS_DEG[number % len(ELEVATIONS_DEG)])
+        level = np.cos(elevation)
+        ahead = np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
+        cameras.append(look_at((AIM_M + DISTANCE_M * ahead).tolist(), AIM_M, WIDTH, HEIGHT, FOCAL * WIDTH))
+    return cameras
+
+
+def _name(timestep: int, camera: int) -> str:
+    return image_name(timestep, camera, ".webp")
+
+
+def _write_parameters(out: Path, person: Person, frames: list[FlameFrame]) -> None:
+    shape = {"shape": person.shape.astype(np.float32)}
+    named = {f"{PARAMETERS}/{timestep:05d}.npz": frame for timestep, frame in enumerate(frames)}
+    for name, frame in {**named, CANONICAL_NAME: neutral_frame(person.model)}.items():
+        write_npz(out / name, moving_arrays(frame.parameters) | shape, compressed=True)
+
+
+def _write_transforms(out: Path, cameras: list[Camera]) -> None:
+    splits: dict[str, list[dict[str, object]]] = {name: [] for name in SPLIT_FILES}
+    train, val, test = splits.values()
+    for timestep in range(len(TRAIN_ACTS) + len(TEST_ACTS)):
+        for number, camera in enumerate(cameras):
+            seen = val if number == HELD_OUT else train
+            (seen if timestep < len(TRAIN_ACTS) else test).append(
+                {
+                    "timestep_index": timestep,
+                    "camera_index": number,
+                    "camera_id": f"{number:02d}",
+                    "file_path": _name(timestep, number),
+                    "flame_param_path": f"{PARAMETERS}/{timestep:05d}.npz",
+                    **camera_entry(camera),
+                }
+            )
+    for name, frames in [*splits.items(), ("transforms.json", [*train, *val, *test])]:
+        write_json(out / name, {"frames": frames})
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
