@@ -52,7 +52,7 @@ CONVERGED_STEP_M = 1e-4
 """Root mean square of the points' motion in a step, after which a level is done."""
 MAX_TURN = 0.3
 """Of a joint in one step, in radians."""
-SETTLED_GAIN = 0.03
+SETTLED_GAIN = 0.01
 """By which a region's misfit has to fall for a settled timestep to be changed: below it, the surface that several
 cameras see is the better evidence."""
 KEPT_STIFFNESS = 100.0
