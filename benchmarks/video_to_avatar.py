@@ -8,6 +8,7 @@ called, and seconds of wall time. Below, processor seconds, of helping processes
 
 import argparse
 import os
+import re
 import tempfile
 from pathlib import Path
 from time import perf_counter
@@ -29,7 +30,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = options.out or Path(folder) / "avatar"
         track = Track(options.video.resolve(), None, out / CAPTURE_FOLDER, stop=options.frames)
-        settings = make_settings(seconds=options.seconds)
+        settings = make_settings(seconds=options.seconds, effects={})
         measure(MakeAvatar(track, Train(out / RUN_FOLDER, track.out, settings)))
 
 
@@ -43,7 +44,7 @@ def measure(request: MakeAvatar) -> None:
         nonlocal last, stage
         now = perf_counter()
         seconds[stage] = seconds.get(stage, 0.0) + now - last
-        last, stage = now, progress.stage
+        last, stage = now, re.sub(r": \d+ of \d+$", "", progress.stage)
         return False
 
     perform(request, report)
