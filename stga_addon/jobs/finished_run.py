@@ -132,7 +132,13 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
     write_json(path, {"views": len(views), **quality.as_json()})
     lines = [f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)]
     unseen = {view.timestep for view in views} - {view.timestep for view in capture.views.get("train", ())}
-    if unseen and capture is not tracked:
+    if (
+        tracked.flame is not None
+        and capture.flame is not None
+        and any(
+            not np.array_equal(capture.flame.frame(t).parameters, tracked.flame.frame(t).parameters) for t in unseen
+        )
+    ):
         before = _describe(evaluate_avatar(avatar, tracked, split))
         lines.insert(1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}")
     return Written(path, tuple(lines))

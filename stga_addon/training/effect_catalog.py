@@ -82,7 +82,7 @@ _EFFECTS = (
     Effect("dynamic-offsets", "a mesh a frame beside the parameters"),
     Effect(
         "tracking",
-        "a fifth of the time, or up to half a second a timestep and view; tracking.npz is then the head's motion",
+        "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the head's motion",
         on={"tracking": True},
         off={"tracking": False},
     ),

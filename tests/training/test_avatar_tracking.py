@@ -12,9 +12,10 @@ import torch
 from PIL import Image
 
 from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_backward
-from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.images import read_view
 from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
@@ -22,6 +23,7 @@ from stga_addon.flame.forward import parameters_gradient
 from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
 from stga_addon.progress import Cancelled
 from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.avatar_tracking import AvatarTracking, RefinedTracking, track_by_avatar
 from stga_addon.training.optimize.cpu_backend import frame_gradient
 from stga_addon.training.optimize.trainer import Trainer
@@ -264,6 +266,10 @@ def test_commands_use_the_refined_meshes(
     assert main(["eval", str(run_folder)]) == 0
     assert f"PSNR {best:.3f} dB" in capsys.readouterr().out
     root = read_run(run_folder).capture
+    tracked = open_capture(root, root / "model.npz")
+    assert main(["eval", str(run_folder), "--split", "test"]) == 0
+    before = evaluate_avatar(read_avatar(run_folder / "avatar.npz"), tracked, "test").psnr
+    assert f"as tracked before: PSNR {before:.3f} dB" in capsys.readouterr().out
     cameras = ["--cameras", str(root / "transforms_val.json")]
     assert main(["render", str(run_folder), *cameras, "--out", str(tmp_path / "run")]) == 0
     avatar = [str(run_folder / "avatar.npz"), "--capture", str(root), "--flame", str(root / "model.npz")]

@@ -52,7 +52,8 @@ FIRST_STEP = 0.01
 
 @dataclass(frozen=True)
 class AvatarTracking:
-    """Parameters (T, E + 18) of timesteps, and the loss of their images (T,) where they started and where they are."""
+    """Parameters (T, E + 18) of timesteps, and what was minimized, (T,), where they started and where they are: the
+    loss of their images, in the points' units, and the prior."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
@@ -174,7 +175,7 @@ class _Tracker:
         self._backend = CpuBackend(settings, self._frames, state)
 
     def solve(self, timestep: int) -> tuple[np.ndarray, float, float]:
-        """Parameters (E + 18,), and loss before and after; as tracked where no view shows the timestep."""
+        """Parameters (E + 18,), and what was minimized before and after; as tracked where no view shows it."""
         from scipy.linalg import solve_triangular
         from scipy.optimize import minimize
 
@@ -194,18 +195,16 @@ class _Tracker:
             return loss + prior / 2, solve_triangular(root, gradient, lower=True)
 
         start = np.zeros(len(tracked))
-        kept = [energy(start)]
-        scale = FIRST_STEP * max(float(np.linalg.norm(kept[0][1])), 1e-9)
+        before, slope = energy(start)
+        scale = FIRST_STEP * max(float(np.linalg.norm(slope)), 1e-9)
 
         def scaled(values: np.ndarray) -> tuple[float, np.ndarray]:
-            found = kept[0] if not values.any() else energy(scale * values)
-            return found[0], scale * found[1]
+            found, gradient = (before, slope) if not values.any() else energy(scale * values)
+            return found, scale * gradient
 
         options = {"maxfun": RENDERINGS, "maxiter": RENDERINGS}
-        best = minimize(scaled, start, jac=True, method="L-BFGS-B", options=options).x
-        values = tracked + solve_triangular(root, scale * best, lower=True, trans=1)
-        before, after = (self._loss(own, timestep, shots)[0] for own in (tracked, values))
-        return (values, before, after) if after < before else (tracked, before, before)
+        best = minimize(scaled, start, jac=True, method="L-BFGS-B", options=options)
+        return tracked + solve_triangular(root, scale * best.x, lower=True, trans=1), before, float(best.fun)
 
     def _read(self, view: View) -> tuple[View, np.ndarray]:
         background = [round(255 * part) for part in self._settings.background]

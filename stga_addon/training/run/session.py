@@ -155,8 +155,8 @@ class Session:
         seen = {view.timestep for view in views["train"]}
         unseen = sorted({view.timestep for own in views.values() for view in own} - seen)
         if tracking is not None and tracking.rounds == 1 and unseen:
-            self._tracked(unseen, None if seconds is None else TRACKING_TIME_SHARE * seconds, report)
-            tracking.rounds += 1
+            limit = None if seconds is None else TRACKING_TIME_SHARE * seconds
+            tracking.rounds += self._tracked(unseen, limit, report)
 
     def _tracked(self, timesteps: list[int], seconds: float | None, report: Callable[[int, int], bool]) -> bool:
         tracking = self.trainer.tracking
