@@ -6,7 +6,8 @@ _registered = ExitStack()
 
 
 def register() -> None:
-    """Register everything or nothing. Imports are local because tests import this file without Blender, too."""
+    """Register everything or nothing. Imports are local because tests import this file without
+    Blender, too."""
     from . import operators
     from .operators import command_line, render_engine
     from .ui import curve, panel, preferences, properties

@@ -2,12 +2,13 @@
 
     python benchmarks/driving.py DATA [--poses 1000] [--components 50]
 
-DATA is the folder of `flame_open/flame2023_open_basis.npz`. FLAME's expressions are not published openly, so the heads
-have generated ones (tests/driving/heads.py). Prints, for three identities with a third of the poses each: mean distance
-at the face points of the map's poses from ICT-FaceKit's shapes on that head, beside that of a fit of expressions and
-jaw to each pose alone; the mean distance from a head's true poses, and from those by its own coefficients, when it is
-driven by the parameters of another person whose face leaks into the expressions, in several ways; the largest error of
-each weight after parameters and back; and per shape how much of it the head can do.
+DATA is the folder of `flame_open/flame2023_open_basis.npz`. FLAME's expressions are not published
+openly, so the heads have generated ones (tests/driving/heads.py). Prints, for three identities with
+a third of the poses each: mean distance at the face points of the map's poses from ICT-FaceKit's
+shapes on that head, beside that of a fit of expressions and jaw to each pose alone; the mean
+distance from a head's true poses, and from those by its own coefficients, when it is driven by the
+parameters of another person whose face leaks into the expressions, in several ways; the largest
+error of each weight after parameters and back; and per shape how much of it the head can do.
 """
 
 import argparse
@@ -63,7 +64,9 @@ class Head:
 
     def points(self, values: np.ndarray) -> np.ndarray:
         """(N, 3) of expressions and jaw (E + 3,)."""
-        return self.posed.positions(values[: self.count], self.rigid(values[self.count : self.count + 3]))
+        return self.posed.positions(
+            values[: self.count], self.rigid(values[self.count : self.count + 3])
+        )
 
     def true_points(self, weights: np.ndarray) -> np.ndarray:
         """(N, 3) where ICT-FaceKit's shapes put this head's face points."""
@@ -76,7 +79,9 @@ class Head:
             [*range(self.count), *range(self.count + JAW, self.count + JAW + 3)],
         )
         for _ in range(FREE_STEPS):
-            at, slopes = self.posed.linearized(values[: self.count], self.rigid(values[self.count :]))
+            at, slopes = self.posed.linearized(
+                values[: self.count], self.rigid(values[self.count :])
+            )
             matrix = slopes[..., columns].reshape(-1, len(columns))
             normal = matrix.T @ matrix
             normal[np.diag_indices(len(normal))] += SINGULAR
@@ -90,7 +95,9 @@ def mean_distance(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def combinations(heads: list[Head], poses: int) -> None:
-    print("## Combinations\n\n| identity | motion mm | map mm | free fit mm | map / free fit | max coefficient |")
+    print(
+        "## Combinations\n\n| identity | motion mm | map mm | free fit mm | map / free fit | max coefficient |"
+    )
     print("|---|---|---|---|---|---|")
     for number, head in enumerate(heads):
         weights = random_poses(poses // len(heads), np.random.default_rng(100 + number))
@@ -103,12 +110,14 @@ def combinations(heads: list[Head], poses: int) -> None:
         motion, missed, best = np.mean(rows, axis=0)
         largest = np.abs(found[:, : head.count]).max()
         print(
-            f"| {number} | {motion:.3f} | {missed:.3f} | {best:.3f} | {missed / best:.3f} | {largest:.1f} |", flush=True
+            f"| {number} | {motion:.3f} | {missed:.3f} | {best:.3f} | {missed / best:.3f} | {largest:.1f} |",
+            flush=True,
         )
 
 
 def leaks(driver: Head, driven: Head, poses: int) -> None:
-    """The driver's expressions hold what the identity components do not: a random ICT-FaceKit face."""
+    """The driver's expressions hold what the identity components do not: a random ICT-FaceKit
+    face."""
     rng = np.random.default_rng(7)
     weights = random_poses(poses + QUIET_FRAMES, rng)
     weights[:QUIET_FRAMES] = 0.02 * weights[:QUIET_FRAMES]
@@ -124,18 +133,25 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
         driver.rest - driver.rest.mean(axis=0)
     )
     displaced = [driven.rest + scale * (driver.points(row) - rest) for row in copied]
-    own, true = _values(driven.map.frames(take)), [driven.true_points(row) for row in weights[QUIET_FRAMES:]]
+    own, true = (
+        _values(driven.map.frames(take)),
+        [driven.true_points(row) for row in weights[QUIET_FRAMES:]],
+    )
     through = driven.map.parameters(back)[:, : driven.count + 3]
     ways = {
         "coefficients copied": copied,
         "coefficients, relative to the quiet face": apart,
         "displacements of the points, fitted": _fitted(driven, displaced, apart),
         "ARKit weights and this head's map": through,
-        "ARKit weights, what they do fitted": _fitted(driven, [driven.true_points(row) for row in back], through),
+        "ARKit weights, what they do fitted": _fitted(
+            driven, [driven.true_points(row) for row in back], through
+        ),
         "this head's own coefficients": own,
         "best of this model": _fitted(driven, true, own),
     }
-    print("\n## Another person's motion\n\n| way | from ICT-FaceKit mm | less % | from own coefficients mm | less % |")
+    print(
+        "\n## Another person's motion\n\n| way | from ICT-FaceKit mm | less % | from own coefficients mm | less % |"
+    )
     print("|---|---|---|---|---|")
     first: np.ndarray | None = None
     for name, values in ways.items():
@@ -143,18 +159,25 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
         missed = np.array(
             [
                 np.mean([mean_distance(p, t) for p, t in zip(points, true, strict=True)]),
-                np.mean([mean_distance(p, driven.points(v)) for p, v in zip(points, own, strict=True)]),
+                np.mean(
+                    [mean_distance(p, driven.points(v)) for p, v in zip(points, own, strict=True)]
+                ),
             ]
         )
         first = missed if first is None else first
         less = 100 * (1 - missed / first)
-        print(f"| {name} | {missed[0]:.3f} | {less[0]:.0f} | {missed[1]:.3f} | {less[1]:.0f} |", flush=True)
+        print(
+            f"| {name} | {missed[0]:.3f} | {less[0]:.0f} | {missed[1]:.3f} | {less[1]:.0f} |",
+            flush=True,
+        )
 
 
 def _leaked(driver: Head) -> np.ndarray:
     """(E,) expression coefficients that a tracker finds in the driver's face at rest."""
     shapes = face_shapes()
-    other = np.tensordot(np.random.default_rng(7).normal(0, 1, len(shapes.identity)), shapes.identity, 1)
+    other = np.tensordot(
+        np.random.default_rng(7).normal(0, 1, len(shapes.identity)), shapes.identity, 1
+    )
     _, slopes = driver.posed.linearized(np.zeros(driver.count), np.zeros(RIGID_SIZE))
     matrix = slopes[..., : driver.count].reshape(-1, driver.count)
     normal = matrix.T @ matrix + LEAK_RIDGE_M**2 * len(driver.rest) * np.eye(driver.count)
@@ -163,7 +186,9 @@ def _leaked(driver: Head) -> np.ndarray:
 
 def _values(frames: list[FlameFrame]) -> np.ndarray:
     """(T, E + 3) expressions and jaw, without the quiet frames at the beginning."""
-    return np.stack([np.concatenate([frame.expr, frame.jaw_pose]) for frame in frames[QUIET_FRAMES:]])
+    return np.stack(
+        [np.concatenate([frame.expr, frame.jaw_pose]) for frame in frames[QUIET_FRAMES:]]
+    )
 
 
 def _fitted(head: Head, wanted: list[np.ndarray], start: np.ndarray) -> np.ndarray:
@@ -179,7 +204,9 @@ def there_and_back(head: Head) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--poses", type=int, default=1000)
     parser.add_argument("--components", type=int, default=50)
@@ -192,7 +219,9 @@ def main() -> None:
     combinations(heads, options.poses)
     leaks(heads[1], heads[2], options.leak_poses)
     errors = there_and_back(heads[0])
-    print(f"\n## Per shape\n\n{(errors < 0.01).sum()} of {len(errors)} weights come back within 0.01\n")
+    print(
+        f"\n## Per shape\n\n{(errors < 0.01).sum()} of {len(errors)} weights come back within 0.01\n"
+    )
     print("| shape | reach % | error there and back |\n|---|---|---|")
     reach = np.mean([head.map.reach for head in heads], axis=0)
     for name, share, error in zip(ARKIT_SHAPES, reach, errors, strict=True):

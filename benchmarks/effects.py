@@ -1,16 +1,19 @@
-"""Benchmark of effect plans: effects decided automatically against all effects, at the same number of iterations.
+"""Benchmark of effect plans: effects decided automatically against all effects, at the same number
+of iterations.
 
-    python benchmarks/effects.py CAPTURE [--flame FILE] [--iterations 500] [--seeds 3] [--only full static one-camera]
-    python benchmarks/effects.py CAPTURE … --each
-    python benchmarks/effects.py CAPTURE … --switch strain-color view-color [--only full uneven]
+    python benchmarks/effects.py CAPTURE [--flame FILE] [--iterations 500] [--seeds 3] [--only full
+    static one-camera] python benchmarks/effects.py CAPTURE … --each python benchmarks/effects.py
+    CAPTURE … --switch strain-color view-color [--only full uneven]
 
-The first derives two captures from CAPTURE, its first training timestep and its middle training camera, trains each
-with the effects decided by Auto and with all that can be on, and says whether Auto is within 0.1 dB of all, in less
-time. --each trains with all effects but one, for what each of them costs. --switch trains with one effect on and off,
-the others decided by Auto, for what it brings; the capture "uneven" has the channels of each training camera
-multiplied by 0.9 to 1.1. Prints tables in Markdown: PSNR of the held-out view, means over seeds ± their standard
-deviation, and milliseconds of an iteration. Selection is left to Auto: it is another way to train, not something more
-to compute. Each seed trains all variants of a capture in another order. Run it on an idle machine.
+The first derives two captures from CAPTURE, its first training timestep and its middle training
+camera, trains each with the effects decided by Auto and with all that can be on, and says whether
+Auto is within 0.1 dB of all, in less time. --each trains with all effects but one, for what each of
+them costs. --switch trains with one effect on and off, the others decided by Auto, for what it
+brings; the capture "uneven" has the channels of each training camera multiplied by 0.9 to 1.1.
+Prints tables in Markdown: PSNR of the held-out view, means over seeds ± their standard deviation,
+and milliseconds of an iteration. Selection is left to Auto: it is another way to train, not
+something more to compute. Each seed trains all variants of a capture in another order. Run it on an
+idle machine.
 """
 
 import argparse
@@ -50,7 +53,8 @@ Choices = dict[str, str]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a variant over seeds: PSNR in dB by split, milliseconds per iteration, effects that were on."""
+    """Result of a variant over seeds: PSNR in dB by split, milliseconds per iteration, effects that
+    were on."""
 
     psnr: Mapping[str, Spread]
     pace: Spread
@@ -58,7 +62,8 @@ class Outcome:
 
 
 def derive(root: Path, folder: Path, keep: Callable[[str, dict[str, Any]], bool]) -> Path:
-    """A capture of those frames of another that `keep(split, frame)` chooses; its files are links."""
+    """A capture of those frames of another that `keep(split, frame)` chooses; its files are
+    links."""
     folder.mkdir(parents=True, exist_ok=True)
     for item in root.resolve().iterdir():
         if not item.name.startswith("transforms") and not (folder / item.name).exists():
@@ -79,25 +84,35 @@ def uneven(root: Path, folder: Path) -> Path:
     for number, frame in enumerate(document["frames"]):
         gain = np.random.default_rng(frame["camera_index"]).uniform(0.9, 1.1, 3)
         image = np.asarray(Image.open(root / frame["file_path"]).convert("RGB"), np.float32)
-        cover = np.asarray(Image.open(root / frame["fg_mask_path"]).convert("L"), np.float32)[..., None] / 255
+        cover = (
+            np.asarray(Image.open(root / frame["fg_mask_path"]).convert("L"), np.float32)[..., None]
+            / 255
+        )
         image *= 1 + cover * (gain - 1)  # the background was replaced after recording
         frame["file_path"] = f"uneven_{number:05d}.png"
-        Image.fromarray(np.clip(image + 0.5, 0, 255).astype(np.uint8)).save(folder / frame["file_path"])
+        Image.fromarray(np.clip(image + 0.5, 0, 255).astype(np.uint8)).save(
+            folder / frame["file_path"]
+        )
     path.write_text(json.dumps(document), "utf-8")
     return folder
 
 
 def captures(root: Path, folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Name -> folder: the capture itself, one timestep of it, one camera of it, and with unlike cameras."""
+    """Name -> folder: the capture itself, one timestep of it, one camera of it, and with unlike
+    cameras."""
     frames = json.loads((root / "transforms_train.json").read_text("utf-8"))["frames"]
     first = min(frame["timestep_index"] for frame in frames)
     cameras = sorted({frame["camera_index"] for frame in frames})
     middle = cameras[len(cameras) // 2]
     made: dict[str, Callable[[], Path]] = {
         "full": lambda: root,
-        "static": lambda: derive(root, folder / "static", lambda split, frame: frame["timestep_index"] == first),
+        "static": lambda: derive(
+            root, folder / "static", lambda split, frame: frame["timestep_index"] == first
+        ),
         "one-camera": lambda: derive(
-            root, folder / "one-camera", lambda split, frame: split != "train" or frame["camera_index"] == middle
+            root,
+            folder / "one-camera",
+            lambda split, frame: split != "train" or frame["camera_index"] == middle,
         ),
         "uneven": lambda: uneven(root, folder / "uneven"),
     }
@@ -107,36 +122,69 @@ def captures(root: Path, folder: Path, names: Sequence[str]) -> dict[str, Path]:
 def possible(capture: Capture, iterations: int) -> list[str]:
     """The effects that can be on."""
     facts = CaptureFacts(capture, make_settings(iterations=iterations))
-    looked = {effect.name: RULES[effect.name](facts) for effect in EFFECTS.values() if effect.name not in LEFT_TO_AUTO}
-    return [name for name, verdict in looked.items() if verdict is not None and (verdict.on or not verdict.fixed)]
+    looked = {
+        effect.name: RULES[effect.name](facts)
+        for effect in EFFECTS.values()
+        if effect.name not in LEFT_TO_AUTO
+    }
+    return [
+        name
+        for name, verdict in looked.items()
+        if verdict is not None and (verdict.on or not verdict.fixed)
+    ]
 
 
 def trained(
-    capture: Capture, flame: Path | None, iterations: int, choices: Choices, seed: int = 0, matched: bool = False
+    capture: Capture,
+    flame: Path | None,
+    iterations: int,
+    choices: Choices,
+    seed: int = 0,
+    matched: bool = False,
 ) -> tuple[Capture, dict[str, float], float, str]:
-    """The capture as it was refined, PSNR by split, milliseconds of an iteration, and the effects that were on."""
-    settings, plan = plan_effects(capture, make_settings(iterations=iterations, seed=seed, effects=choices))
+    """The capture as it was refined, PSNR by split, milliseconds of an iteration, and the effects
+    that were on."""
+    settings, plan = plan_effects(
+        capture, make_settings(iterations=iterations, seed=seed, effects=choices)
+    )
     with tempfile.TemporaryDirectory() as folder:
-        avatar = read_avatar(train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan)))
+        avatar = read_avatar(
+            train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan))
+        )
         seconds = read_metrics(Path(folder))[-1]["seconds"]
         shown = with_refined_tracking(capture, Path(folder))
     splits = [split for split in ("val", "test") if shown.views.get(split)]
     psnr = {split: evaluate_avatar(avatar, shown, split, matched=matched).psnr for split in splits}
-    return shown, psnr, 1000 * seconds / iterations, ", ".join(decision.effect for decision in plan if decision.on)
+    return (
+        shown,
+        psnr,
+        1000 * seconds / iterations,
+        ", ".join(decision.effect for decision in plan if decision.on),
+    )
 
 
 def compare(
-    capture: Capture, flame: Path | None, iterations: int, seeds: int, variants: Mapping[str, Choices]
+    capture: Capture,
+    flame: Path | None,
+    iterations: int,
+    seeds: int,
+    variants: Mapping[str, Choices],
 ) -> dict[str, Outcome]:
     """Variant -> its result."""
     found: dict[str, list[tuple[dict[str, float], float, str]]] = {name: [] for name in variants}
     for seed in range(seeds):
         for name in random.Random(seed).sample(list(variants), len(variants)):
-            # Exposure matched for all variants, so that those with and without the effect `exposure` compare.
-            _, psnr, pace, on = trained(capture, flame, iterations, variants[name], seed, matched=True)
+            # Exposure matched for all variants, so that those with and without the effect
+            # `exposure` compare.
+            _, psnr, pace, on = trained(
+                capture, flame, iterations, variants[name], seed, matched=True
+            )
             found[name].append((psnr, pace, on))
             scores = ", ".join(f"{split} {value:.2f} dB" for split, value in psnr.items())
-            print(f"{capture.root.name}, {name}, seed {seed}: {scores}, {pace:.1f} ms: {on}", file=sys.stderr)
+            print(
+                f"{capture.root.name}, {name}, seed {seed}: {scores}, {pace:.1f} ms: {on}",
+                file=sys.stderr,
+            )
     return {name: _outcome(runs) for name, runs in found.items()}
 
 
@@ -146,7 +194,9 @@ def _outcome(runs: Sequence[tuple[dict[str, float], float, str]]) -> Outcome:
 
 
 def cell(value: Spread, decimals: int) -> str:
-    return f"{value.mean:.{decimals}f}" + (f" ± {value.spread:.{decimals}f}" if value.count > 1 else "")
+    return f"{value.mean:.{decimals}f}" + (
+        f" ± {value.spread:.{decimals}f}" if value.count > 1 else ""
+    )
 
 
 def row(*cells: str) -> None:
@@ -154,7 +204,9 @@ def row(*cells: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", type=Path)
     parser.add_argument("--flame", type=Path)
     parser.add_argument("--iterations", type=int, default=500)
@@ -176,12 +228,23 @@ def main() -> None:
 
 def auto_and_all(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
     """One row per capture: is the automatic plan as good as all effects?"""
-    row("capture", "Auto, val", "all on, val", "Δ", "Auto, ms", "all on, ms", "Auto is right", "only by all on")
+    row(
+        "capture",
+        "Auto, val",
+        "all on, val",
+        "Δ",
+        "Auto, ms",
+        "all on, ms",
+        "Auto is right",
+        "only by all on",
+    )
     row(*["---"] * 8)
     for name, capture in opened.items():
         everything = dict.fromkeys(possible(capture, options.iterations), "on")
         variants: dict[str, Choices] = {"Auto": {}, "all on": everything}
-        auto, every = compare(capture, options.flame, options.iterations, options.seeds, variants).values()
+        auto, every = compare(
+            capture, options.flame, options.iterations, options.seeds, variants
+        ).values()
         difference = auto.psnr["val"].mean - every.psnr["val"].mean
         more = [effect for effect in every.on.split(", ") if effect not in auto.on.split(", ")]
         right = not more or (difference > -MAX_LOSS_DB and auto.pace.mean < every.pace.mean)
@@ -195,9 +258,15 @@ def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
     """One row per effect: quality and time without it."""
     for name, capture in opened.items():
         everything = dict.fromkeys(possible(capture, options.iterations), "on")
-        variants = {effect: {**everything, effect: "off"} for effect in everything if changes(effect)}
+        variants = {
+            effect: {**everything, effect: "off"} for effect in everything if changes(effect)
+        }
         outcomes = compare(
-            capture, options.flame, options.iterations, options.seeds, {"all on": everything, **variants, "Auto": {}}
+            capture,
+            options.flame,
+            options.iterations,
+            options.seeds,
+            {"all on": everything, **variants, "Auto": {}},
         )
         every = outcomes["all on"]
         row(f"{name}, without", "val", "Δ", "ms", "saved")
@@ -206,7 +275,13 @@ def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
             difference = outcome.psnr["val"].mean - every.psnr["val"].mean
             saved = every.pace.mean - outcome.pace.mean
             title = {"all on": "none: all on", "Auto": "(Auto)"}.get(variant, f"`{variant}`")
-            row(title, cell(outcome.psnr["val"], 2), f"{difference:+.2f}", cell(outcome.pace, 1), f"{saved:+.1f}")
+            row(
+                title,
+                cell(outcome.psnr["val"], 2),
+                f"{difference:+.2f}",
+                cell(outcome.pace, 1),
+                f"{saved:+.1f}",
+            )
 
 
 def changes(effect: str) -> bool:
@@ -221,15 +296,22 @@ def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
     row(*["---"] * 6)
     for name, capture in opened.items():
         _, plan = plan_effects(capture, make_settings(iterations=options.iterations, effects={}))
-        decided = {decision.effect: f"{'on' if decision.on else 'off'}: {decision.reason}" for decision in plan}
+        decided = {
+            decision.effect: f"{'on' if decision.on else 'off'}: {decision.reason}"
+            for decision in plan
+        }
         for effect in options.switch:
             variants = {choice: {effect: choice} for choice in ("on", "off")}
-            on, off = compare(capture, options.flame, options.iterations, options.seeds, variants).values()
+            on, off = compare(
+                capture, options.flame, options.iterations, options.seeds, variants
+            ).values()
             gains = [
                 f"{on.psnr[split].mean - off.psnr[split].mean:+.2f}" if split in on.psnr else ""
                 for split in ("val", "test")
             ]
-            row(name, f"`{effect}`", decided[effect], *gains, f"{on.pace.mean - off.pace.mean:+.1f}")
+            row(
+                name, f"`{effect}`", decided[effect], *gains, f"{on.pace.mean - off.pace.mean:+.1f}"
+            )
 
 
 if __name__ == "__main__":

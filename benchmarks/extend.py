@@ -1,14 +1,19 @@
-"""Compares ways to extend an avatar by a take, and to refine a region of it, at equal training time.
+"""Compares ways to extend an avatar by a take, and to refine a region of it, at equal training
+time.
 
-    python benchmarks/extend.py CAPTURE [--flame FILE] [--base 1500] [--seconds 60] [--seeds 0 1 2] [--refine mouth]
-                                [--arms extend all-in-turn anew refine] [--parent RUN] [--report FILE]
+    python benchmarks/extend.py CAPTURE [--flame FILE] [--base 1500] [--seconds 60] [--seeds 0 1 2]
+    [--refine mouth]
+                                [--arms extend all-in-turn anew refine] [--parent RUN] [--report
+                                FILE]
 
-The training timesteps are split into two takes, alternating by how much of the face moves. An avatar is trained on the
-first; each arm then continues it for the same time, but training anew on both takes has three times as long. With
---refine, arms that train this region of the same avatar follow; --parent refines a finished run instead. PSNR of
-held-out views in dB: whole image and moving region of the old and the new take, and the region. Ends with a table of
-all seeds and the differences that matter. --clock cpu counts processor time, for a machine that others use: set
-NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first take is not repeated.
+The training timesteps are split into two takes, alternating by how much of the face moves. An
+avatar is trained on the first; each arm then continues it for the same time, but training anew on
+both takes has three times as long. With --refine, arms that train this region of the same avatar
+follow; --parent refines a finished run instead. PSNR of held-out views in dB: whole image and
+moving region of the old and the new take, and the region. Ends with a table of all seeds and the
+differences that matter. --clock cpu counts processor time, for a machine that others use: set
+NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first take is
+not repeated.
 """
 
 import argparse
@@ -61,7 +66,8 @@ CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "cpu": time
 
 @dataclass(frozen=True)
 class Arm:
-    """A way to go on: settings, which views, and which splats. anew: with new splats instead of the avatar's."""
+    """A way to go on: settings, which views, and which splats. anew: with new splats instead of the
+    avatar's."""
 
     settings: TrainingSettings
     views: Iterator[View]
@@ -70,18 +76,29 @@ class Arm:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", type=Path)
     parser.add_argument("--flame", type=Path)
     parser.add_argument("--base", type=int, default=1500, help="iterations on the first take")
     parser.add_argument("--seconds", type=float, default=60.0, help="time of each arm")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--refine", metavar="REGION", help="compare refinements of this region, too")
-    parser.add_argument("--parent", type=Path, metavar="RUN", help="a finished run to refine, instead of extending one")
+    parser.add_argument(
+        "--refine", metavar="REGION", help="compare refinements of this region, too"
+    )
+    parser.add_argument(
+        "--parent",
+        type=Path,
+        metavar="RUN",
+        help="a finished run to refine, instead of extending one",
+    )
     parser.add_argument("--arms", nargs="+", help="only these (names as in the table)")
     parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     parser.add_argument("--folder", type=Path, default=Path("out/extend"))
-    parser.add_argument("--report", type=Path, help="also write the tables of all seeds into this file")
+    parser.add_argument(
+        "--report", type=Path, help="also write the tables of all seeds into this file"
+    )
     options = parser.parse_args()
     if options.parent is not None and options.refine is None:
         parser.error("--parent needs --refine")
@@ -92,42 +109,67 @@ def main() -> None:
         for kind, prepared, arms in comparisons(options, seed):
             for name, arm in arms.items():
                 if not options.arms or name in options.arms:
-                    runs.setdefault(kind, {}).setdefault(name, []).append(compare(name, prepared, arm, options))
-    report = "\n\n".join("\n".join([*table(of_kind), "", *differences(of_kind)]) for of_kind in runs.values())
+                    runs.setdefault(kind, {}).setdefault(name, []).append(
+                        compare(name, prepared, arm, options)
+                    )
+    report = "\n\n".join(
+        "\n".join([*table(of_kind), "", *differences(of_kind)]) for of_kind in runs.values()
+    )
     print(f"\n{report}")
     if options.report is not None:
         options.report.write_text(report + "\n", encoding="utf-8")
 
 
-def comparisons(options: argparse.Namespace, seed: int) -> Iterator[tuple[str, Prepared, dict[str, Arm]]]:
-    """What is compared with one seed: "extend" and, where a region is given, "refine"; the arms of each."""
+def comparisons(
+    options: argparse.Namespace, seed: int
+) -> Iterator[tuple[str, Prepared, dict[str, Arm]]]:
+    """What is compared with one seed: "extend" and, where a region is given, "refine"; the arms of
+    each."""
     parent, unused = options.parent, options.folder / "unused"
     if parent is None:
-        old, new = split_takes(options.capture, options.flame, options.folder / options.capture.name)
+        old, new = split_takes(
+            options.capture, options.flame, options.folder / options.capture.name
+        )
         parent = trained(old, options, seed)
         extend = Extend(unused, parent, (new,), seconds=options.seconds, seed=seed, device="cpu")
         prepared = prepare(extend, ignore, print)
-        settings, plan = add_effects(prepared.capture, prepared.run.settings, prepared.run.effect_plan)
+        settings, plan = add_effects(
+            prepared.capture, prepared.run.settings, prepared.run.effect_plan
+        )
         prepared = replace(prepared, run=replace(prepared.run, settings=settings, effect_plan=plan))
         yield "extend", prepared, extend_arms(prepared, seed)
     if options.refine:
         refine = Refine(
-            options.folder / "unused", parent, options.refine, seconds=options.seconds, seed=seed, device="cpu"
+            options.folder / "unused",
+            parent,
+            options.refine,
+            seconds=options.seconds,
+            seed=seed,
+            device="cpu",
         )
         prepared = prepare(refine, ignore, print)
         yield "refine", prepared, refine_arms(prepared, seed)
 
 
 def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Path]:
-    """Two captures with every other training timestep each; their files are links into the whole one."""
+    """Two captures with every other training timestep each; their files are links into the whole
+    one."""
     capture = open_capture(root, flame)
     timesteps = sorted({view.timestep for view in capture.views["train"]})
     selection = select_capture(capture, SelectionOptions())
     ranked = sorted(timesteps, key=lambda timestep: selection[timestep].mean())
     first, second = ranked[::2], ranked[1::2]
     return (
-        derive(root, folder / "old", lambda split, frame: split != "test" and frame["timestep_index"] in first),
-        derive(root, folder / "new", lambda split, frame: split != "test" and frame["timestep_index"] in second),
+        derive(
+            root,
+            folder / "old",
+            lambda split, frame: split != "test" and frame["timestep_index"] in first,
+        ),
+        derive(
+            root,
+            folder / "new",
+            lambda split, frame: split != "test" and frame["timestep_index"] in second,
+        ),
     )
 
 
@@ -146,23 +188,37 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     """Name -> arm."""
     assert prepared.run.continuation is not None
     assert prepared.selection is not None
-    settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
+    settings, continuation, capture = (
+        prepared.run.settings,
+        prepared.run.continuation,
+        prepared.capture,
+    )
     parent = read_run(continuation.parent).settings
-    before: dict[str, Any] = {"strain_color": parent.strain_color, "driven_offsets": parent.driven_offsets}
-    now: dict[str, Any] = {"strain_color": settings.strain_color, "driven_offsets": settings.driven_offsets}
+    before: dict[str, Any] = {
+        "strain_color": parent.strain_color,
+        "driven_offsets": parent.driven_offsets,
+    }
+    now: dict[str, Any] = {
+        "strain_color": settings.strain_color,
+        "driven_offsets": settings.driven_offsets,
+    }
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]
     union, every = np.any(list(prepared.selection.values()), axis=0), GlobalStrategy()
     arms = {
-        "extend": Arm(settings, continued_order(continuation, capture, None, seed), ExtendStrategy(union)),
+        "extend": Arm(
+            settings, continued_order(continuation, capture, None, seed), ExtendStrategy(union)
+        ),
         "all-in-turn": Arm(settings, alternating(old, new, seed), every),
         "all-replay": Arm(settings, continued_order(continuation, capture, None, seed), every),
         "all-new-only": Arm(settings, view_order(new, 1, seed), every),
         "anew": Arm(replace(parent, **now), view_order(views, 1, seed), every, anew=True),
     }
     if now != before:
-        arms["all-in-turn-plain"] = Arm(replace(settings, **before), alternating(old, new, seed), every)
+        arms["all-in-turn-plain"] = Arm(
+            replace(settings, **before), alternating(old, new, seed), every
+        )
     return arms
 
 
@@ -170,15 +226,28 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     """Name -> arm."""
     assert prepared.run.continuation is not None
     assert prepared.selection is not None
-    settings, continuation, capture = prepared.run.settings, prepared.run.continuation, prepared.capture
+    settings, continuation, capture = (
+        prepared.run.settings,
+        prepared.run.continuation,
+        prepared.capture,
+    )
     region = np.any(list(prepared.selection.values()), axis=0)
-    base = Trainer(capture, settings, prepared.selection, starting_state(continuation, settings, len(capture.faces)))
+    base = Trainer(
+        capture,
+        settings,
+        prepared.selection,
+        starting_state(continuation, settings, len(capture.faces)),
+    )
     share = float(region[base.state.face].mean())
     grown = replace(settings, growth=share, density_interval=DENSITY_INTERVAL)
     every = view_order(capture.views["train"], 1, seed)
     return {
-        "refine": Arm(settings, continued_order(continuation, capture, region, seed), base.strategy),
-        "refine-grown": Arm(grown, continued_order(continuation, capture, region, seed), base.strategy),
+        "refine": Arm(
+            settings, continued_order(continuation, capture, region, seed), base.strategy
+        ),
+        "refine-grown": Arm(
+            grown, continued_order(continuation, capture, region, seed), base.strategy
+        ),
         "all": Arm(settings, every, GlobalStrategy()),
     }
 
@@ -195,7 +264,11 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     """Train one arm; returns and prints its quality before, during and after."""
     assert prepared.run.continuation is not None
     capture, clock = prepared.capture, CLOCKS[options.clock]
-    state = None if arm.anew else starting_state(prepared.run.continuation, arm.settings, len(prepared.capture.faces))
+    state = (
+        None
+        if arm.anew
+        else starting_state(prepared.run.continuation, arm.settings, len(prepared.capture.faces))
+    )
     trainer = Trainer(capture, arm.settings, prepared.selection or {}, state)
     trainer.strategy = arm.strategy
     region = arm_region(prepared)
@@ -206,12 +279,23 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     lines: list[Line] = []
     red, green, blue = (round(255 * level) for level in arm.settings.background)
     prepare = image_preparation(capture, arm.settings)
-    with ViewLoader(arm.views, background=(red, green, blue), prepare=prepare, mesh=capture.mesh) as loader:
+    with ViewLoader(
+        arm.views, background=(red, green, blue), prepare=prepare, mesh=capture.mesh
+    ) as loader:
         while True:
             if spent >= due:
                 share = min(1.0, spent / budget) if arm.anew else 1.0
-                quality = evaluate(partial(trainer.render, progress=share), evaluation_views, exposure=exposure)
-                lines.append({"arm": name, "seconds": spent, "iterations": trainer.iteration, **quality.as_json()})
+                quality = evaluate(
+                    partial(trainer.render, progress=share), evaluation_views, exposure=exposure
+                )
+                lines.append(
+                    {
+                        "arm": name,
+                        "seconds": spent,
+                        "iterations": trainer.iteration,
+                        **quality.as_json(),
+                    }
+                )
                 print(describe(lines[-1]), flush=True)
                 if spent >= budget:
                     break
@@ -221,7 +305,10 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
             trainer.step(view, image, min(1.0, spent / budget), mask, mesh)
             spent += clock() - begin
     with (options.folder / f"{options.capture.name}.jsonl").open("a", encoding="utf-8") as out:
-        out.writelines(json.dumps({**line, "seed": arm.settings.seed, "clock": options.clock}) + "\n" for line in lines)
+        out.writelines(
+            json.dumps({**line, "seed": arm.settings.seed, "clock": options.clock}) + "\n"
+            for line in lines
+        )
     return lines
 
 
@@ -234,18 +321,24 @@ def arm_region(prepared: Prepared) -> np.ndarray | None:
 
 def describe(line: dict[str, float]) -> str:
     """One row of the table."""
-    figures = "  ".join(f"{name} {line[f'psnr_{name}']:.2f}" for name in FIGURES if f"psnr_{name}" in line)
+    figures = "  ".join(
+        f"{name} {line[f'psnr_{name}']:.2f}" for name in FIGURES if f"psnr_{name}" in line
+    )
     return f"{line['arm']:20} {line['seconds']:6.1f} s {line['iterations']:5d} it  all {line['psnr']:.2f}  {figures}"
 
 
 def table(runs: dict[str, list[list[Line]]]) -> list[str]:
-    """Markdown: PSNR at the end of each arm, mean ± standard deviation over seeds, and the seconds to two levels.
+    """Markdown: PSNR at the end of each arm, mean ± standard deviation over seeds, and the seconds
+    to two levels.
 
-    *same*: until the moving region of the new take (or the region) is as good as all-in-turn (or all) leaves it.
-    *98 %*: until both takes together reach 98 % of the PSNR that training anew ends with.
+    *same*: until the moving region of the new take (or the region) is as good as all-in-turn (or
+    all) leaves it. *98 %*: until both takes together reach 98 % of the PSNR that training anew ends
+    with.
     """
     figures = [name for name in FIGURES if f"psnr_{name}" in next(iter(runs.values()))[0][-1]]
-    measured, rival = ("psnr_region", "all") if "region" in figures else ("psnr_moving_take_2", "all-in-turn")
+    measured, rival = (
+        ("psnr_region", "all") if "region" in figures else ("psnr_moving_take_2", "all-in-turn")
+    )
     goals = {"98 %": ("psnr", runs.get("anew"), 0.98)}
     if measured.removeprefix("psnr_") in figures:
         goals = {"same": (measured, runs.get(rival), 1.0), **goals}
@@ -255,24 +348,37 @@ def table(runs: dict[str, list[list[Line]]]) -> list[str]:
         rows.append(["before", "", "", *before, *("" for _ in goals)])
     for arm, of_seeds in runs.items():
         ends = [lines[-1] for lines in of_seeds]
-        count, seconds = (np.mean([end[name] for end in ends]) for name in ("iterations", "seconds"))
+        count, seconds = (
+            np.mean([end[name] for end in ends]) for name in ("iterations", "seconds")
+        )
         row = [arm, f"{count:.0f}", f"{1000 * seconds / count:.0f}"]
         row += [spread([end[f"psnr_{name}"] for end in ends]) for name in figures]
         for quality, others, share in goals.values():
             pairs = zip(of_seeds, others or [], strict=False)
-            row.append(spread([time_to(lines, quality, share * other[-1][quality]) for lines, other in pairs], 1))
+            row.append(
+                spread(
+                    [time_to(lines, quality, share * other[-1][quality]) for lines, other in pairs],
+                    1,
+                )
+            )
         rows.append(row)
     rows.insert(1, ["---"] * len(rows[0]))
     return ["| " + " | ".join(row) + " |" for row in rows]
 
 
 def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
-    """What each arm gains in the new take beside what it pays in the old one, and how long the continuation takes."""
+    """What each arm gains in the new take beside what it pays in the old one, and how long the
+    continuation takes."""
     found = gains_and_costs(runs) if "extend" in runs else []
     if {"extend", "anew"} <= set(runs):
         pairs = list(zip(runs["extend"], runs["anew"], strict=True))
-        shares = [time_to(lines, "psnr", 0.98 * anew[-1]["psnr"]) / anew[-1]["seconds"] for lines, anew in pairs]
-        found.append(f"- 98 % of the PSNR of anew: after {spread([100 * share for share in shares], 1)} % of its time")
+        shares = [
+            time_to(lines, "psnr", 0.98 * anew[-1]["psnr"]) / anew[-1]["seconds"]
+            for lines, anew in pairs
+        ]
+        found.append(
+            f"- 98 % of the PSNR of anew: after {spread([100 * share for share in shares], 1)} % of its time"
+        )
     for name, of_seeds in runs.items():
         if "refine" in name and "psnr_region" in of_seeds[0][-1]:
             gains = [lines[-1]["psnr_region"] - lines[0]["psnr_region"] for lines in of_seeds]
@@ -281,15 +387,18 @@ def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
 
 
 def gains_and_costs(runs: dict[str, list[list[Line]]]) -> list[str]:
-    """Markdown: change of PSNR in dB from the avatar before to the end of each arm, the new take beside the old one."""
+    """Markdown: change of PSNR in dB from the avatar before to the end of each arm, the new take
+    beside the old one."""
     titles = {"take_2": "new take", "moving_take_2": "where it moves", "take_1": "old take"}
     titles["moving_take_1"] = titles["moving_take_2"]
     figures = [name for name in titles if f"psnr_{name}" in runs["extend"][0][-1]]
     rows = [["over before", *(titles[name] for name in figures)], ["---"] * (1 + len(figures))]
     for arm, of_seeds in runs.items():
-        pairs = list(zip(of_seeds, runs["extend"], strict=True))  # its first line is of the avatar before
+        # its first line is of the avatar before
+        pairs = list(zip(of_seeds, runs["extend"], strict=True))
         changes = [
-            [lines[-1][f"psnr_{figure}"] - before[0][f"psnr_{figure}"] for lines, before in pairs] for figure in figures
+            [lines[-1][f"psnr_{figure}"] - before[0][f"psnr_{figure}"] for lines, before in pairs]
+            for figure in figures
         ]
         rows.append([arm, *(spread(values, signed=True) for values in changes)])
     return [*("| " + " | ".join(row) + " |" for row in rows), ""]
@@ -306,7 +415,8 @@ def spread(values: list[float], digits: int = 2, signed: bool = False) -> str:
 
 
 def time_to(lines: list[Line], quality: str, level: float) -> float:
-    """Seconds until the quality is first reached, between two evaluations by interpolation; infinite if never."""
+    """Seconds until the quality is first reached, between two evaluations by interpolation;
+    infinite if never."""
     for before, after in pairwise(lines):
         low, high = before[quality], after[quality]
         if high >= level:

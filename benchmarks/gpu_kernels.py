@@ -29,7 +29,8 @@ _PER_RESOLVE = 32
 
 
 class KernelTimes:
-    """Times what is recorded for a device while this is its `kernel_times`, each dispatch in a pass of its own."""
+    """Times what is recorded for a device while this is its `kernel_times`, each dispatch in a pass
+    of its own."""
 
     def __init__(self, gpu: Any) -> None:
         """gpu: `Device.gpu`. Raises ValueError where the adapter has no timestamps."""
@@ -78,7 +79,8 @@ def wait(device: Device) -> None:
 
 
 def queued_ms(backend: GpuBackend, repeats: int, batch: Batch) -> float:
-    """Mean wall time in milliseconds of iterations that follow each other without waiting, after five of them."""
+    """Mean wall time in milliseconds of iterations that follow each other without waiting, after
+    five of them."""
     for count in (5, repeats):
         wait(backend.device)
         begin = perf_counter()
@@ -89,9 +91,11 @@ def queued_ms(backend: GpuBackend, repeats: int, batch: Batch) -> float:
 
 
 def host_ms(backend: GpuBackend, batch: Batch, repeats: int) -> tuple[float, float]:
-    """Median CPU time in milliseconds that the host's thread takes for an iteration: without the submit, and in it.
+    """Median CPU time in milliseconds that the host's thread takes for an iteration: without the
+    submit, and in it.
 
-    Of an idle device. Software Vulkan computes in the submit, so that only a tiny image shows what the latter costs.
+    Of an idle device. Software Vulkan computes in the submit, so that only a tiny image shows what
+    the latter costs.
     """
     queue, inside = backend.device.gpu.queue, 0.0
     submit = queue.submit
@@ -117,7 +121,9 @@ def host_ms(backend: GpuBackend, batch: Batch, repeats: int) -> tuple[float, flo
 def tiny(batch: Batch) -> Batch:
     """The same view as an image of 16 × 16 pixels."""
     camera = replace(batch.view.camera, width=16, height=16)
-    return replace(batch, view=replace(batch.view, camera=camera), target=batch.target[:16, :16].copy())
+    return replace(
+        batch, view=replace(batch.view, camera=camera), target=batch.target[:16, :16].copy()
+    )
 
 
 def copy_bandwidth(device: Device) -> float:
@@ -136,7 +142,8 @@ def copy_bandwidth(device: Device) -> float:
 
 
 def least_bytes(splats: int, pixels: int, tiles: int, pairs: int) -> dict[str, int]:
-    """kernel -> bytes that it must move at least in a global iteration; kernels without large arrays are left out."""
+    """kernel -> bytes that it must move at least in a global iteration; kernels without large
+    arrays are left out."""
     row, projected = 4 * SPLAT_WORDS, 4 * PROJECTED
     sorted_keys = splats * -(-32 // DIGIT_BITS) + pairs * -(-tiles.bit_length() // DIGIT_BITS)
     return {
@@ -157,7 +164,8 @@ def least_bytes(splats: int, pixels: int, tiles: int, pairs: int) -> dict[str, i
 
 
 def kernel_table(backend: GpuBackend, batch: Batch, repeats: int) -> dict[str, float]:
-    """Print each kernel's time beside its floor, and what an iteration asks of the host; returns milliseconds."""
+    """Print each kernel's time beside its floor, and what an iteration asks of the host; returns
+    milliseconds."""
     device, camera = backend.device, batch.view.camera
     if device.is_software:
         print("This adapter is a CPU: its times say nothing of a GPU's")
@@ -173,7 +181,9 @@ def kernel_table(backend: GpuBackend, batch: Batch, repeats: int) -> dict[str, f
         f"host thread: {recording:.2f} ms of CPU time to upload and record an iteration; {submitting:.2f} in the submit"
     )
     _, submitting = host_ms(backend, tiny(batch), repeats)
-    print(f"of an image of 16 × 16 pixels, which leaves next to nothing to compute: {submitting:.2f} ms in the submit")
+    print(
+        f"of an image of 16 × 16 pixels, which leaves next to nothing to compute: {submitting:.2f} ms in the submit"
+    )
     print(f"buffers: {device.bytes / 2**20:.0f} MiB")
     backend.step(batch)
     wait(device)

@@ -1,16 +1,20 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
-    python benchmarks/iteration.py [--head ellipsoid] [--device gpu] [--splats 60000] [--width 802] [--height 550]
-                                   [--repeats 30] [--opensplat FOLDER] [--processor-time] [--out FILE.json]
+    python benchmarks/iteration.py [--head ellipsoid] [--device gpu] [--splats 60000] [--width 802]
+    [--height 550]
+                                   [--repeats 30] [--opensplat FOLDER] [--processor-time] [--out
+                                   FILE.json]
 
-Splats of SH degree 3 on the bundled head (23,400 triangles, denser at eyes and mouth, as heads are), or on an evenly
-covered ellipsoid, for which a selection costs most. On the CPU: the instruction set, and medians over repeats in one
-process; beside each stage the bytes it must at least move and the time that takes at this machine's measured copy
-bandwidth, and for the image loss its arithmetic at the measured rate of multiply-adds. On a GPU, whose queue is never
-waited for: means over all repeats, the same table by kernel, the dispatches, submits, waits and milliseconds that an
-iteration takes of the host, and the device's memory. --opensplat: a checkout of OpenSplat, whose CPU rasterizer is
-compiled and run on the same splats. Run it on an idle machine, or with --processor-time: instead of time that passes,
-that of the processor, of ours divided by its threads.
+Splats of SH degree 3 on the bundled head (23,400 triangles, denser at eyes and mouth, as heads
+are), or on an evenly covered ellipsoid, for which a selection costs most. On the CPU: the
+instruction set, and medians over repeats in one process; beside each stage the bytes it must at
+least move and the time that takes at this machine's measured copy bandwidth, and for the image loss
+its arithmetic at the measured rate of multiply-adds. On a GPU, whose queue is never waited for:
+means over all repeats, the same table by kernel, the dispatches, submits, waits and milliseconds
+that an iteration takes of the host, and the device's memory. --opensplat: a checkout of OpenSplat,
+whose CPU rasterizer is compiled and run on the same splats. Run it on an idle machine, or with
+--processor-time: instead of time that passes, that of the processor, of ours divided by its
+threads.
 """
 
 import argparse
@@ -47,7 +51,13 @@ from stga_addon.raster.cpu.rasterize import (
     with_strain_color,
 )
 from stga_addon.raster.cpu.threads import next_piece, parallel, threads
-from stga_addon.raster.cpu.tiles import SORT_PARTS, arrange_tiles, count_pairs, fill_pairs, sum_tiles
+from stga_addon.raster.cpu.tiles import (
+    SORT_PARTS,
+    arrange_tiles,
+    count_pairs,
+    fill_pairs,
+    sum_tiles,
+)
 from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch
@@ -61,8 +71,9 @@ RATES = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-9)
 
 
 LOSS_OPERATIONS = 3 * (14 * 11 + 28 + 12)
-"""Additions, multiplications, multiply-adds and the like that the image loss needs of a pixel: in each channel 14 blurs
-of 11, SSIM with its derivatives, and the rest. `tests/raster/test_assembly.py` counts them in the assembly."""
+"""Additions, multiplications, multiply-adds and the like that the image loss needs of a pixel: in
+each channel 14 blurs of 11, SSIM with its derivatives, and the rest.
+`tests/raster/test_assembly.py` counts them in the assembly."""
 
 REGIONS = {
     "bundled": ([0.031, 0.036, 0.09], [0.0, -0.034, 0.11]),
@@ -72,7 +83,8 @@ REGIONS = {
 
 
 def bundled_head(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray, np.ndarray]:
-    """`count` splats on the bundled head, sized like its triangles; with its vertices (V, 3) and faces (F, 3)."""
+    """`count` splats on the bundled head, sized like its triangles; with its vertices (V, 3) and
+    faces (F, 3)."""
     model = flame_model(None)
     vertices, faces = model.v_template, model.faces
     spacing = np.sqrt(2 * face_areas(vertices, faces)) * np.sqrt(len(faces) / count)
@@ -80,15 +92,16 @@ def bundled_head(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarr
 
 
 def ellipsoid(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray, np.ndarray]:
-    """`count` splats of one size on an ellipsoid of about 20,000 triangles; with its vertices and faces."""
+    """`count` splats of one size on an ellipsoid of about 20,000 triangles; with its vertices and
+    faces."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
     vertices, faces = sphere.vertices * [0.08, 0.11, 0.09], np.asarray(sphere.faces, np.int32)
     return _splats(count, np.full(len(faces), 0.0012), rng), vertices, faces
 
 
 def _splats(count: int, size: np.ndarray, rng: np.random.Generator) -> Splats:
-    """Splats on random triangles, in the triangles' order, as a lattice has them; size (F,): the smallest standard
-    deviation on each, meters.
+    """Splats on random triangles, in the triangles' order, as a lattice has them; size (F,): the
+    smallest standard deviation on each, meters.
     """
     face = np.sort(rng.integers(0, len(size), count)).astype(np.int32)
     sigma = size[face][:, None]
@@ -110,8 +123,11 @@ def front_camera(width: int, height: int) -> Camera:
     return Camera(width, height, 2.43 * width, 2.43 * width, width / 2, height / 2, view)
 
 
-def median_ms(work: Callable[[], object], repeats: int, clock: Callable[[], float] = perf_counter) -> float:
-    """Median time of `work` in milliseconds, after two calls that are not counted; clock: returns seconds."""
+def median_ms(
+    work: Callable[[], object], repeats: int, clock: Callable[[], float] = perf_counter
+) -> float:
+    """Median time of `work` in milliseconds, after two calls that are not counted; clock: returns
+    seconds."""
     times = []
     for _ in range(repeats + 2):
         begin = clock()
@@ -155,9 +171,15 @@ def multiply_add_rows(work, rows):
 
 
 def arithmetic_rate(clock: Callable[[], float]) -> float:
-    """Multiply-adds of single floats a second, by all threads, on values that stay in the nearest cache."""
+    """Multiply-adds of single floats a second, by all threads, on values that stay in the nearest
+    cache."""
     rows = np.full((512, 256), 0.5, np.float32)
-    return 100 * MULTIPLY_ADDS * rows.size / (median_ms(lambda: multiply_add_rows(rows), 5, clock) / 1e3)
+    return (
+        100
+        * MULTIPLY_ADDS
+        * rows.size
+        / (median_ms(lambda: multiply_add_rows(rows), 5, clock) / 1e3)
+    )
 
 
 def stages(
@@ -223,25 +245,46 @@ def stages(
 
 
 def device_step(
-    device: str, splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
+    device: str,
+    splats: Splats,
+    mesh: np.ndarray,
+    faces: np.ndarray,
+    camera: Camera,
+    target: np.ndarray,
 ) -> tuple[Backend, Batch]:
-    """A whole iteration on a device of `choose_device`, from the posed mesh's frames on, and its global batch."""
-    capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, lambda timestep: mesh, lambda timestep, zero_pose: mesh)
+    """A whole iteration on a device of `choose_device`, from the posed mesh's frames on, and its
+    global batch."""
+    capture = Capture(
+        Path(),
+        "",
+        faces,
+        mesh,
+        {},
+        (0,),
+        {},
+        lambda timestep: mesh,
+        lambda timestep, zero_pose: mesh,
+    )
     given = make_settings(iterations=1), FrameStore(capture, "stga"), new_state(splats)
     backend = make_backend(device, *given)
     view = View(0, 0, camera, "benchmark", Path())
     return backend, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
 
 
-def two_regions(splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float, head: str = "bundled") -> np.ndarray:
-    """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `share` of the splats."""
+def two_regions(
+    splats: Splats, mesh: np.ndarray, faces: np.ndarray, share: float, head: str = "bundled"
+) -> np.ndarray:
+    """(F,) bool: triangles nearest to two points on the front (an eye, the mouth), with `share` of
+    the splats."""
     center = mesh[faces].mean(1)
     away = np.minimum(*(np.linalg.norm(center - p, axis=1) for p in REGIONS[head]))
     return np.asarray(away <= np.quantile(away[splats.face], share))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu", metavar="{cpu,gpu,gpu:NAME}")
     parser.add_argument("--head", choices=tuple(REGIONS), default="bundled")
     parser.add_argument("--splats", type=int, default=60_000)
@@ -249,7 +292,9 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=550)
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--opensplat", type=Path, metavar="FOLDER")
-    parser.add_argument("--processor-time", action="store_true", help="of the CPU, for a loaded machine")
+    parser.add_argument(
+        "--processor-time", action="store_true", help="of the CPU, for a loaded machine"
+    )
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     if options.opensplat and options.device != "cpu":
@@ -268,7 +313,9 @@ def main() -> None:
         frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
         found = cpu_table(splats, frames, target, options.repeats, clock)
         if options.opensplat:
-            compare_opensplat(options.opensplat, splats, frames, target, found, options.repeats, clock)
+            compare_opensplat(
+                options.opensplat, splats, frames, target, found, options.repeats, clock
+            )
     else:
         import gpu_kernels  # needs wgpu
 
@@ -282,8 +329,12 @@ def main() -> None:
     print(f"{'whole iteration':<22}{whole:8.2f}")
     parts = {}
     for share in (0.05, 0.1, 0.2, 0.4):
-        parts[share] = measure(replace(batch, selected=two_regions(splats, mesh, faces, share, options.head)))
-        print(f"local, {share:4.0%} selected   {parts[share]:8.2f}   {parts[share] / whole:.2f} of a global one")
+        parts[share] = measure(
+            replace(batch, selected=two_regions(splats, mesh, faces, share, options.head))
+        )
+        print(
+            f"local, {share:4.0%} selected   {parts[share]:8.2f}   {parts[share] / whole:.2f} of a global one"
+        )
     if options.out:
         result = {"stages_ms": found, "global_ms": whole, "local_ms": parts}
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
@@ -295,14 +346,17 @@ def cpu_ms(backend: Backend, repeats: int, clock: Callable[[], float], batch: Ba
 
 
 def instruction_set() -> str:
-    """The processor that the kernels are compiled for, as LLVM calls it, and its vector instructions."""
+    """The processor that the kernels are compiled for, as LLVM calls it, and its vector
+    instructions."""
     features = get_host_cpu_features().split(",")
     vectors = [f[1:] for f in features if f.startswith(("+avx", "+neon", "+sve", "+fma"))]
     cpu = config.CPU_NAME  # type: ignore[attr-defined]  # read from the environment
     return f"{cpu or get_host_cpu_name()}: {' '.join(vectors)}"
 
 
-def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]) -> dict[str, float]:
+def cpu_table(
+    splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]
+) -> dict[str, float]:
     """Print the stages beside their floors; returns their times."""
     bandwidth = copy_bandwidth()
     print(f"{threads()} threads, copy {bandwidth / 1e9:.1f} GB/s, {instruction_set()}")
@@ -313,7 +367,9 @@ def cpu_table(splats: Splats, frames, target: np.ndarray, repeats: int, clock: C
         print(f"{name:<22}{ms:8.2f}{moved / 1e6:8.1f}{floor:10.2f}{ms / floor:7.1f}")
     rate, ms = arithmetic_rate(clock), found["L1 + SSIM, both ways"][0]
     floor = 1e3 * target.shape[0] * target.shape[1] * LOSS_OPERATIONS / rate
-    print(f"{rate / 1e9:.0f} billion multiply-adds a second: L1 + SSIM at least {floor:.2f} ms, ratio {ms / floor:.1f}")
+    print(
+        f"{rate / 1e9:.0f} billion multiply-adds a second: L1 + SSIM at least {floor:.2f} ms, ratio {ms / floor:.1f}"
+    )
     return {name: ms for name, (ms, _) in found.items()}
 
 
@@ -331,7 +387,9 @@ def compare_opensplat(
         return render_forward(state.parameters, face, frames, 3, background, buffers=buffers)
 
     def both_ways():
-        render_backward(forward(), state.parameters, face, frames, v_image, gradients, buffers=buffers)
+        render_backward(
+            forward(), state.parameters, face, frames, v_image, gradients, buffers=buffers
+        )
 
     output = forward()
     v_image = np.empty_like(output.image)
@@ -341,10 +399,14 @@ def compare_opensplat(
         perf_counter if clock is perf_counter else process_time,
     )  # fmt: skip
     blending = found["blend"] + found["blend backward"]
-    print(f"{'OpenSplat, both ways':<22}{peer[1]:8.2f}   forward {peer[0]:.2f}, on one thread, without projection")
+    print(
+        f"{'OpenSplat, both ways':<22}{peer[1]:8.2f}   forward {peer[0]:.2f}, on one thread, without projection"
+    )
     print(f"{'blending, both ways':<22}{blending:8.2f}   {peer[1] / blending:.1f} times as fast")
     ours = median_ms(both_ways, repeats, clock)
-    print(f"{'rendering, both ways':<22}{ours:8.2f}   {peer[1] / ours:.1f} times as fast, with projection and sorting")
+    print(
+        f"{'rendering, both ways':<22}{ours:8.2f}   {peer[1] / ours:.1f} times as fast, with projection and sorting"
+    )
 
 
 if __name__ == "__main__":

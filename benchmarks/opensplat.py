@@ -1,4 +1,5 @@
-"""OpenSplat's CPU rasterizer beside ours: the same projected splats, image and gradient of the image.
+"""OpenSplat's CPU rasterizer beside ours: the same projected splats, image and gradient of the
+image.
 
 Built from the user's own checkout of OpenSplat (AGPL), of which nothing is kept here.
 """
@@ -49,16 +50,18 @@ def both_ways_ms(
     folder: Path, projection: layout.Projection, rows: np.ndarray, image: np.ndarray, v_image: np.ndarray, repeats: int,
     clock: Callable[[], float],
 ) -> tuple[float, float]:  # fmt: skip
-    """Median milliseconds of its forward pass, and of forward and backward pass together, over a white background.
+    """Median milliseconds of its forward pass, and of forward and backward pass together, over a
+    white background.
 
-    rows (M,): the visible splats; image, v_image (3, H, W): ours and its gradient; clock: returns seconds. Raises
-    ValueError where its image is another one.
+    rows (M,): the visible splats; image, v_image (3, H, W): ours and its gradient; clock: returns
+    seconds. Raises ValueError where its image is another one.
     """
     module, (_, height, width) = build(folder), image.shape
     gradient = torch.from_numpy(np.ascontiguousarray(v_image.transpose(1, 2, 0)))
     white, splats = torch.ones(3), [torch.from_numpy(array) for array in _splats(projection, rows)]
     theirs = module.both_ways(width, height, splats, white, gradient)[0].numpy().transpose(2, 0, 1)
-    if (off := np.abs(theirs - image).mean()) > 2e-3:  # it blends pixels behind an opaque one's stop differently
+    # it blends pixels behind an opaque one's stop differently
+    if (off := np.abs(theirs - image).mean()) > 2e-3:
         raise ValueError(f"{folder}: its image differs by {off:.4f} on average")
     found = []
     for wanted in (torch.empty(0), gradient):
@@ -72,8 +75,8 @@ def both_ways_ms(
 
 
 def _splats(projection: layout.Projection, rows: np.ndarray) -> list[np.ndarray]:
-    """Center, conic, color, opacity, covariance and depth of the listed splats; its pixels have their centers at whole
-    numbers."""
+    """Center, conic, color, opacity, covariance and depth of the listed splats; its pixels have
+    their centers at whole numbers."""
     columns = projection.columns[rows]
     px, shear, py = columns[:, PRECISION_X], columns[:, SHEAR], columns[:, PRECISION_Y]
     conic = np.stack([px, -px * shear, px * shear * shear + py], 1)
@@ -82,5 +85,6 @@ def _splats(projection: layout.Projection, rows: np.ndarray) -> list[np.ndarray]
     center = columns[:, [layout.MEAN_X, layout.MEAN_Y]] - np.float32(0.5)
     color, opacity = columns[:, RED : BLUE + 1].copy(), columns[:, OPACITY, None].copy()
     return [
-        np.ascontiguousarray(array) for array in (center, conic, color, opacity, covariance, projection.depth[rows])
+        np.ascontiguousarray(array)
+        for array in (center, conic, color, opacity, covariance, projection.depth[rows])
     ]

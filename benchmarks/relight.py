@@ -1,11 +1,14 @@
-"""Relighting against path-traced truth: one avatar trained under light A, shown under lights that it never saw.
+"""Relighting against path-traced truth: one avatar trained under light A, shown under lights that
+it never saw.
 
     python benchmarks/relight.py FOLDER [FOLDER …] [--train 150s] [--folder out/relight]
 
-Each FOLDER holds `capture_A` (a capture under light A whose head never turns), `truth_A` … `truth_E` (captures of the
-same head and cameras with split "train": held-out views under each light) and `lights.json`, which says what the lights
-are (`lighting`). Light A is not given; its level is, as the colors of a gray ball. LPIPS needs STGA_LPIPS.
-Prints PSNR inside the mask / LPIPS / PSNR of eyes and mouth, and writes pictures beside the run with --pictures.
+Each FOLDER holds `capture_A` (a capture under light A whose head never turns), `truth_A` …
+`truth_E` (captures of the same head and cameras with split "train": held-out views under each
+light) and `lights.json`, which says what the lights
+are (`lighting`). Light A is not given; its level is, as the colors of a gray ball. LPIPS needs
+STGA_LPIPS. Prints PSNR inside the mask / LPIPS / PSNR of eyes and mouth, and writes pictures beside
+the run with --pictures.
 """
 
 import argparse
@@ -42,17 +45,33 @@ CARD_REFLECTANCE = 0.18
 def lighting(spec: dict, **options: object) -> Lighting:
     """Values of an entry of lights.json.
 
-    area: rows of azimuth and elevation in degrees, power in W, side in meters, color; squares 1.2 m from the origin
-    that face it. sun: azimuth, elevation, strength in W/m², angle in radians, color. world: steps of height from 0
-    (down, -y) to 1 and radiance, linear between.
+    area: rows of azimuth and elevation in degrees, power in W, side in meters, color; squares 1.2 m
+    from the origin that face it. sun: azimuth, elevation, strength in W/m², angle in radians,
+    color. world: steps of height from 0 (down, -y) to 1 and radiance, linear between.
     """
     lights = []
     for azimuth, elevation, power, side, color in spec["area"]:
         toward = direction(azimuth, elevation)
         tangent = np.cross((0, 1, 0), toward)
-        lights.append(Light("area", power * np.array(color), 1.2 * toward, -toward, size=(side, side), tangent=tangent))
+        lights.append(
+            Light(
+                "area",
+                power * np.array(color),
+                1.2 * toward,
+                -toward,
+                size=(side, side),
+                tangent=tangent,
+            )
+        )
     for azimuth, elevation, strength, angle, color in spec["sun"]:
-        lights.append(Light("sun", strength * np.array(color), direction=-direction(azimuth, elevation), angle=angle))
+        lights.append(
+            Light(
+                "sun",
+                strength * np.array(color),
+                direction=-direction(azimuth, elevation),
+                angle=angle,
+            )
+        )
     sky = even_directions(600)
     return Lighting(project(world_radiance(spec, sky), sky), tuple(lights), **options)  # type: ignore[arg-type]
 
@@ -61,7 +80,9 @@ def world_radiance(spec: dict, directions: np.ndarray) -> np.ndarray:
     """(N, 3) radiance of the world in directions (N, 3)."""
     steps, colors = zip(*spec["world"], strict=True)
     height = directions[:, 1] / 2 + 0.5
-    return np.stack([np.interp(height, steps, channel) for channel in zip(*colors, strict=True)], axis=-1)
+    return np.stack(
+        [np.interp(height, steps, channel) for channel in zip(*colors, strict=True)], axis=-1
+    )
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
@@ -70,12 +91,15 @@ def direction(azimuth: float, elevation: float) -> np.ndarray:
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
-BALL = np.array([direction(azimuth, elevation) for azimuth in (-50, 0, 50) for elevation in (-30, 0, 30)])
+BALL = np.array(
+    [direction(azimuth, elevation) for azimuth in (-50, 0, 50) for elevation in (-30, 0, 30)]
+)
 """(9, 3) normals of the gray ball that says how light the capture is."""
 
 
 def gray_ball(spec: dict) -> np.ndarray:
-    """(9, 3) linear colors of a gray ball at the origin under a light, where its normals are BALL."""
+    """(9, 3) linear colors of a gray ball at the origin under a light, where its normals are
+    BALL."""
     values = lighting(spec, shadows=False)
     far = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])  # says only where the head is
     lamps = Lamps(values, far, np.zeros((0, 3), np.int32))
@@ -92,7 +116,9 @@ class Bench:
         self.avatar = avatar
         self.specs = json.loads((folder / "lights.json").read_text())
         self.truth = {
-            name: open_capture(folder / f"truth_{name}") for name in LIGHTS if (folder / f"truth_{name}").is_dir()
+            name: open_capture(folder / f"truth_{name}")
+            for name in LIGHTS
+            if (folder / f"truth_{name}").is_dir()
         }
         self.network = load_network()
 
@@ -108,7 +134,13 @@ class Bench:
                 colors = relighter.colors(mesh, view.camera.position, values)
                 yield view, render_colors(self.avatar, mesh, view.camera, colors)
 
-    def score(self, name: str, relighter: Relighter | None, pictures: Path | None = None, **options: object):  # type: ignore[no-untyped-def]
+    def score(
+        self,
+        name: str,
+        relighter: Relighter | None,
+        pictures: Path | None = None,
+        **options: object,
+    ) -> np.ndarray:
         """Mean PSNR in the mask, LPIPS, PSNR of eyes and mouth."""
         found = []
         for view, image in self.images(name, relighter, **options):
@@ -121,9 +153,13 @@ class Bench:
             small = small_parts(self.truth[name], view) & mask
             found.append((psnr(image, target, mask), distance, psnr(image, target, small)))
             if pictures is not None:
-                pair = np.concatenate([target, np.rint(255 * image.transpose(1, 2, 0)).astype(np.uint8)], axis=1)
+                pair = np.concatenate(
+                    [target, np.rint(255 * image.transpose(1, 2, 0)).astype(np.uint8)], axis=1
+                )
                 pictures.mkdir(parents=True, exist_ok=True)
-                Image.fromarray(pair).save(pictures / f"{name}_{view.timestep}_{view.camera_index}.png")
+                Image.fromarray(pair).save(
+                    pictures / f"{name}_{view.timestep}_{view.camera_index}.png"
+                )
         return tuple(np.mean(found, axis=0))
 
 
@@ -137,13 +173,25 @@ def small_parts(capture: Capture, view: View) -> np.ndarray:
 def trained(capture: Path, run: Path, seconds: str) -> Avatar:
     """The avatar of a run, which is trained where it is missing."""
     if not (run / "avatar.npz").exists():
-        command = [sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(run), "--budget", seconds]
+        command = [
+            sys.executable,
+            "-m",
+            "stga_addon",
+            "train",
+            str(capture),
+            "--out",
+            str(run),
+            "--budget",
+            seconds,
+        ]
         subprocess.run(command, check=True)
     return read_avatar(run / "avatar.npz")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--train", default="150s", help="budget of the training under light A")
     parser.add_argument("--folder", type=Path, default=Path("out/relight"))
@@ -161,7 +209,9 @@ def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> Non
     ball = gray_ball(bench.specs["A"])
     light = estimate_light(capture, Known(card=ball, toward=BALL))
     even = estimate_light(capture, Known(radiance=uniform(ball.mean(0) / CARD_REFLECTANCE)))
-    print(f"{folder.name}: {len(avatar.splats)} splats; residual {light.residual:.3f}, damping {light.damping:.2f}")
+    print(
+        f"{folder.name}: {len(avatar.splats)} splats; residual {light.residual:.3f}, damping {light.damping:.2f}"
+    )
     relighter = Relighter(replace(avatar, light=light))
     rows: dict[str, tuple[Relighter | None, dict[str, Any]]] = {
         "as trained": (None, {}),
@@ -172,8 +222,14 @@ def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> Non
         "  without highlights": (relighter, {"specular": 0.0}),
     }
     for label, (used, values) in rows.items():
-        cells = [bench.score(name, used, pictures if label == "relit" else None, **values) for name in bench.truth]
-        parts = (f"{name} {a:5.2f}/{b:.3f}/{c:5.2f}" for name, (a, b, c) in zip(bench.truth, cells, strict=True))
+        cells = [
+            bench.score(name, used, pictures if label == "relit" else None, **values)
+            for name in bench.truth
+        ]
+        parts = (
+            f"{name} {a:5.2f}/{b:.3f}/{c:5.2f}"
+            for name, (a, b, c) in zip(bench.truth, cells, strict=True)
+        )
         print(f"{label:22s}", "  ".join(parts), flush=True)
 
 

@@ -1,10 +1,12 @@
-"""Writes docs/results.md: tables of quality, each with the version and the command that measured it.
+"""Writes docs/results.md: tables of quality, each with the version and the command that measured
+it.
 
     python benchmarks/results.py CAPTURE [--share 1] [--out docs/results.md] [--folder out/results]
 
-CAPTURE: one with a tracked mesh and the splits val and test, as `studio_head`. Takes less than 25 minutes on two
-otherwise idle cores. What was measured stays in --folder and is not measured again. --share 0.05 tries it with a
-twentieth of all budgets. STGA_LPIPS names the weights of LPIPS (docs/dependencies.md).
+CAPTURE: one with a tracked mesh and the splits val and test, as `studio_head`. Takes less than 25
+minutes on two otherwise idle cores. What was measured stays in --folder and is not measured again.
+--share 0.05 tries it with a twentieth of all budgets. STGA_LPIPS names the weights of LPIPS
+(docs/dependencies.md).
 """
 
 import argparse
@@ -45,8 +47,8 @@ PARTS = (("whole image", ""), ("head", "_mask"), ("moving", "_moving"))
 
 @dataclass(frozen=True)
 class Section:
-    """A table: its commands as they are shown, whose RUN is a folder, and what reads the table from that; note: on what
-    is compared."""
+    """A table: its commands as they are shown, whose RUN is a folder, and what reads the table from
+    that; note: on what is compared."""
 
     title: str
     commands: tuple[str, ...]
@@ -95,7 +97,9 @@ def quality_table(run: Path) -> str:
             if f"psnr{suffix}" in quality:
                 lpips = f"{quality[f'lpips{suffix}']:.4f}" if f"lpips{suffix}" in quality else ""
                 psnr, ssim = f"{quality[f'psnr{suffix}']:.2f}", f"{quality[f'ssim{suffix}']:.4f}"
-                rows.append(f"| {split}, {quality['views']} views | {name} | {psnr} | {ssim} | {lpips} |")
+                rows.append(
+                    f"| {split}, {quality['views']} views | {name} | {psnr} | {ssim} | {lpips} |"
+                )
     return "\n".join(rows)
 
 
@@ -110,7 +114,9 @@ def measure(commands: tuple[str, ...], run: Path, capture: Path) -> None:
     }
     for command in commands:
         print(command, flush=True)
-        subprocess.run([given for word in command.split() for given in meant.get(word, [word])], check=True)
+        subprocess.run(
+            [given for word in command.split() for given in meant.get(word, [word])], check=True
+        )
 
 
 def machine() -> str:
@@ -122,7 +128,9 @@ def machine() -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", type=Path)
     parser.add_argument("--share", type=float, default=1.0, help="of all budgets")
     parser.add_argument("--out", type=Path, default=Path("docs/results.md"))

@@ -1,18 +1,21 @@
 """What one iteration's time grows with: splats, pixels, the selected share and threads.
 
-    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png] [--model] [--splats 60000]
+    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png] [--model]
+    [--splats 60000]
 
-The bundled head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at 802×550, all in one
-process. More splats are smaller ones, as on a real head: their size falls with the square root of their number. Run it
-on an idle machine. Prints every figure, with the (splat, tile) pairs of the view, and draws them.
+The bundled head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at
+802×550, all in one process. More splats are smaller ones, as on a real head: their size falls with
+the square root of their number. Run it on an idle machine. Prints every figure, with the (splat,
+tile) pairs of the view, and draws them.
 
---model: instead, what more threads than this machine has would bring. The pieces that an iteration is cut into are
-timed one after the other (time of the thread, median of repeats; many short ones a few at a time) and given to N
-threads as `threads.py` does: the calling thread unpacks the arguments and begins, each of the others joins later by as
-much as two threads measurably need to meet in a kernel, one after the other, and each takes the next piece when it is
-free. Where the pause before a kernel is longer than threads look for work, they are woken: the caller wakes two, and
-each of these two more, each time as late as measured. Added is what lies between the kernels.
-Cores are taken to be alike and memory to keep up: the last column is the bandwidth that this needs.
+--model: instead, what more threads than this machine has would bring. The pieces that an iteration
+is cut into are timed one after the other (time of the thread, median of repeats; many short ones a
+few at a time) and given to N threads as `threads.py` does: the calling thread unpacks the arguments
+and begins, each of the others joins later by as much as two threads measurably need to meet in a
+kernel, one after the other, and each takes the next piece when it is free. Where the pause before a
+kernel is longer than threads look for work, they are woken: the caller wakes two, and each of these
+two more, each time as late as measured. Added is what lies between the kernels. Cores are taken to
+be alike and memory to keep up: the last column is the bandwidth that this needs.
 """
 
 import argparse
@@ -51,15 +54,19 @@ BYTES_PER_SPLAT, BYTES_PER_PAIR, BYTES_PER_PIXEL = 3_100, 140, 71
 
 @dataclass(frozen=True)
 class Point:
-    """One measurement: what was varied, median ms of an iteration, and (splat, tile) pairs in the view."""
+    """One measurement: what was varied, median ms of an iteration, and (splat, tile) pairs in the
+    view."""
 
     x: float
     ms: float
     pairs: int
 
 
-def measure(x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, share: float | None = None) -> Point:
-    """An iteration of `splats` splats at `zoom` times the image size; share: of the splats, selected; None: global."""
+def measure(
+    x: float, repeats: int, splats: int = SPLATS, zoom: float = 1.0, share: float | None = None
+) -> Point:
+    """An iteration of `splats` splats at `zoom` times the image size; share: of the splats,
+    selected; None: global."""
     rng = np.random.default_rng(0)
     head, mesh, faces = bundled_head(splats, rng)
     camera = front_camera(round(zoom * WIDTH), round(zoom * HEIGHT))
@@ -87,9 +94,16 @@ def series(repeats: int) -> dict[str, list[Point]]:
     """What was varied -> its measurements."""
     counts = (10_000, 30_000, 60_000, 100_000, 200_000, 500_000, 1_000_000)
     plans: dict[str, list[Callable[[], Point]]] = {
-        "splats": [partial(measure, n, repeats if n < 200_000 else max(3, repeats // 5), n) for n in counts],
-        "pixels": [partial(measure, z * z * WIDTH * HEIGHT, repeats, zoom=z) for z in (0.25, 0.5, 1.0, 1.5, 2.0)],
-        "selected share": [partial(measure, s, repeats, share=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)],
+        "splats": [
+            partial(measure, n, repeats if n < 200_000 else max(3, repeats // 5), n) for n in counts
+        ],
+        "pixels": [
+            partial(measure, z * z * WIDTH * HEIGHT, repeats, zoom=z)
+            for z in (0.25, 0.5, 1.0, 1.5, 2.0)
+        ],
+        "selected share": [
+            partial(measure, s, repeats, share=s) for s in (0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+        ],
         "threads": [partial(on_threads, n, repeats) for n in range(1, threads() + 1)],
     }
     found: dict[str, list[Point]] = {}
@@ -104,7 +118,8 @@ def series(repeats: int) -> dict[str, list[Point]]:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel, in milliseconds: its pieces, what it takes to call it, and the time since the kernel before."""
+    """A kernel, in milliseconds: its pieces, what it takes to call it, and the time since the
+    kernel before."""
 
     name: str
     pieces: list[float]
@@ -113,14 +128,16 @@ class Kernel:
 
 
 def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
-    """Runs an iteration on this thread, cut as for the threads that are set. Returns its kernels, in order, and what
-    lies between them, in milliseconds of this thread.
+    """Runs an iteration on this thread, cut as for the threads that are set. Returns its kernels,
+    in order, and what lies between them, in milliseconds of this thread.
     """
     found: list[Kernel] = []
     words = np.zeros(kernel_threads.FIRST_HELPER, np.int64)
     last = aside = 0.0
 
-    def one_by_one(kernel: kernel_threads.TeamKernel, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
+    def one_by_one(
+        kernel: kernel_threads.TeamKernel, units: int, piece: int, arguments: tuple[Any, ...]
+    ) -> None:
         nonlocal aside, last
         begin = thread_time()
         together = piece * -(-units // (piece * TIMED_PIECES))
@@ -135,7 +152,11 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
             kernel.call(words, 0, (np.array([0, 0, piece]), *arguments))
         call = 1e3 * (thread_time() - before) / 3
         pieces = [-(-(past - first) // piece) for first, past in spans]
-        each = [max(0.0, ms - call) / count for ms, count in zip(times, pieces, strict=True) for _ in range(count)]
+        each = [
+            max(0.0, ms - call) / count
+            for ms, count in zip(times, pieces, strict=True)
+            for _ in range(count)
+        ]
         found.append(Kernel(kernel.kernel.__name__, each, call, 1e3 * (begin - last)))
         last = thread_time()
         aside += 1e3 * (last - begin)
@@ -149,8 +170,9 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
 
 @dataclass(frozen=True)
 class Latency:
-    """Milliseconds that a thread joins a kernel later than its caller begins it: if it looks for work, what every
-    further one takes on top, and if it sleeps and is woken by a thread that joins then.
+    """Milliseconds that a thread joins a kernel later than its caller begins it: if it looks for
+    work, what every further one takes on top, and if it sleeps and is woken by a thread that joins
+    then.
     """
 
     awake: float
@@ -164,8 +186,8 @@ class Latency:
 
 
 def spans_ms(kernels: list[Kernel], count: int, latency: Latency) -> list[float]:
-    """How long each kernel of an iteration takes `count` threads, of which each takes the next piece when it is free;
-    who has waited longer than SPIN_S since its last piece sleeps.
+    """How long each kernel of an iteration takes `count` threads, of which each takes the next
+    piece when it is free; who has waited longer than SPIN_S since its last piece sleeps.
     """
     spans, waited = [], np.inf
     for kernel in kernels:
@@ -185,7 +207,8 @@ def spans_ms(kernels: list[Kernel], count: int, latency: Latency) -> list[float]
 @parallel(lambda met, *_: len(met) - 1)
 @kernel_jit
 def meet(work, met, patience):
-    """Each thread takes one unit and waits until met[0], how many have, is all of them: together, if that many came."""
+    """Each thread takes one unit and waits until met[0], how many have, is all of them: together,
+    if that many came."""
     begin, end = next_piece(work)
     while begin < end:
         fetch_add(met, 0, 1)
@@ -205,7 +228,8 @@ def take(work, count):
 
 
 def measure_latency(repeats: int) -> Latency:
-    """Measured on two threads, of the repeats the fastest tenth: on a loaded machine a thread may lack a core."""
+    """Measured on two threads, of the repeats the fastest tenth: on a loaded machine a thread may
+    lack a core."""
     pieces = 100_000
 
     def meet_ms(awake: bool) -> float:
@@ -232,7 +256,8 @@ def measure_latency(repeats: int) -> Latency:
 
 
 def model(splats: int, repeats: int) -> None:
-    """Print what an iteration would take on more threads, and of the most threads each kernel's part."""
+    """Print what an iteration would take on more threads, and of the most threads each kernel's
+    part."""
     rng = np.random.default_rng(0)
     head, mesh, faces = bundled_head(splats, rng)
     camera = front_camera(WIDTH, HEIGHT)
@@ -240,7 +265,9 @@ def model(splats: int, repeats: int) -> None:
     backend, batch = device_step("cpu", head, mesh, faces, camera, target)
     arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
     pairs = len(
-        render_forward(arrays, head.face, frames_in_camera(face_frames(mesh, faces, mesh), camera), 3).lists.pair_splat
+        render_forward(
+            arrays, head.face, frames_in_camera(face_frames(mesh, faces, mesh), camera), 3
+        ).lists.pair_splat
     )
     moved = splats * BYTES_PER_SPLAT + pairs * BYTES_PER_PAIR + WIDTH * HEIGHT * BYTES_PER_PIXEL
     latency = measure_latency(20 * repeats)
@@ -256,21 +283,31 @@ def model(splats: int, repeats: int) -> None:
     print(f"{'threads':>7}{'work':>8}{'between':>9}{'ms':>8}{'efficiency':>12}{'GB/s':>7}")
     single = 0.0
     for count, measured in runs.items():
-        kernels = [median_kernel(calls) for calls in zip(*(run[0] for run in measured[2:]), strict=True)]
+        kernels = [
+            median_kernel(calls) for calls in zip(*(run[0] for run in measured[2:]), strict=True)
+        ]
         between = statistics.median(run[1] for run in measured[2:])
         spans = spans_ms(kernels, count, latency)
         work, ms = sum(sum(kernel.pieces) for kernel in kernels), sum(spans) + between
         single = single or ms
-        print(f"{count:>7}{work:>8.2f}{between:>9.2f}{ms:>8.2f}{single / ms / count:>12.2f}{moved / ms / 1e6:>7.0f}")
+        print(
+            f"{count:>7}{work:>8.2f}{between:>9.2f}{ms:>8.2f}{single / ms / count:>12.2f}{moved / ms / 1e6:>7.0f}"
+        )
     for kernel, span in zip(kernels, spans, strict=True):
         share = sum(kernel.pieces) / span / count
-        print(f"    {kernel.name:<24}{span:>8.2f} ms on {count} threads, busy for {share:.2f} of it")
+        print(
+            f"    {kernel.name:<24}{span:>8.2f} ms on {count} threads, busy for {share:.2f} of it"
+        )
 
 
 def median_kernel(calls: tuple[Kernel, ...]) -> Kernel:
     """Several runs of the same call as one."""
-    pieces = [statistics.median(times) for times in zip(*(call.pieces for call in calls), strict=True)]
-    call, pause = (statistics.median(getattr(kernel, name) for kernel in calls) for name in ("call", "pause"))
+    pieces = [
+        statistics.median(times) for times in zip(*(call.pieces for call in calls), strict=True)
+    ]
+    call, pause = (
+        statistics.median(getattr(kernel, name) for kernel in calls) for name in ("call", "pause")
+    )
     return Kernel(calls[0].name, pieces, call, pause)
 
 
@@ -286,13 +323,22 @@ def draw(found: dict[str, list[Point]], path: Path) -> None:
         axis.set_xlim(0)
         for at, point in zip(x, points, strict=True):
             label = f"{point.x / 1e3:g}k" if by_pairs else ""
-            axis.annotate(label, (at, point.ms), textcoords="offset points", xytext=(-4, 5), fontsize=7, ha="right")
+            axis.annotate(
+                label,
+                (at, point.ms),
+                textcoords="offset points",
+                xytext=(-4, 5),
+                fontsize=7,
+                ha="right",
+            )
     axes[0].set_ylabel("ms per iteration")
     figure.savefig(path, dpi=110)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--model", action="store_true")

@@ -2,11 +2,12 @@
 
     python benchmarks/tracking_accuracy.py CAPTURE [--model HEAD] [--flame FILE] [--timesteps 8]
 
-CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the model that they were
-made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of FLAME's open template (`v_template`,
-`shapedirs`, `faces`); without it, the bundled head. Prints in millimeters, within 9 cm of the landmarks' center: how
-far what the cameras see of the capture's mesh, by its triangles' centers, is from the tracked surface and, where both
-have the same topology, vertices from each other. Landmarks are detected, or read from the folder of --landmarks.
+CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the
+model that they were made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of
+FLAME's open template (`v_template`, `shapedirs`, `faces`); without it, the bundled head. Prints in
+millimeters, within 9 cm of the landmarks' center: how far what the cameras see of the capture's
+mesh, by its triangles' centers, is from the tracked surface and, where both have the same topology,
+vertices from each other. Landmarks are detected, or read from the folder of --landmarks.
 """
 
 import argparse
@@ -39,14 +40,20 @@ def head_file(path: Path | None, folder: Path) -> Path | None:
     if path is not None and path.suffix == ".npz":
         arrays = read_npz(path)
         if "v_template" in arrays and "posedirs" not in arrays:
-            linear = {"mean": arrays["v_template"], "faces": arrays["faces"], "identity": arrays["shapedirs"]}
+            linear = {
+                "mean": arrays["v_template"],
+                "faces": arrays["faces"],
+                "identity": arrays["shapedirs"],
+            }
             write_npz(folder / "head.npz", linear)
             return folder / "head.npz"
     return path
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", type=Path)
     parser.add_argument("--model", type=Path)
     parser.add_argument("--flame", type=Path)
@@ -65,28 +72,43 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     result = track(footage, file, folder / "out", options.landmarks, mattes=False)
     seconds = perf_counter() - begin
     found = open_capture(folder / "out", file)
-    places, used = read_places((options.landmarks or folder / "out" / LANDMARKS_FOLDER) / PLACES_FILE, len(found.faces))
+    places, used = read_places(
+        (options.landmarks or folder / "out" / LANDMARKS_FOLDER) / PLACES_FILE, len(found.faces)
+    )
     template = read_head_model(file).model.v_template
     center = places.on(template, found.faces)[used].mean(0)
     face = np.flatnonzero(np.linalg.norm(template - center, axis=1) < FACE_RADIUS_M)
     # The true world is the footage's: cameras are in both, so that they give the way back.
-    first = {view.camera_index: view.camera for view in (*found.views["train"], *found.views["val"])}
+    first = {
+        view.camera_index: view.camera for view in (*found.views["train"], *found.views["val"])
+    }
     print("| timestep | surface: median | 90 % | vertices: mean |")
     print("| --- | --- | --- | --- |")
     for timestep in footage.timesteps:
         camera, known = first[0], footage.cameras[0].camera
-        local = found.mesh(timestep) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        local = (local / result.scale - known.world_to_camera[:3, 3]) @ known.world_to_camera[:3, :3]
+        local = (
+            found.mesh(timestep) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        )
+        local = (local / result.scale - known.world_to_camera[:3, 3]) @ known.world_to_camera[
+            :3, :3
+        ]
         mesh, middle = true.mesh(timestep), places.on(local, found.faces)[used].mean(0)
-        centers, normals = mesh[true.faces].mean(1), vertex_normals(mesh, true.faces)[true.faces].mean(1)
+        centers, normals = (
+            mesh[true.faces].mean(1),
+            vertex_normals(mesh, true.faces)[true.faces].mean(1),
+        )
         seen = np.zeros(len(centers), bool)
         for view in (own.camera for own in footage.cameras if timestep in own.timesteps):
-            seen |= (facing(view, centers, normals) > MIN_COSINE) & in_sight(view, mesh, true.faces, centers)
+            seen |= (facing(view, centers, normals) > MIN_COSINE) & in_sight(
+                view, mesh, true.faces, centers
+            )
         seen &= np.linalg.norm(centers - middle, axis=1) < FACE_RADIUS_M / result.scale
         distance = 1000 * nearest_points(local, found.faces, centers[seen])[1]
         same = len(found.faces) == len(true.faces) or len(mesh) - len(local) == TEETH_VERTICES
         shift = 1000 * np.linalg.norm(local[face] - mesh[face], axis=1).mean() if same else np.nan
-        print(f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |")
+        print(
+            f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |"
+        )
     print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
     print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")
 

@@ -2,8 +2,9 @@
 
     python benchmarks/video_to_avatar.py VIDEO [--frames 300] [--seconds 300] [--out FOLDER]
 
-Carries out `stga avatar VIDEO` with its defaults and prints a row in Markdown for each step: what its progress is
-called, and seconds of wall time. Below, processor seconds, of helping processes too. --out keeps what is made.
+Carries out `stga avatar VIDEO` with its defaults and prints a row in Markdown for each step: what
+its progress is called, and seconds of wall time. Below, processor seconds, of helping processes
+too. --out keeps what is made.
 """
 
 import argparse
@@ -21,7 +22,9 @@ from stga_addon.training.settings import make_settings
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("video", type=Path)
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--seconds", type=float, default=300.0, help="of training")

@@ -1,4 +1,5 @@
-"""Analyzes the capture in a worker: the effects it calls for, with reasons, and the time of each preset."""
+"""Analyzes the capture in a worker: the effects it calls for, with reasons, and the time of each
+preset."""
 
 from typing import Any, ClassVar
 
@@ -14,7 +15,8 @@ from .training_python import training_python
 
 
 class AnalyzeCapture(bpy.types.Operator):
-    """Find out which effects the capture calls for, and how long each preset takes on this machine"""
+    """Find out which effects the capture calls for, and how long each preset takes on this
+    machine"""
 
     bl_idname = ids.ANALYZE_CAPTURE
     bl_label = "Analyze Capture"
@@ -26,7 +28,11 @@ class AnalyzeCapture(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        start(context.scene, _request(head_of(context), scene_settings(context)), training_python(context))
+        start(
+            context.scene,
+            _request(head_of(context), scene_settings(context)),
+            training_python(context),
+        )
         return {"FINISHED"}
 
 

@@ -23,8 +23,19 @@ from ..stga_addon.driving.read_performance import is_performance, read_performan
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, control_paths, has_controls
-from ..stga_addon.scene.rig.motion import WEIGHT_RANGE, apply_motion, sample_motion, store_range, stored_range
+from ..stga_addon.scene.rig.arkit import (
+    apply_weights,
+    checked_shape_keys,
+    control_paths,
+    has_controls,
+)
+from ..stga_addon.scene.rig.motion import (
+    WEIGHT_RANGE,
+    apply_motion,
+    sample_motion,
+    store_range,
+    stored_range,
+)
 from . import ids
 from .common import (
     FileImport,
@@ -48,7 +59,9 @@ NEUTRAL_LABELS = {"none": "As Recorded", "quiet": "Quiet Face", "first": "First 
 
 
 def _part_property(name: str, description: str) -> Any:
-    return bpy.props.BoolProperty(name=name, description=description, default=True, options={"SKIP_SAVE"})
+    return bpy.props.BoolProperty(
+        name=name, description=description, default=True, options={"SKIP_SAVE"}
+    )
 
 
 def _gain_property(name: str, what: str) -> Any:
@@ -73,7 +86,8 @@ def exchange_property(pair: str) -> Any:
 
 
 class ApplyMotion(bpy.types.Operator, FileImport):
-    """Animate this head with the expressions and pose of another person; its earlier animation is kept"""
+    """Animate this head with the expressions and pose of another person; its earlier animation is
+    kept"""
 
     bl_idname = ids.APPLY_MOTION
     bl_label = "Apply Motion"
@@ -102,7 +116,11 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         options={"SKIP_SAVE"},
     )
     start: bpy.props.IntProperty(
-        name="Start Frame", description="Frame of the first keyframe", default=1, min=0, options={"SKIP_SAVE"}
+        name="Start Frame",
+        description="Frame of the first keyframe",
+        default=1,
+        min=0,
+        options={"SKIP_SAVE"},
     )
     neutral: option_property(MotionOptions, "neutral", labels=NEUTRAL_LABELS, options={"SKIP_SAVE"})
     stay_trained: bpy.props.FloatProperty(
@@ -147,7 +165,11 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         description="Where the keyframes go; the earlier animation is kept in the file",
         items=(
             ("action", "New Action", "A copy of the head's action with the chosen parts replaced"),
-            ("strip", "NLA Strip", "A strip over the head's own animation, which plays before and after it"),
+            (
+                "strip",
+                "NLA Strip",
+                "A strip over the head's own animation, which plays before and after it",
+            ),
         ),
         options={"SKIP_SAVE"},
     )
@@ -176,7 +198,9 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         head = head_of(context)
         parts = [part for part in PARTS if getattr(self, part)]
         if not parts:
-            raise StgaError("Apply Motion: no part is chosen; choose expression, jaw, eyes, neck or head")
+            raise StgaError(
+                "Apply Motion: no part is chosen; choose expression, jaw, eyes, neck or head"
+            )
         path = None if self.source else file_path(self.filepath, "motion")
         if path is not None and is_performance(path):
             name, count = path.stem, self._apply_performance(context.scene, head, path, parts)
@@ -198,12 +222,14 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         frames, beyond = adapted(frames, self._options(), self._trained(head))
         self._report_range(beyond)
         tracked = self._tracked(head, step) if self.own_offsets else None
-        apply_motion(head, frames, self.start, name, parts, self.place == "strip", self._warn, tracked)
+        apply_motion(
+            head, frames, self.start, name, parts, self.place == "strip", self._warn, tracked
+        )
         return name, len(frames)
 
     def _apply_performance(self, scene: Any, head: Any, path: Path, parts: list[str]) -> int:
-        """Apply a face performance to controls, shape keys of its names, or expressions and bones; returns the number
-        of frames."""
+        """Apply a face performance to controls, shape keys of its names, or expressions and bones;
+        returns the number of frames."""
         performance, options = read_performance(path), self._options()
         rate = scene.render.fps / scene.render.fps_base / self.speed
         self._check_end(int(performance.times[-1] * rate) + 1)
@@ -212,29 +238,53 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         rig = rig_or_none(head)
         if rig is not None and not has_controls(rig):
             motion = performed(
-                performance, flame_of(capture_of(head), head.name), head.name, options, self._trained(head), rate
+                performance,
+                flame_of(capture_of(head), head.name),
+                head.name,
+                options,
+                self._trained(head),
+                rate,
             )
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
             self._report_range(motion.outside)
-            apply_motion(head, frames, self.start, path.stem, parts, self.place == "strip", self._warn)
+            apply_motion(
+                head, frames, self.start, path.stem, parts, self.place == "strip", self._warn
+            )
             return len(frames)
         chosen = {"face": self.expression, "jaw": self.jaw, "eyes": self.eyes, "head": self.neck}
         kept = parts_kept(performance, tuple(part for part in chosen if chosen[part]))
         prepared = prepared_performance(kept, options, rate)
-        owner, paths = (head.data.shape_keys, checked_shape_keys(head)) if rig is None else (rig, control_paths())
+        owner, paths = (
+            (head.data.shape_keys, checked_shape_keys(head))
+            if rig is None
+            else (rig, control_paths())
+        )
         weights = np.clip(prepared.weights, *WEIGHT_RANGE)
         neck = None
         if rig is not None and self.neck:
-            neck = np.zeros((len(weights), 3)) if prepared.head is None else head_turns(prepared.head)
+            neck = (
+                np.zeros((len(weights), 3)) if prepared.head is None else head_turns(prepared.head)
+            )
         apply_weights(owner, paths, weights, self.start, path.stem, self.place == "strip", neck)
         return len(weights)
 
     def _options(self) -> MotionOptions:
-        gains = {"face": self.face_gain, "jaw": self.jaw_gain, "eyes": self.eyes_gain, "head": self.head_gain}
+        gains = {
+            "face": self.face_gain,
+            "jaw": self.jaw_gain,
+            "eyes": self.eyes_gain,
+            "head": self.head_gain,
+        }
         gains |= dict(parsed_gain(text) for text in self.shape_gains.replace(",", " ").split())
         exchange = tuple(pair for pair in EXCHANGEABLE if getattr(self, f"exchange_{pair}"))
         return MotionOptions(
-            self.strength, self.neutral, self.smoothing, self.mirror, gains, self.stay_trained, exchange
+            self.strength,
+            self.neutral,
+            self.smoothing,
+            self.mirror,
+            gains,
+            self.stay_trained,
+            exchange,
         )
 
     def _trained(self, head: Any) -> TrainedRange | None:
@@ -246,7 +296,9 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         except StgaError as error:
             if self.stay_trained:
                 raise
-            self._warn(f"{error}; the motion is put on the head without expression, not on its quiet face")
+            self._warn(
+                f"{error}; the motion is put on the head without expression, not on its quiet face"
+            )
             return stored_range(head)
         trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
         store_range(head, trained)
@@ -255,13 +307,18 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     def _check_end(self, count: int) -> None:
         end = self.start + count - 1
         if end > LAST_FRAME:
-            raise StgaError(f"Apply Motion: would end at frame {end}; Blender's last frame is {LAST_FRAME}")
+            raise StgaError(
+                f"Apply Motion: would end at frame {end}; Blender's last frame is {LAST_FRAME}"
+            )
 
     def _report_range(self, beyond: Mapping[str, np.ndarray]) -> None:
         for part, values in beyond.items():
             if values.any():
                 share = 100 * float((values > 0).mean())
-                self.report({"INFO"}, f"{part}: {share:.0f} % of the frames were outside the head's own recording")
+                self.report(
+                    {"INFO"},
+                    f"{part}: {share:.0f} % of the frames were outside the head's own recording",
+                )
 
     def _motion(self, context: Any, head: Any) -> tuple[str, FlameSequence]:
         if not self.source:
@@ -273,22 +330,29 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         if other == head:
             raise StgaError(f"{self.source}: is this head itself; choose another one, or a file")
         numbers = range(context.scene.frame_start, context.scene.frame_end + 1)
-        return other.name, sample_motion(other, flame_of(capture_of(other), other.name), numbers, self._warn)
+        return other.name, sample_motion(
+            other, flame_of(capture_of(other), other.name), numbers, self._warn
+        )
 
     def _tracked(self, head: Any, step: float) -> tuple[FlameSequence, list[float]]:
         """What the head was imported from, and where its timesteps come to lie."""
         own = flame_of(capture_of(head), head.name)
-        return own, [self.start + (timestep - own.timesteps[0]) / step for timestep in own.timesteps]
+        return own, [
+            self.start + (timestep - own.timesteps[0]) / step for timestep in own.timesteps
+        ]
 
     def _step(self, scene: Any) -> float:
         """Timesteps of the recording that a frame of the scene takes."""
-        return float(self.speed * (self.fps * scene.render.fps_base / scene.render.fps if self.fps else 1.0))
+        return float(
+            self.speed * (self.fps * scene.render.fps_base / scene.render.fps if self.fps else 1.0)
+        )
 
     def _warn(self, sentence: str) -> None:
         self.report({"WARNING"}, sentence)
 
 
 def _recorded(context: Any, path: Path, head: Any) -> FlameSequence:
-    """The motion of a file or a capture, read with this head's model: expressions mean the same in both."""
+    """The motion of a file or a capture, read with this head's model: expressions mean the same in
+    both."""
     model = flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
     return flame_of(open_capture(path, flame=model), str(path))

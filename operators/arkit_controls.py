@@ -12,7 +12,8 @@ from .common import capture_of, flame_of, head_of, needs_rig, reporting, rig_or_
 
 
 class AddArkitControls(bpy.types.Operator):
-    """Add 52 sliders named as ARKit's blend shapes, which drive expressions, jaw and eyes without Python"""
+    """Add 52 sliders named as ARKit's blend shapes, which drive expressions, jaw and eyes without
+    Python"""
 
     bl_idname = ids.ADD_ARKIT_CONTROLS
     bl_label = "Add ARKit Controls"
@@ -28,7 +29,8 @@ class AddArkitControls(bpy.types.Operator):
 
 
 class RemoveArkitControls(bpy.types.Operator):
-    """Remove the ARKit sliders and their keyframes; expressions, jaw and eyes play their own animation again"""
+    """Remove the ARKit sliders and their keyframes; expressions, jaw and eyes play their own
+    animation again"""
 
     bl_idname = ids.REMOVE_ARKIT_CONTROLS
     bl_label = "Remove ARKit Controls"

@@ -1,4 +1,5 @@
-"""Makes an avatar from a video: tracks and trains in a process beside Blender, and shows both as they become."""
+"""Makes an avatar from a video: tracks and trains in a process beside Blender, and shows both as
+they become."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,14 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import TRAINS
-from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track, check_inputs, read_inputs
+from ..stga_addon.jobs.track import (
+    CAPTURE_FOLDER,
+    RUN_FOLDER,
+    MakeAvatar,
+    Track,
+    check_inputs,
+    read_inputs,
+)
 from ..stga_addon.jobs.train import Train as TrainRequest
 from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
 from ..stga_addon.training.settings import make_settings
@@ -24,8 +32,8 @@ DIGITS = 3
 
 
 class AvatarFromVideo(bpy.types.Operator, FileImport):
-    """Make an avatar from a video of a face: track the head, train, and show the avatar on it. What was begun with the
-    same video is continued"""
+    """Make an avatar from a video of a face: track the head, train, and show the avatar on it. What
+    was begun with the same video is continued"""
 
     bl_idname = ids.AVATAR_FROM_VIDEO
     bl_label = "Avatar from Video"
@@ -38,7 +46,9 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
         "DIR_PATH",
         options={"SKIP_SAVE"},
     )
-    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
+    minutes: bpy.props.FloatProperty(
+        name="Minutes", description="Training time", default=5.0, min=0.01
+    )
     focal: option_property(Track, "focal", "Focal Length", options={"SKIP_SAVE"})
     python: bpy.props.StringProperty(
         name="Python",
@@ -57,7 +67,9 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
             return self.execute(context) if self.folder else super().invoke(context, event)
         video = file_path(self.filepath, "video").resolve()  # dropped
         self.folder = str(proposed_folder(self._tracking(video, Path())).parent)
-        return context.window_manager.invoke_props_dialog(self, width=480, title=self.bl_label, confirm_text="Make")
+        return context.window_manager.invoke_props_dialog(
+            self, width=480, title=self.bl_label, confirm_text="Make"
+        )
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
@@ -68,7 +80,10 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
     def execute(self, context: Any) -> set[str]:
         if self.folder and not self.filepath:  # continues
             began_with = read_inputs(file_path(self.folder, "folder"))
-            self.filepath, self.focal = str(began_with.get("footage", "")), began_with.get("focal") or 0.0
+            self.filepath, self.focal = (
+                str(began_with.get("footage", "")),
+                began_with.get("focal") or 0.0,
+            )
         video = file_path(self.filepath, "video").resolve()
         if not video.is_file():
             raise StgaError(f"{video}: is not a file; expected a video")
@@ -89,14 +104,19 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
 
 
 def proposed_folder(track: Track) -> Path:
-    """The folder of the capture in the first folder beside the .blend file, else beside the video, that is free or in
-    which this video's avatar was begun."""
+    """The folder of the capture in the first folder beside the .blend file, else beside the video,
+    that is free or in which this video's avatar was begun."""
     beside = Path(bpy.data.filepath).parent if bpy.data.filepath else track.footage.parent
-    names = [f"{track.footage.stem} avatar", *(f"{track.footage.stem} avatar {n}" for n in range(2, MAX_FOLDERS))]
+    names = [
+        f"{track.footage.stem} avatar",
+        *(f"{track.footage.stem} avatar {n}" for n in range(2, MAX_FOLDERS)),
+    ]
     for capture in (beside / name / CAPTURE_FOLDER for name in names):
         try:
             check_inputs(replace(track, out=capture))
         except StgaError:
             continue
         return capture
-    raise StgaError(f"{beside}: holds {MAX_FOLDERS} avatars of {track.footage.name}; choose a folder")
+    raise StgaError(
+        f"{beside}: holds {MAX_FOLDERS} avatars of {track.footage.name}; choose a folder"
+    )

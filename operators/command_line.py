@@ -1,4 +1,5 @@
-"""`blender --command stga …`: the commands of `python -m stga_addon`, by default about the open file's head."""
+"""`blender --command stga …`: the commands of `python -m stga_addon`, by default about the open
+file's head."""
 
 import sys
 from pathlib import Path
@@ -23,8 +24,9 @@ from .common import capture_of, capture_source, file_path, is_head, scene_settin
 from .training_python import training_python
 
 IN_BLENDER = ("select", "export", "demo")
-"""Commands that need none of the packages that Blender's Python may lack, or need Blender itself; all others run in the
-Python that trains, also where that is Blender's own: as `stga_addon`, whose kernels are compiled."""
+"""Commands that need none of the packages that Blender's Python may lack, or need Blender itself;
+all others run in the Python that trains, also where that is Blender's own: as `stga_addon`, whose
+kernels are compiled."""
 
 if TYPE_CHECKING:
     from ..stga_addon.jobs.avatar_source import OpenHead
@@ -33,7 +35,8 @@ _commands: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
-    from ..stga_addon.cli.main import main, make_parser  # loaded when a command is given, not when Blender starts
+    # loaded when a command is given, not when Blender starts
+    from ..stga_addon.cli.main import main, make_parser
 
     try:
         head = _open_head()
@@ -69,7 +72,8 @@ def _open_head() -> "OpenHead | None":
 
 
 def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
-    """Run the command in the Python that trains; returns its exit code. Raises StgaError where there is none."""
+    """Run the command in the Python that trains; returns its exit code. Raises StgaError where
+    there is none."""
     from ..stga_addon.jobs.avatar_source import FOLDER, write_head
 
     python = training_python(bpy.context)
@@ -95,17 +99,21 @@ def _make_avatar(arguments: list[str], options: Any) -> int:
         scene_settings(bpy.context).head = head
         if refined.exists():  # PyTorch, which reads it into a capture, need not be here
             start = head[tags.TIMESTEPS][0]
-            bpy.ops.stga.apply_motion(filepath=str(refined.resolve()), own_offsets=True, start=start)
+            bpy.ops.stga.apply_motion(
+                filepath=str(refined.resolve()), own_offsets=True, start=start
+            )
 
     print(f"blender: {write_blend(options.out, lambda capture: capture, apply_refined)}")
     return 0
 
 
 def _played(head: Any) -> Played:
-    """What the head plays in the scene's frames, however it is animated. Raises StgaError where its capture has moved,
-    or a FLAME head has no rig."""
+    """What the head plays in the scene's frames, however it is animated. Raises StgaError where its
+    capture has moved, or a FLAME head has no rig."""
     frames = range(bpy.context.scene.frame_start, bpy.context.scene.frame_end + 1)
-    meshes = {frame: np.asarray(evaluated_vertices(head), np.float64) for frame in iterate_frames(frames)}
+    meshes = {
+        frame: np.asarray(evaluated_vertices(head), np.float64) for frame in iterate_frames(frames)
+    }
     flame = capture_of(head).flame
     motion = None if flame is None else motion_arrays(sample_motion(head, flame, frames))
     return Played(meshes, motion, training_selection(head))

@@ -20,7 +20,8 @@ from . import ids
 
 
 def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], set[str]]:
-    """Decorator of `execute`: a StgaError becomes the operator's error report, without a traceback."""
+    """Decorator of `execute`: a StgaError becomes the operator's error report, without a
+    traceback."""
 
     def guarded(self: Any, context: Any) -> set[str]:
         try:
@@ -38,7 +39,8 @@ def scene_settings(context: Any) -> Any:
 
 
 def preferences(context: Any) -> Any:
-    """The extension's preferences (`ui.preferences.Preferences`); None while it runs from a checkout."""
+    """The extension's preferences (`ui.preferences.Preferences`); None while it runs from a
+    checkout."""
     addon = context.preferences.addons.get(package())
     return addon.preferences if addon else None
 
@@ -62,7 +64,8 @@ def is_head(thing: Any) -> bool:
 
 
 def polled(operator: Any, is_possible: bool, message: str) -> bool:
-    """Poll: whether an operator can be called; where not, Blender shows the message, which says what to do."""
+    """Poll: whether an operator can be called; where not, Blender shows the message, which says
+    what to do."""
     if not is_possible:
         operator.poll_message_set(message)
     return is_possible
@@ -79,7 +82,11 @@ def needs_own_head(operator: Any, context: Any) -> bool:
         return False
     head = scene_settings(context).head
     is_own = head.library is None and head.data.library is None
-    return polled(operator, is_own, "The head is linked from another file: open that file, or make the head local")
+    return polled(
+        operator,
+        is_own,
+        "The head is linked from another file: open that file, or make the head local",
+    )
 
 
 def needs_rig(operator: Any, context: Any) -> bool:
@@ -110,21 +117,32 @@ def rig_or_none(head: Any) -> Any:
 
 
 def path_property(
-    name: str, description: str, subtype: str = "FILE_PATH", options: Collection[str] = (), **more: Any
+    name: str,
+    description: str,
+    subtype: str = "FILE_PATH",
+    options: Collection[str] = (),
+    **more: Any,
 ) -> Any:
     """A path, which may begin with "//"."""
     return bpy.props.StringProperty(
-        name=name, description=description, subtype=subtype, options={*PATH_OPTIONS, *options}, **more
+        name=name,
+        description=description,
+        subtype=subtype,
+        options={*PATH_OPTIONS, *options},
+        **more,
     )
 
 
 def file_filter(*suffixes: str) -> Any:
     """The files that a file browser shows."""
-    return bpy.props.StringProperty(default=";".join(f"*{suffix}" for suffix in suffixes), options={"HIDDEN"})
+    return bpy.props.StringProperty(
+        default=";".join(f"*{suffix}" for suffix in suffixes), options={"HIDDEN"}
+    )
 
 
 class FileImport(ImportHelper):
-    """Mixin of operators that import a file: asks for it, unless called with one, as when a file is dropped."""
+    """Mixin of operators that import a file: asks for it, unless called with one, as when a file is
+    dropped."""
 
     filepath: path_property("File", "File to import", options={"SKIP_SAVE"})
 
@@ -152,30 +170,39 @@ def flame_model_path(context: Any, given: str = "") -> Path | None:
 
 
 def capture_source(head: Any) -> tuple[Path, Path | None, str]:
-    """The capture that a head was imported from, its FLAME model and its convention of principal points, as
-    `open_capture` takes them."""
-    model, point = head.get(tags.FLAME_MODEL), head.get(tags.PRINCIPAL_POINT, DEFAULT_PRINCIPAL_POINT)
+    """The capture that a head was imported from, its FLAME model and its convention of principal
+    points, as `open_capture` takes them."""
+    model, point = (
+        head.get(tags.FLAME_MODEL),
+        head.get(tags.PRINCIPAL_POINT, DEFAULT_PRINCIPAL_POINT),
+    )
     return Path(head[tags.CAPTURE]), Path(model) if model else None, point
 
 
 def capture_of(head: Any) -> Capture:
-    """Open the capture that a head was imported from. Raises StgaError where it has moved or changed."""
+    """Open the capture that a head was imported from. Raises StgaError where it has moved or
+    changed."""
     return open_capture(*capture_source(head))
 
 
 def flame_of(capture: Capture, name: str) -> FlameSequence:
     """The FLAME parameters of a capture. Raises StgaError where it has none; `name` says whose."""
     if capture.flame is None:
-        raise StgaError(f"{name}: was not tracked with FLAME, so it has no parameters of expression and pose")
+        raise StgaError(
+            f"{name}: was not tracked with FLAME, so it has no parameters of expression and pose"
+        )
     return capture.flame
 
 
 def file_path(value: str, what: str) -> Path:
-    """Absolute path of a path property. Raises StgaError where it is empty, or relative to a file never saved."""
+    """Absolute path of a path property. Raises StgaError where it is empty, or relative to a file
+    never saved."""
     if not value:
         raise StgaError(f"{what}: no path given")
     if value.startswith("//") and not bpy.data.filepath:
-        raise StgaError(f"{what}: {value} is relative to the .blend file, which has not been saved yet")
+        raise StgaError(
+            f"{what}: {value} is relative to the .blend file, which has not been saved yet"
+        )
     return Path(bpy.path.abspath(value))
 
 

@@ -1,4 +1,5 @@
-"""Continues a trained avatar: refines a region of it, or extends it by a further take of the same head."""
+"""Continues a trained avatar: refines a region of it, or extends it by a further take of the same
+head."""
 
 from typing import Any, ClassVar
 
@@ -26,20 +27,25 @@ class RefineOptions:
         description="Vertex group whose triangles are refined; empty: the active one. In Edit Mode, the selected "
         "triangles are refined instead",
     )
-    seconds: option_property(RefineRequest, "seconds", description="Training time", default=20.0, min=0.1)
+    seconds: option_property(
+        RefineRequest, "seconds", description="Training time", default=20.0, min=0.1
+    )
     growth: option_property(RefineRequest, "growth", "More Splats", soft_max=2.0, subtype="FACTOR")
 
 
 class ExtendOptions:
-    """What a run is extended by, and for how long: of the operator, and of the panel that calls it."""
+    """What a run is extended by, and for how long: of the operator, and of the panel that calls
+    it."""
 
     take: path_property("Take", "Folder of a further capture of the same head", "DIR_PATH")
-    seconds: option_property(ExtendRequest, "seconds", description="Training time", default=60.0, min=0.1)
+    seconds: option_property(
+        ExtendRequest, "seconds", description="Training time", default=60.0, min=0.1
+    )
 
 
 class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator):
-    """Train one region of the avatar further; all other splats stay as they are. In Edit Mode the region is the
-    selected triangles, otherwise a vertex group"""
+    """Train one region of the avatar further; all other splats stay as they are. In Edit Mode the
+    region is the selected triangles, otherwise a vertex group"""
 
     bl_idname = ids.REFINE
     bl_label = "Refine"
@@ -52,7 +58,11 @@ class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
         options={"SKIP_SAVE"},
     )
     first: bpy.props.IntProperty(
-        name="First Frame", description="First frame to train on", default=-1, min=-1, options={"SKIP_SAVE"}
+        name="First Frame",
+        description="First frame to train on",
+        default=-1,
+        min=-1,
+        options={"SKIP_SAVE"},
     )
     last: bpy.props.IntProperty(
         name="Last Frame",
@@ -68,7 +78,9 @@ class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
         run = next_folder(parent)
         weights = None if self.region else _painted_region(head, self.group)
         frames = None if self.last < 0 else (max(self.first, 0), self.last)
-        request = RefineRequest(run, parent, self.region, weights, frames, growth=self.growth, **_common(self, head))
+        request = RefineRequest(
+            run, parent, self.region, weights, frames, growth=self.growth, **_common(self, head)
+        )
         return _start(self, context, request)
 
 
@@ -87,26 +99,35 @@ class Extend(TrainingOperator, ExtendOptions, DeviceOptions, bpy.types.Operator)
         take = file_path(self.take, "take").resolve()
         if not take.is_dir():
             raise StgaError(f"{take}: is not a folder; expected a further capture of the same head")
-        request = ExtendRequest(next_folder(parent), parent, (take,), **_common(self, head_of(context)))
+        request = ExtendRequest(
+            next_folder(parent), parent, (take,), **_common(self, head_of(context))
+        )
         return _start(self, context, request)
 
 
 def _common(operator: Any, head: Any) -> dict[str, Any]:
     """What both requests have: budget, FLAME model and device."""
-    budget = {"iterations": operator.iterations} if operator.iterations else {"seconds": operator.seconds}
+    budget = (
+        {"iterations": operator.iterations}
+        if operator.iterations
+        else {"seconds": operator.seconds}
+    )
     _, flame, _ = capture_source(head)
     return {**budget, "flame": flame, "device": device_of(operator)}
 
 
 def _painted_region(head: Any, group: str) -> np.ndarray:
-    """(F,) weights of the triangles selected in Edit Mode, or of a vertex group. Raises StgaError for none."""
+    """(F,) weights of the triangles selected in Edit Mode, or of a vertex group. Raises StgaError
+    for none."""
     if head.mode == "EDIT":
         weights = selected_triangles(head).astype(np.float32)
         where = "no triangle is selected in Edit Mode"
     else:
         found = head.vertex_groups.get(group) if group else head.vertex_groups.active
         if found is None:
-            raise StgaError(f"{head.name}: has no vertex group '{group}' to refine; paint one, or select in Edit Mode")
+            raise StgaError(
+                f"{head.name}: has no vertex group '{group}' to refine; paint one, or select in Edit Mode"
+            )
         weights = read_triangle_weights(head, found.name)
         where = f"no triangle has all its corners in the vertex group '{found.name}'"
     if not (weights >= SELECTED_WEIGHT).any():
@@ -115,7 +136,8 @@ def _painted_region(head: Any, group: str) -> np.ndarray:
 
 
 def _start(operator: Any, context: Any, request: RefineRequest | ExtendRequest) -> set[str]:
-    """Start the worker; the splats that show the run before show the new one, so that its preview changes them."""
+    """Start the worker; the splats that show the run before show the new one, so that its preview
+    changes them."""
     settings = scene_settings(context)
     if not (request.parent / AVATAR).is_file():
         raise StgaError(f"{request.parent}: holds no trained avatar; train one first")

@@ -1,4 +1,5 @@
-"""Driving the head live: starting and stopping to listen, calibrating, recording, choosing among senders."""
+"""Driving the head live: starting and stopping to listen, calibrating, recording, choosing among
+senders."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -6,7 +7,13 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.driving.head_map import head_map
-from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES, Receiver, Recording, leaves_this_machine
+from ..stga_addon.driving.live.sources import (
+    LOOPBACK,
+    SOURCES,
+    Receiver,
+    Recording,
+    leaves_this_machine,
+)
 from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S, MotionOptions, trained_range
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.rig.motion import LivePose, store_range, stored_range
@@ -46,7 +53,11 @@ class DriveOptions:
         default=LOOPBACK,
     )
     port: bpy.props.IntProperty(
-        name="Port", description="UDP port; 0: the source's usual one", min=0, max=MAX_PORT, default=0
+        name="Port",
+        description="UDP port; 0: the source's usual one",
+        min=0,
+        max=MAX_PORT,
+        default=0,
     )
     phone: bpy.props.StringProperty(
         name="Phone", description="IP address that the app on the phone shows", default=LOOPBACK
@@ -78,7 +89,8 @@ class DriveOptions:
 
 
 class MeasureRange(bpy.types.Operator):
-    """Measure the range of expression, jaw and eyes in the recording that the head was trained on"""
+    """Measure the range of expression, jaw and eyes in the recording that the head was trained
+    on"""
 
     bl_idname = ids.MEASURE_RANGE
     bl_label = "Measure Trained Range"
@@ -95,7 +107,8 @@ class MeasureRange(bpy.types.Operator):
 
 
 class DriveLive(bpy.types.Operator):
-    """Let a phone or program move the head; Esc over the viewport stops it. Keyframes are only made by Record"""
+    """Let a phone or program move the head; Esc over the viewport stops it. Keyframes are only made
+    by Record"""
 
     bl_idname = ids.DRIVE_LIVE
     bl_label = "Drive Live"
@@ -107,7 +120,10 @@ class DriveLive(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         head, settings = head_of(context), scene_settings(context).drive
         source = SOURCES[settings.source]
-        if leaves_this_machine(source, settings.address, settings.phone) and not bpy.app.online_access:
+        if (
+            leaves_this_machine(source, settings.address, settings.phone)
+            and not bpy.app.online_access
+        ):
             raise StgaError(
                 f"{source.label}: receives from other devices, but online access is off in Blender's preferences "
                 f"(System > Network); allow it, or listen on {LOOPBACK}"
@@ -134,7 +150,11 @@ class _NeedsSession:
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return polled(cls, live_session.session() is not None, "No source is listened to; choose Drive Live first")
+        return polled(
+            cls,
+            live_session.session() is not None,
+            "No source is listened to; choose Drive Live first",
+        )
 
     @property
     def running(self) -> LiveSession:
@@ -160,7 +180,8 @@ class StopLive(_NeedsSession, bpy.types.Operator):
 
 
 class CalibrateLive(_NeedsSession, bpy.types.Operator):
-    """Take the performer's face and head of this moment as the resting ones, which do not move the head"""
+    """Take the performer's face and head of this moment as the resting ones, which do not move the
+    head"""
 
     bl_idname = ids.CALIBRATE_LIVE
     bl_label = "Set Neutral"
@@ -172,7 +193,8 @@ class CalibrateLive(_NeedsSession, bpy.types.Operator):
 
 
 class RecordLive(_NeedsSession, bpy.types.Operator):
-    """Record what is received; again: write the take as CSV and apply it to the head as a new action"""
+    """Record what is received; again: write the take as CSV and apply it to the head as a new
+    action"""
 
     bl_idname = ids.RECORD_LIVE
     bl_label = "Record"
@@ -206,12 +228,15 @@ class FollowLive(_NeedsSession, bpy.types.Operator):
 
 
 def takes_folder(context: Any) -> tuple[Path, str]:
-    """The folder of takes, which is made, and a warning where it does not last, or "". Raises StgaError."""
+    """The folder of takes, which is made, and a warning where it does not last, or "". Raises
+    StgaError."""
     folder = scene_settings(context).drive.takes
     warning = ""
     if folder.startswith("//") and not bpy.data.filepath:
         path = Path(bpy.app.tempdir)
-        warning = f"{path}: is emptied when Blender ends; save the .blend file to keep takes beside it"
+        warning = (
+            f"{path}: is emptied when Blender ends; save the .blend file to keep takes beside it"
+        )
     else:
         path = file_path(folder, "takes")
     try:

@@ -17,7 +17,8 @@ from .training_python import training_python
 
 
 class DriveVideo(bpy.types.Operator, FileImport):
-    """Detect the 52 shapes in a video of a face, write them as a CSV file into the takes, and apply them to the head"""
+    """Detect the 52 shapes in a video of a face, write them as a CSV file into the takes, and apply
+    them to the head"""
 
     bl_idname = ids.DRIVE_VIDEO
     bl_label = "Drive from Video"

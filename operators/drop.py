@@ -1,4 +1,5 @@
-"""Files dropped into the 3D viewport: video, capture, avatar or FLAME motion, face performance, Gaussian splats."""
+"""Files dropped into the 3D viewport: video, capture, avatar or FLAME motion, face performance,
+Gaussian splats."""
 
 import zipfile
 from pathlib import Path
@@ -17,7 +18,8 @@ MOTION_FIELDS = {*FRAME_FIELDS, *FIELD_ALIASES, "pose"}
 
 
 class OpenNpz(bpy.types.Operator):
-    """Open an .npz file by its content: show an avatar, apply a FLAME motion to the head, or import it as a new one"""
+    """Open an .npz file by its content: show an avatar, apply a FLAME motion to the head, or import
+    it as a new one"""
 
     bl_idname = ids.OPEN_NPZ
     bl_label = "Open Avatar or Motion"
@@ -33,7 +35,11 @@ class OpenNpz(bpy.types.Operator):
                 raise StgaError(f"{path}: is an avatar, which needs a head; import a capture first")
             operator = bpy.ops.stga.show_avatar
         else:
-            operator = bpy.ops.stga.apply_motion if ApplyMotion.poll(context) else bpy.ops.stga.import_motion
+            operator = (
+                bpy.ops.stga.apply_motion
+                if ApplyMotion.poll(context)
+                else bpy.ops.stga.import_motion
+            )
         try:
             result: set[str] = operator(filepath=str(path))
         except RuntimeError as error:
@@ -54,7 +60,9 @@ def npz_kind(path: Path) -> str:
         return "avatar"
     if names & MOTION_FIELDS:
         return "motion"
-    raise StgaError(f"{path}: is neither an avatar (no header) nor a FLAME motion (none of {', '.join(FRAME_FIELDS)})")
+    raise StgaError(
+        f"{path}: is neither an avatar (no header) nor a FLAME motion (none of {', '.join(FRAME_FIELDS)})"
+    )
 
 
 class _ViewportDrop:

@@ -12,7 +12,13 @@ from bpy_extras.io_utils import ExportHelper
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.driving.head_map import page_controls
 from ..stga_addon.errors import StgaError
-from ..stga_addon.export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar
+from ..stga_addon.export.formats import (
+    FORMATS,
+    Meshes,
+    check_free_space,
+    check_suffix,
+    export_avatar,
+)
 from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
 from ..stga_addon.scene.arrays import evaluated_vertices
@@ -40,7 +46,8 @@ SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suff
 
 
 class ExportAvatar(bpy.types.Operator, ExportHelper):
-    """Export a trained avatar, posed as the head in the scene, for other viewers of Gaussian splats"""
+    """Export a trained avatar, posed as the head in the scene, for other viewers of Gaussian
+    splats"""
 
     bl_idname = ids.EXPORT_AVATAR
     bl_label = "Export Avatar"
@@ -51,7 +58,9 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         "A folder for PLY Sequence and GaussianAvatars, a file for the other formats",
         options={"SKIP_SAVE"},
     )
-    avatar: path_property("Avatar", "Avatar file (.npz); empty: the one shown", options={"SKIP_SAVE"})
+    avatar: path_property(
+        "Avatar", "Avatar file (.npz); empty: the one shown", options={"SKIP_SAVE"}
+    )
     format: bpy.props.EnumProperty(
         name="Format",
         description="File format",
@@ -95,7 +104,9 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
     def _size(self, context: Any, frames: int) -> str:
         try:
             source = self._source(context)
-            return f"About {format_bytes(_size(source, source.stat().st_mtime, self.format, frames))}"
+            return (
+                f"About {format_bytes(_size(source, source.stat().st_mtime, self.format, frames))}"
+            )
         except (StgaError, OSError) as error:
             return str(error)
 
@@ -116,14 +127,19 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
             write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
         else:
             self._range = RangeExport(head, frames, write)
-            self._timer = context.window_manager.event_timer_add(STEP_INTERVAL_S, window=context.window)
+            self._timer = context.window_manager.event_timer_add(
+                STEP_INTERVAL_S, window=context.window
+            )
             context.window_manager.modal_handler_add(self)
             return {"RUNNING_MODAL"}
         self.report({"INFO"}, f"Exported to {path}")
         return {"FINISHED"}
 
-    def _writer(self, context: Any, head: Any, frames: range) -> tuple[Path, Callable[[Meshes], Any]]:
-        """Where the file comes to lie, and what writes it. Raises StgaError for what can be known before."""
+    def _writer(
+        self, context: Any, head: Any, frames: range
+    ) -> tuple[Path, Callable[[Meshes], Any]]:
+        """Where the file comes to lie, and what writes it. Raises StgaError for what can be known
+        before."""
         format = FORMATS[self.format]
         path = file_path(self.filepath, "export")
         if format.suffixes and not path.suffix:
@@ -141,7 +157,9 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         elif format.source == "motion":
             motion = sample_motion(head, flame_of(capture_of(head), head.name), frames, self._warn)
         fps = frames_per_second(context.scene)
-        return path, lambda meshes: export_avatar(path, avatar, self.format, meshes, motion, fps, playback)
+        return path, lambda meshes: export_avatar(
+            path, avatar, self.format, meshes, motion, fps, playback
+        )
 
     def modal(self, context: Any, event: Any) -> set[str]:
         """Export one frame a timer event; Esc cancels."""
@@ -149,7 +167,9 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         assert job is not None
         if event.type == "ESC" or event.type == "TIMER":
             is_running = False if event.type == "ESC" else job.step()
-            context.workspace.status_text_set(f"Exporting frame {job.done} of {job.total}   Esc: Cancel")
+            context.workspace.status_text_set(
+                f"Exporting frame {job.done} of {job.total}   Esc: Cancel"
+            )
             if not is_running:
                 return self._end(context)
         return {"RUNNING_MODAL"}
@@ -177,7 +197,8 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
 
 @lru_cache(maxsize=8)
 def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
-    """`Format.size` of an avatar file last modified at this time. Raises StgaError where it cannot be read."""
+    """`Format.size` of an avatar file last modified at this time. Raises StgaError where it cannot
+    be read."""
     return FORMATS[format].size(read_avatar(avatar), frames)
 
 

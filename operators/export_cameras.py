@@ -11,14 +11,17 @@ from .common import file_filter, file_path, path_property, reporting
 
 
 class ExportCameras(bpy.types.Operator, ExportHelper):
-    """Export cameras at the current frame as calibration of footage: each has a folder, video or image of its name"""
+    """Export cameras at the current frame as calibration of footage: each has a folder, video or
+    image of its name"""
 
     bl_idname = ids.EXPORT_CAMERAS
     bl_label = "Export Cameras"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     filename_ext = ".json"
-    filepath: path_property("File", "transforms.json in the folder of the footage", options={"SKIP_SAVE"})
+    filepath: path_property(
+        "File", "transforms.json in the folder of the footage", options={"SKIP_SAVE"}
+    )
     filter_glob: file_filter(".json")
     selected_only: bpy.props.BoolProperty(
         name="Selected Only", description="Export selected cameras instead of all in the scene"

@@ -1,4 +1,5 @@
-"""Exports a mesh object with shape keys as a linear head model, which footage can be tracked with."""
+"""Exports a mesh object with shape keys as a linear head model, which footage can be tracked
+with."""
 
 from typing import Any, ClassVar
 
@@ -12,7 +13,8 @@ from .common import file_filter, file_path, polled, reporting
 
 
 class ExportHeadModel(bpy.types.Operator, ExportHelper):
-    """Export the active object's shape keys as a head model for tracking; keys named identity… make other persons"""
+    """Export the active object's shape keys as a head model for tracking; keys named identity… make
+    other persons"""
 
     bl_idname = ids.EXPORT_HEAD_MODEL
     bl_label = "Export Head Model"

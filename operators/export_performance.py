@@ -9,11 +9,21 @@ from ..stga_addon.driving.inverse import captured_performance, write_performance
 from ..stga_addon.scene.blend_file import frames_per_second
 from ..stga_addon.scene.rig.motion import sample_motion
 from . import ids
-from .common import capture_of, file_filter, file_path, flame_of, head_of, needs_rig, path_property, reporting
+from .common import (
+    capture_of,
+    file_filter,
+    file_path,
+    flame_of,
+    head_of,
+    needs_rig,
+    path_property,
+    reporting,
+)
 
 
 class ExportPerformance(bpy.types.Operator, ExportHelper):
-    """Export expression, jaw, eyes and neck of the head in the scene's frame range as curves of ARKit's 52 shapes"""
+    """Export expression, jaw, eyes and neck of the head in the scene's frame range as curves of
+    ARKit's 52 shapes"""
 
     bl_idname = ids.EXPORT_PERFORMANCE
     bl_label = "Export ARKit Curves"
@@ -31,7 +41,9 @@ class ExportPerformance(bpy.types.Operator, ExportHelper):
         path = file_path(self.filepath, "curves").with_suffix(self.filename_ext)
         own = flame_of(capture_of(head), head.name)
         frames = range(scene.frame_start, scene.frame_end + 1)
-        motion = sample_motion(head, own, frames, lambda sentence: self.report({"WARNING"}, sentence))
+        motion = sample_motion(
+            head, own, frames, lambda sentence: self.report({"WARNING"}, sentence)
+        )
         write_performance(path, captured_performance(motion, head.name, frames_per_second(scene)))
         self.report({"INFO"}, f"Exported {len(frames)} frames to {path}")
         return {"FINISHED"}

@@ -1,4 +1,5 @@
-"""Export of a range of frames beside the user interface: Blender poses the head, a thread writes the files."""
+"""Export of a range of frames beside the user interface: Blender poses the head, a thread writes
+the files."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,7 +18,8 @@ MAX_WAITING_MESHES = 2
 class RangeExport:
     """An export that advances by a frame whenever `step` is called.
 
-    head: what plays; frames: of the scene; write: takes the numbered meshes, and raises StgaError where it fails.
+    head: what plays; frames: of the scene; write: takes the numbered meshes, and raises StgaError
+    where it fails.
     done, total: frames posed so far, and all.
     """
 
@@ -31,7 +33,8 @@ class RangeExport:
         self._thread.start()
 
     def step(self) -> bool:
-        """Pose the next frame if the thread has room for it; whether the thread is still at work."""
+        """Pose the next frame if the thread has room for it; whether the thread is still at
+        work."""
         if not self._is_fed and not self._queue.full():
             frame = next(self._frames, None)
             self._is_fed = frame is None
@@ -40,7 +43,8 @@ class RangeExport:
         return self._thread.is_alive()
 
     def finish(self) -> bool:
-        """End the export, restore the scene's frame; whether it is whole. Raises what the thread failed with."""
+        """End the export, restore the scene's frame; whether it is whole. Raises what the thread
+        failed with."""
         self._frames.close()
         if not self._is_fed:
             with suppress(Empty):

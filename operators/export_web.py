@@ -19,7 +19,8 @@ from .common import capture_of, flame_of
 
 
 def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) -> Playback:
-    """The scene's frame rate, camera, selection groups and upward direction, in the head's space."""
+    """The scene's frame rate, camera, selection groups and upward direction, in the head's
+    space."""
     to_head = np.linalg.inv(np.array(head.matrix_world, np.float64))
     up = to_head[:3, :3] @ [0.0, 0.0, 1.0]
     up /= np.linalg.norm(up)
@@ -36,8 +37,8 @@ def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) ->
 
 
 def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
-    """FLAME parameters of what the head plays; None without a rig, or, after saying why, where they would not give the
-    scene's meshes."""
+    """FLAME parameters of what the head plays; None without a rig, or, after saying why, where they
+    would not give the scene's meshes."""
     reasons: list[str] = []
     try:
         rig_of(head)
@@ -61,5 +62,7 @@ def _scene_camera(context: Any, to_head: np.ndarray) -> dict[str, Camera]:
         return {}
     pose = to_head @ found.camera_to_world_gl
     pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
-    seen = camera_from_gl(pose, found.width, found.height, found.fl_x, found.fl_y, found.cx, found.cy)
+    seen = camera_from_gl(
+        pose, found.width, found.height, found.fl_x, found.fl_y, found.cx, found.cy
+    )
     return {bpy.path.display_name(context.scene.camera.name, has_ext=False): seen}

@@ -29,8 +29,12 @@ class CopyReport(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         training = monitor.state_of(context.scene, Kind.TRAINING).folder
-        folder = training if training and not self.directory else file_path(self.directory, "folder")
+        folder = (
+            training if training and not self.directory else file_path(self.directory, "folder")
+        )
         versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
-        context.window_manager.clipboard = f"{versions}\n{failure_report(folder, monitor.inspect_status(folder))}"
+        context.window_manager.clipboard = (
+            f"{versions}\n{failure_report(folder, monitor.inspect_status(folder))}"
+        )
         self.report({"INFO"}, "Copied to the clipboard")
         return {"FINISHED"}

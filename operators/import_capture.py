@@ -31,14 +31,17 @@ from .prepare import begin_preparing
 
 
 class ImportCapture(bpy.types.Operator, FileImport):
-    """Import a multi-view capture: the tracked head, animated over its frames, and its cameras with images"""
+    """Import a multi-view capture: the tracked head, animated over its frames, and its cameras with
+    images"""
 
     bl_idname = ids.IMPORT_CAPTURE
     bl_label = "Import Capture"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     filepath: path_property(
-        "File", "Transforms file of the capture, such as transforms_train.json; or its folder", options={"SKIP_SAVE"}
+        "File",
+        "Transforms file of the capture, such as transforms_train.json; or its folder",
+        options={"SKIP_SAVE"},
     )
     directory: path_property(
         "Capture",
@@ -51,7 +54,11 @@ class ImportCapture(bpy.types.Operator, FileImport):
         name="Principal Point",
         description="Meaning of cx and cy in the transforms files",
         items=(
-            ("vhap", "VHAP", "cy is counted from the bottom of the image, as VHAP's exporter writes it"),
+            (
+                "vhap",
+                "VHAP",
+                "cy is counted from the bottom of the image, as VHAP's exporter writes it",
+            ),
             ("opencv", "OpenCV", "cx and cy are counted from the top left corner of the image"),
             ("center", "Image Center", "cx and cy are ignored, as GaussianAvatars does"),
         ),
@@ -62,7 +69,11 @@ class ImportCapture(bpy.types.Operator, FileImport):
         description="FLAME joints that get pose correctives: shape keys, with drivers, that correct the mesh",
         items=(
             ("all", "All Joints", "Every bone can be posed by hand and gives FLAME's exact mesh"),
-            ("moving", "Moving Joints", "Joints that move in this capture only: fewer shape keys and drivers"),
+            (
+                "moving",
+                "Moving Joints",
+                "Joints that move in this capture only: fewer shape keys and drivers",
+            ),
         ),
     )
     set_up_scene: bpy.props.BoolProperty(
@@ -76,17 +87,28 @@ class ImportCapture(bpy.types.Operator, FileImport):
     @reporting
     def execute(self, context: Any) -> set[str]:
         folder = _capture_folder(file_path(self.filepath or self.directory, "capture"))
-        bring_in(self, context, folder, self.flame, self.principal_point, self.set_up_scene, self.correctives)
+        bring_in(
+            self,
+            context,
+            folder,
+            self.flame,
+            self.principal_point,
+            self.set_up_scene,
+            self.correctives,
+        )
         return {"FINISHED"}
 
 
 def _capture_folder(path: Path) -> Path:
-    """The folder of a capture that is given by its folder or a transforms file. Raises StgaError for another file."""
+    """The folder of a capture that is given by its folder or a transforms file. Raises StgaError
+    for another file."""
     if not path.is_file():
         return path
     if path.suffix.lower() == ".json" and path.name.startswith("transforms"):
         return path.parent
-    raise StgaError(f"{path}: is not a transforms file; choose a capture's transforms_train.json, or its folder")
+    raise StgaError(
+        f"{path}: is not a transforms file; choose a capture's transforms_train.json, or its folder"
+    )
 
 
 def bring_in(
@@ -98,7 +120,8 @@ def bring_in(
     set_up_scene: bool = False,
     correctives: str = "all",
 ) -> None:
-    """Import what `open_capture` reads from `source`, and make it the scene's head. Raises StgaError."""
+    """Import what `open_capture` reads from `source`, and make it the scene's head. Raises
+    StgaError."""
 
     def warn(sentence: str) -> None:
         operator.report({"WARNING"}, sentence)
@@ -130,7 +153,8 @@ def bring_in(
 
 
 def _open(context: Any, source: Path, flame: str, principal_point: str) -> Capture:
-    """The capture, with the FLAME model that is given, else its own, else that of the preferences. Raises StgaError."""
+    """The capture, with the FLAME model that is given, else its own, else that of the preferences.
+    Raises StgaError."""
     has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
     model = None if has_model else flame_model_path(context, flame)
     return open_capture(source, flame=model, principal_point=principal_point)
@@ -142,7 +166,8 @@ def _show_first_frame(scene: Any, capture: Capture) -> None:
 
 
 def _hide_start_up_cube(context: Any) -> None:
-    """Hide the cube of Blender's start-up scene where it is as it came: 2 m wide, it would enclose the head."""
+    """Hide the cube of Blender's start-up scene where it is as it came: 2 m wide, it would enclose
+    the head."""
     cube = context.view_layer.objects.get("Cube")
     if cube is None or cube.library or cube.type != "MESH" or len(cube.data.vertices) != 8:
         return

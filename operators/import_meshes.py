@@ -17,7 +17,9 @@ class ImportMeshes(bpy.types.Operator, FileImport):
     bl_label = "Import Mesh Sequence"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    filepath: path_property("File", "Any mesh of the sequence; the whole folder is imported", options={"SKIP_SAVE"})
+    filepath: path_property(
+        "File", "Any mesh of the sequence; the whole folder is imported", options={"SKIP_SAVE"}
+    )
     filter_glob: file_filter(*MESH_SUFFIXES)
 
     @reporting

@@ -11,7 +11,8 @@ from .import_capture import bring_in
 
 
 class ImportMotion(bpy.types.Operator, FileImport):
-    """Import FLAME parameters (VHAP, GaussianAvatars, plain expression and pose) as a rigged, animated head"""
+    """Import FLAME parameters (VHAP, GaussianAvatars, plain expression and pose) as a rigged,
+    animated head"""
 
     bl_idname = ids.IMPORT_MOTION
     bl_label = "Import FLAME Motion"
@@ -25,6 +26,8 @@ class ImportMotion(bpy.types.Operator, FileImport):
     def execute(self, context: Any) -> set[str]:
         path = file_path(self.filepath, "motion")
         if flame_model_path(context, self.flame) is None:
-            raise StgaError(f"{path}: holds FLAME parameters; choose your FLAME model in the add-on's preferences")
+            raise StgaError(
+                f"{path}: holds FLAME parameters; choose your FLAME model in the add-on's preferences"
+            )
         bring_in(self, context, path, self.flame)
         return {"FINISHED"}

@@ -26,7 +26,8 @@ def _needs_splats(operator: Any, context: Any) -> bool:
 
 
 class EstimateLight(bpy.types.Operator):
-    """Find out the light of the capture that the avatar was trained on, so that the scene can light the avatar"""
+    """Find out the light of the capture that the avatar was trained on, so that the scene can light
+    the avatar"""
 
     bl_idname = ids.ESTIMATE_LIGHT
     bl_label = "Estimate Light"
@@ -41,12 +42,15 @@ class EstimateLight(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         run = file_path(self.directory or scene_settings(context).run_folder, "run folder")
-        start(context.scene, Relight(run, flame=flame_model_path(context)), training_python(context))
+        start(
+            context.scene, Relight(run, flame=flame_model_path(context)), training_python(context)
+        )
         return {"FINISHED"}
 
 
 class RelightFrame(bpy.types.Operator):
-    """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other frames keep them"""
+    """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other
+    frames keep them"""
 
     bl_idname = ids.RELIGHT_FRAME
     bl_label = "Relight Frame for EEVEE and Cycles"
@@ -69,7 +73,8 @@ class RelightFrame(bpy.types.Operator):
 
 
 class HeadShadow(bpy.types.Operator):
-    """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen; again: hide it"""
+    """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen;
+    again: hide it"""
 
     bl_idname = ids.HEAD_SHADOW
     bl_label = "Shadow onto the Scene"

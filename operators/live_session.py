@@ -1,4 +1,5 @@
-"""The live session: what a phone or program sends, on the scene's head, at most one in this Blender."""
+"""The live session: what a phone or program sends, on the scene's head, at most one in this
+Blender."""
 
 import gc
 from collections import deque
@@ -23,7 +24,13 @@ from ..stga_addon.driving.live.sources import (
     resting,
     row_of,
 )
-from ..stga_addon.driving.open_motion import MotionOptions, TrainedRange, at_strength, corrected, frames_of
+from ..stga_addon.driving.open_motion import (
+    MotionOptions,
+    TrainedRange,
+    at_strength,
+    corrected,
+    frames_of,
+)
 from ..stga_addon.driving.performance import EXCHANGEABLE, FacePacket, Performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.rig.motion import LivePose
@@ -38,7 +45,8 @@ SLOWEST_TICKS = 600
 
 @dataclass(frozen=True)
 class Target:
-    """A head that can be driven: how it is posed, its map and the range that its avatar was trained on."""
+    """A head that can be driven: how it is posed, its map and the range that its avatar was trained
+    on."""
 
     scene: str
     pose: LivePose
@@ -61,7 +69,8 @@ class LiveSession:
         self._ticks: deque[float] = deque(maxlen=SLOWEST_TICKS)
 
     def tick(self) -> float | None:
-        """Read what has arrived and pose the head; seconds until the next call, None where the head is gone."""
+        """Read what has arrived and pose the head; seconds until the next call, None where the head
+        is gone."""
         begin = monotonic()
         if not self._target.pose.is_there or self.scene not in bpy.data.scenes:
             self.close()
@@ -94,7 +103,8 @@ class LiveSession:
         return max(self._ticks, default=0.0)
 
     def calibrate(self) -> None:
-        """The performer's face of now is the resting one. Raises StgaError before the first face."""
+        """The performer's face of now is the resting one. Raises StgaError before the first
+        face."""
         if not self._recent:
             raise StgaError("Drive: no face has been received yet")
         self.rest = resting(list(self._recent))
@@ -128,7 +138,9 @@ class LiveSession:
                 scene.frame_set(scene.frame_current)
 
     def _options(self) -> MotionOptions:
-        return live_options(getattr(bpy.data.scenes[self.scene], ids.SETTINGS).drive, self.rest is not None)
+        return live_options(
+            getattr(bpy.data.scenes[self.scene], ids.SETTINGS).drive, self.rest is not None
+        )
 
     def _show(self, packet: FacePacket, now: float) -> None:
         options = self._options()
@@ -153,7 +165,8 @@ class LiveSession:
 
 
 def live_options(settings: Any, calibrated: bool) -> MotionOptions:
-    """The panel's options of a live source, whose resting face is taken off where it is calibrated."""
+    """The panel's options of a live source, whose resting face is taken off where it is
+    calibrated."""
     exchange = tuple(pair for pair in EXCHANGEABLE if getattr(settings, f"exchange_{pair}"))
     return MotionOptions(
         strength=settings.strength,
@@ -186,8 +199,8 @@ def start(target: Target, receiver: Receiver) -> LiveSession:
 
 
 def write_take(recording: Recording, folder: Path) -> Path:
-    """Write what was recorded as the next take of a folder. Raises StgaError for fewer than two packets, and where it
-    cannot be written."""
+    """Write what was recorded as the next take of a folder. Raises StgaError for fewer than two
+    packets, and where it cannot be written."""
     performance = recording.performance()
     if performance is None:
         raise StgaError("Record: fewer than two faces were received; nothing was recorded")
@@ -200,7 +213,8 @@ def write_take(recording: Recording, folder: Path) -> Path:
 
 @persistent
 def _show_again(scene: Any, depsgraph: Any) -> None:
-    """The scene's own animation posed the head: pose it live again, so that it does not flicker between two packets.
+    """The scene's own animation posed the head: pose it live again, so that it does not flicker
+    between two packets.
 
     Rendered animations keep their own pose.
     """

@@ -1,7 +1,8 @@
-"""Request monitor: the one timer, which reads the status of workers and brings their results into their scenes.
+"""Request monitor: the one timer, which reads the status of workers and brings their results into
+their scenes.
 
-What is to be done is decided by `jobs.monitor_state`; this module reads files, owns the timer and carries out
-effects, those that depend on the kind of request by the table in `results`.
+What is to be done is decided by `jobs.monitor_state`; this module reads files, owns the timer and
+carries out effects, those that depend on the kind of request by the table in `results`.
 """
 
 import shutil
@@ -21,7 +22,13 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
 from ..stga_addon.jobs import monitor_state as states
 from ..stga_addon.jobs.folder import PICTURE, PREVIEW, remove_request, request_folder
-from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, SLICE_INTERVAL_S, RequestState, RunFiles, transition
+from ..stga_addon.jobs.monitor_state import (
+    CHECK_INTERVAL_S,
+    SLICE_INTERVAL_S,
+    RequestState,
+    RunFiles,
+    transition,
+)
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.report import curve_image
@@ -30,13 +37,19 @@ from ..stga_addon.scene.avatar_scene import open_sidebar
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
-from ..stga_addon.worker.status import WorkerSnapshot, inspect_worker, refuse_running_worker, request_cancel
+from ..stga_addon.worker.status import (
+    WorkerSnapshot,
+    inspect_worker,
+    refuse_running_worker,
+    request_cancel,
+)
 from . import ids
 from .common import is_head
 from .results import IN_SCENE, loader
 
 Curve = tuple[np.ndarray, str, str]
-"""Pixels of a run's curve, the ranges of its axes and of the detail difference; or those of a tracking's picture."""
+"""Pixels of a run's curve, the ranges of its axes and of the detail difference; or those of a
+tracking's picture."""
 
 _states: dict[tuple[int, Kind], RequestState] = {}
 """Session id of a scene and kind -> its request."""
@@ -62,7 +75,8 @@ _requests_due = 0.0
 
 
 def watch(thing: Watched) -> None:
-    """Call `thing` from the timer until it returns None, the file is closed, or the extension ends."""
+    """Call `thing` from the timer until it returns None, the file is closed, or the extension
+    ends."""
     _watched.append(thing)
     _restart_timer()
 
@@ -74,7 +88,8 @@ def unwatch(thing: Watched) -> None:
 
 
 def state_of(scene: Any, kind: Kind) -> RequestState:
-    """The scene's request as the timer last saw it; without a window, where no timer runs, as it is."""
+    """The scene's request as the timer last saw it; without a window, where no timer runs, as it
+    is."""
     state = _states.get(_key(scene, kind))
     if has_timer():
         if state is None:
@@ -88,12 +103,16 @@ def state_of(scene: Any, kind: Kind) -> RequestState:
 
 
 def curve(run: Path) -> Curve | None:
-    """The curve of a run as the timer last read it, or the picture of a tracking; None before there is one."""
+    """The curve of a run as the timer last read it, or the picture of a tracking; None before there
+    is one."""
     return _curves.get(run)
 
 
-def follow(scene: Any, kind: Kind, subject: Path, folder: Path, process: "Popen[bytes] | None" = None) -> None:
-    """The request in the folder is that of the scene. process: its worker; None: this process carries it out."""
+def follow(
+    scene: Any, kind: Kind, subject: Path, folder: Path, process: "Popen[bytes] | None" = None
+) -> None:
+    """The request in the folder is that of the scene. process: its worker; None: this process
+    carries it out."""
     _processes.pop(folder, None)
     if process is not None:
         _processes[folder] = process
@@ -101,8 +120,11 @@ def follow(scene: Any, kind: Kind, subject: Path, folder: Path, process: "Popen[
 
 
 def finish(scene: Any, kind: Kind) -> RequestState:
-    """Bring the result of a request that was waited for into the scene; what `Train` made is stored, not shown."""
-    state = _handle(scene, kind, _read_status(scene, _states[_key(scene, kind)], kind != Kind.TRAINING))
+    """Bring the result of a request that was waited for into the scene; what `Train` made is
+    stored, not shown."""
+    state = _handle(
+        scene, kind, _read_status(scene, _states[_key(scene, kind)], kind != Kind.TRAINING)
+    )
     while state.loading is not None:
         state = _handle(scene, kind, states.SceneFree())
         if state.loading is not None:
@@ -119,7 +141,8 @@ def cancel(scene: Any, kind: Kind) -> None:
 
 
 def dismiss(scene: Any, kind: Kind) -> None:
-    """Forget the request and remove its files. Raises StgaError where its worker is running, or they cannot be."""
+    """Forget the request and remove its files. Raises StgaError where its worker is running, or
+    they cannot be."""
     _handle(scene, kind, states.Dismissed())
 
 
@@ -142,15 +165,15 @@ def has_timer() -> bool:
 
 
 def tick() -> float | None:
-    """Check every request, and call what is watched; seconds until the next call, None to stop the timer, as
-    bpy.app.timers expects."""
+    """Check every request, and call what is watched; seconds until the next call, None to stop the
+    timer, as bpy.app.timers expects."""
     intervals = [_check_requests(), *(_call_safely(thing) for thing in list(_watched))]
     return min((interval for interval in intervals if interval is not None), default=None)
 
 
 def _check_requests() -> float | None:
-    """Check every request, unless the timer runs faster for something else and it is too early; seconds until the next
-    check, None where nothing is expected."""
+    """Check every request, unless the timer runs faster for something else and it is too early;
+    seconds until the next check, None where nothing is expected."""
     global _requests_due
     now = monotonic()
     if _watched and now < _requests_due:
@@ -163,7 +186,8 @@ def _check_requests() -> float | None:
 
 
 def _call_safely(thing: Watched) -> float | None:
-    """Call what is watched; after an unexpected error, which is reported, it is closed and called no more."""
+    """Call what is watched; after an unexpected error, which is reported, it is closed and called
+    no more."""
     try:
         interval = thing.tick()
     except Exception as error:
@@ -176,11 +200,16 @@ def _call_safely(thing: Watched) -> float | None:
 
 
 def _check_safely(scene: Any, kind: Kind) -> float | None:
-    """Check one request; an unexpected error is reported once, and ends the monitoring of this request only."""
+    """Check one request; an unexpected error is reported once, and ends the monitoring of this
+    request only."""
     try:
         return _check(scene, kind)
     except Exception as error:
-        _handle(scene, kind, states.Failed(f"Monitoring stopped after an unexpected {_describe(error)}", stops=True))
+        _handle(
+            scene,
+            kind,
+            states.Failed(f"Monitoring stopped after an unexpected {_describe(error)}", stops=True),
+        )
         return None
 
 
@@ -191,7 +220,11 @@ def _check(scene: Any, kind: Kind) -> float | None:
     if not state.building:
         state = _handle(scene, kind, _read_status(scene, state))
     # Blender crashes where a mesh changes during these.
-    if state.loading is not None and not bpy.app.is_job_running("RENDER") and not _is_edited(scene, kind):
+    if (
+        state.loading is not None
+        and not bpy.app.is_job_running("RENDER")
+        and not _is_edited(scene, kind)
+    ):
         state = _handle(scene, kind, states.SceneFree())
     return state.interval_s
 
@@ -221,14 +254,17 @@ def _stored_state(scene: Any, kind: Kind) -> RequestState:
 
 
 def _read_stored(scene: Any, kind: Kind) -> tuple[Path | None, bool]:
-    settings, (subject, result_shown) = getattr(scene, ids.SETTINGS), IN_SCENE[kind].stored or ("", "")
+    settings, (subject, result_shown) = (
+        getattr(scene, ids.SETTINGS),
+        IN_SCENE[kind].stored or ("", ""),
+    )
     path = getattr(settings, subject)
     return Path(path) if path else None, getattr(settings, result_shown)
 
 
 def _locate(scene: Any, state: RequestState) -> Path | None:
-    """The request's folder; where a run is gone, that in the scene's run folder, which may have moved along with the
-    .blend file."""
+    """The request's folder; where a run is gone, that in the scene's run folder, which may have
+    moved along with the .blend file."""
     if state.kind not in STORED or state.subject is None:
         return state.folder
     named = request_folder(state.subject)
@@ -248,14 +284,18 @@ def _read_scene(scene: Any, kind: Kind) -> RequestState:
     return _states[key]
 
 
-def _read_status(scene: Any, state: RequestState, show_result: bool | None = None) -> states.StatusRead:
+def _read_status(
+    scene: Any, state: RequestState, show_result: bool | None = None
+) -> states.StatusRead:
     folder = _locate(scene, state)
     assert folder is not None
     if state.kind not in STORED:
         return states.StatusRead(folder, inspect_status(folder))
     settings, run = getattr(scene, ids.SETTINGS), replace(state, folder=folder).run
     files = RunFiles(
-        _stamp(folder.parent / CAPTURE_FOLDER / SPLIT_FILES[0]) if state.kind == Kind.AVATAR else None,
+        _stamp(folder.parent / CAPTURE_FOLDER / SPLIT_FILES[0])
+        if state.kind == Kind.AVATAR
+        else None,
         _stamp(folder / PICTURE),
         *map(_stamp, (folder / PREVIEW, run / AVATAR, run / METRICS, run / TRACKING)),
     )
@@ -319,7 +359,8 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
 def _show(scene: Any, state: RequestState) -> states.Event | None:
     try:
         return IN_SCENE[state.kind].show(scene, state)
-    except (StgaError, RuntimeError) as error:  # RuntimeError: Blender refuses, for example on linked objects
+    # RuntimeError: Blender refuses, for example on linked objects
+    except (StgaError, RuntimeError) as error:
         return states.Failed(str(error).strip().removeprefix("Error: "))
     except Exception as error:
         return states.Failed(f"Unexpected {_describe(error)}")
@@ -353,7 +394,11 @@ def _read_picture(folder: Path | None) -> Curve | None:
         return None
     if rgb is None or rgb.ndim != 3 or rgb.dtype != np.uint8:
         return None
-    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])[::-1].astype(np.float32) / 255, "", ""
+    return (
+        np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])[::-1].astype(np.float32) / 255,
+        "",
+        "",
+    )
 
 
 def _push_undo() -> None:
@@ -412,7 +457,8 @@ def _after_load(_: Any) -> None:
 
 
 def _adopt(scene: Any) -> None:
-    """Let the panel work on the one head, and the splats, of a file that was made without it, as `stga demo` does."""
+    """Let the panel work on the one head, and the splats, of a file that was made without it, as
+    `stga demo` does."""
     settings = getattr(scene, ids.SETTINGS)
     heads = [thing for thing in scene.objects if is_head(thing)]
     shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]

@@ -26,7 +26,9 @@ class OpenDemo(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return polled(cls, BUNDLED.is_dir(), "Only the complete edition of the add-on brings the demo capture")
+        return polled(
+            cls, BUNDLED.is_dir(), "Only the complete edition of the add-on brings the demo capture"
+        )
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -38,12 +40,15 @@ class OpenDemo(bpy.types.Operator):
 
 
 def _own_copy() -> Path:
-    """The capture in Blender's folder for user files, where an update of the add-on leaves it in place."""
+    """The capture in Blender's folder for user files, where an update of the add-on leaves it in
+    place."""
     folder = Path(bpy.utils.extension_path_user(package(), path="demo", create=True)) / "capture"
     try:
         shutil.copytree(BUNDLED, folder, dirs_exist_ok=True)
     except (OSError, shutil.Error) as error:
-        raise StgaError(f"{folder}: cannot be written ({getattr(error, 'strerror', None) or error})") from error
+        raise StgaError(
+            f"{folder}: cannot be written ({getattr(error, 'strerror', None) or error})"
+        ) from error
     return folder
 
 

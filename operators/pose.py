@@ -15,7 +15,8 @@ from .common import head_of, needs_rig, reporting
 
 
 class PoseHead(bpy.types.Operator):
-    """Show the bones and select one in Pose mode; again: back to Object mode. R turns a bone, I keeps its pose"""
+    """Show the bones and select one in Pose mode; again: back to Object mode. R turns a bone, I
+    keeps its pose"""
 
     bl_idname = ids.POSE_HEAD
     bl_label = "Pose the Head"

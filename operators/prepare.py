@@ -1,4 +1,5 @@
-"""Compiles what a training runs before the first one is asked for, in a folder that uninstalling removes."""
+"""Compiles what a training runs before the first one is asked for, in a folder that uninstalling
+removes."""
 
 import os
 import subprocess
@@ -21,9 +22,13 @@ _processes: list["subprocess.Popen[bytes]"] = []
 
 
 def begin_preparing(context: Any) -> None:
-    """Compile in the background what the first training would wait for; nothing without a window, without a
-    Python that trains, or where it is compiled or is being compiled."""
-    if bpy.app.background or CACHE_VARIABLE not in os.environ or has_kernels(cache_folder() / KERNELS):
+    """Compile in the background what the first training would wait for; nothing without a window,
+    without a Python that trains, or where it is compiled or is being compiled."""
+    if (
+        bpy.app.background
+        or CACHE_VARIABLE not in os.environ
+        or has_kernels(cache_folder() / KERNELS)
+    ):
         return
     if any(process.poll() is None for process in _processes):
         return
@@ -33,7 +38,9 @@ def begin_preparing(context: Any) -> None:
 
 def register() -> None:
     with suppress(ValueError):  # a checkout, which is no extension
-        os.environ.setdefault(CACHE_VARIABLE, bpy.utils.extension_path_user(package(), path="cache"))
+        os.environ.setdefault(
+            CACHE_VARIABLE, bpy.utils.extension_path_user(package(), path="cache")
+        )
     if not bpy.app.background:
         bpy.app.timers.register(_begin, first_interval=START_DELAY_S)
 

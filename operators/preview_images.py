@@ -6,15 +6,20 @@ import bpy
 
 from ..stga_addon.scene.display.display_modes import LIMITS, POINTS, QUADS
 from ..stga_addon.scene.display.splat_nodes import DISPLAY
-from ..stga_addon.scene.display.splat_object import set_input, shows_nodes, use_transparent_bounces, view_transform_hint
+from ..stga_addon.scene.display.splat_object import (
+    set_input,
+    shows_nodes,
+    use_transparent_bounces,
+    view_transform_hint,
+)
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from . import ids
 from .common import polled, reporting
 
 
 class PreviewImages(bpy.types.Operator):
-    """Show all splats as images by EEVEE and Cycles show them: through the scene's camera as quads that face it,
-    without a camera as points. Choose the display As Trained to go back"""
+    """Show all splats as images by EEVEE and Cycles show them: through the scene's camera as quads
+    that face it, without a camera as points. Choose the display As Trained to go back"""
 
     bl_idname = ids.PREVIEW_IMAGES
     bl_label = "Preview for EEVEE/Cycles"
@@ -37,10 +42,18 @@ class PreviewImages(bpy.types.Operator):
             if scene.camera is not None:
                 context.space_data.region_3d.view_perspective = "CAMERA"
         hint = view_transform_hint(scene)
-        self.report({"WARNING" if hint else "INFO"}, f"{mode}: {LIMITS[mode]}" + (f". {hint}" if hint else ""))
+        self.report(
+            {"WARNING" if hint else "INFO"},
+            f"{mode}: {LIMITS[mode]}" + (f". {hint}" if hint else ""),
+        )
         return {"FINISHED"}
 
 
 def _own_as_trained(context: Any) -> list[Any]:
-    """The splat objects that are displayed as trained, but linked ones, whose display cannot be changed."""
-    return [thing for thing in context.view_layer.objects if thing.library is None and is_shown_as_trained(thing)]
+    """The splat objects that are displayed as trained, but linked ones, whose display cannot be
+    changed."""
+    return [
+        thing
+        for thing in context.view_layer.objects
+        if thing.library is None and is_shown_as_trained(thing)
+    ]

@@ -1,4 +1,5 @@
-"""Registers the GPU display and the render engine, and says who renders where Blender has no GPU context."""
+"""Registers the GPU display and the render engine, and says who renders where Blender has no GPU
+context."""
 
 import bpy
 

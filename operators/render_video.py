@@ -1,4 +1,5 @@
-"""Renders a video of the shown splats: Blender records what each image shows, a worker renders and encodes it."""
+"""Renders a video of the shown splats: Blender records what each image shows, a worker renders and
+encodes it."""
 
 import shutil
 import tempfile
@@ -27,7 +28,15 @@ from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.render.view_transform import srgb_background
 from ..stga_addon.worker.status import status_writer
 from . import ids, monitor
-from .common import file_filter, file_path, is_head, path_property, polled, reporting, scene_settings
+from .common import (
+    file_filter,
+    file_path,
+    is_head,
+    path_property,
+    polled,
+    reporting,
+    scene_settings,
+)
 from .options import option_property
 from .render_engine import render_device
 from .request import needs_idle, start
@@ -39,19 +48,30 @@ RECORDING_INTERVAL_S = 0.001
 
 
 class RenderVideo(bpy.types.Operator, ExportHelper):
-    """Render the splats as an MP4 video or as PNGs, in a process beside Blender: go on working meanwhile"""
+    """Render the splats as an MP4 video or as PNGs, in a process beside Blender: go on working
+    meanwhile"""
 
     bl_idname = ids.RENDER_VIDEO
     bl_label = "Render Video"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    filepath: path_property("File or Folder", "An .mp4 file, or a folder for PNGs", options={"SKIP_SAVE"})
+    filepath: path_property(
+        "File or Folder", "An .mp4 file, or a folder for PNGs", options={"SKIP_SAVE"}
+    )
     path: bpy.props.EnumProperty(
         name="Camera",
         description="How the camera moves",
         items=(
-            ("turntable", "Turntable", "The scene's camera moves around the head, which plays its motion to and fro"),
-            ("scene", "As Animated", "The scene's camera and animation, from the scene's first to its last frame"),
+            (
+                "turntable",
+                "Turntable",
+                "The scene's camera moves around the head, which plays its motion to and fro",
+            ),
+            (
+                "scene",
+                "As Animated",
+                "The scene's camera and animation, from the scene's first to its last frame",
+            ),
         ),
     )
     format: bpy.props.EnumProperty(
@@ -80,7 +100,9 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             return False
         if not needs_idle(cls, context, Kind.VIDEO):
             return False
-        message = "Needs a GPU, or a Python that trains, which is chosen in the add-on's preferences"
+        message = (
+            "Needs a GPU, or a Python that trains, which is chosen in the add-on's preferences"
+        )
         return polled(cls, has_training_python(context) or has_gpu_context(), message)
 
     def check(self, context: Any) -> bool:
@@ -105,7 +127,9 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         )
         if bpy.app.background:
             return self._record_and_render(context)
-        self._timer = context.window_manager.event_timer_add(RECORDING_INTERVAL_S, window=context.window)
+        self._timer = context.window_manager.event_timer_add(
+            RECORDING_INTERVAL_S, window=context.window
+        )
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -150,7 +174,9 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         frames = list(range(scene.frame_start, scene.frame_end + 1))
         if self.path == "scene":
             return frames
-        return to_and_fro(frames, max(len(frames), round(self.seconds * frames_per_second(scene)), 1))
+        return to_and_fro(
+            frames, max(len(frames), round(self.seconds * frames_per_second(scene)), 1)
+        )
 
     def _cameras(self, context: Any, count: int) -> Sequence[Camera] | None:
         """One camera per frame of `count`, None for the scene's own at each frame."""
@@ -162,13 +188,20 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
 
 
 class _Recording:
-    """Records the images of a video, one scene frame at a time; the scene's frame is restored at the end.
+    """Records the images of a video, one scene frame at a time; the scene's frame is restored at
+    the end.
 
-    Until the worker takes over, this process is that of the request in the folder, and writes its status.
+    Until the worker takes over, this process is that of the request in the folder, and writes its
+    status.
     """
 
     def __init__(
-        self, context: Any, output: Path, frames: Sequence[int], cameras: Sequence[Camera] | None, drawn: bool
+        self,
+        context: Any,
+        output: Path,
+        frames: Sequence[int],
+        cameras: Sequence[Camera] | None,
+        drawn: bool,
     ) -> None:
         self._scene, self._frames, self._cameras = context.scene, frames, cameras
         self._shown = context.scene.frame_current, context.scene.frame_subframe
@@ -184,7 +217,9 @@ class _Recording:
             self._status = self._files.enter_context(status_writer(self.folder))
             failed.callback(self._files.close)
             self._recorder = Recorder(self.folder / RECORDING)
-            self._drawn = DrawnVideo(self.folder, output, srgb_background(context.scene)) if drawn else None
+            self._drawn = (
+                DrawnVideo(self.folder, output, srgb_background(context.scene)) if drawn else None
+            )
             self._status.update(0.0, "Recording")
             monitor.follow(context.scene, Kind.VIDEO, output, self.folder)
             monitor.check_now(context.scene, Kind.VIDEO)
@@ -255,4 +290,6 @@ def _temporary_folder() -> Path:
     try:
         return Path(tempfile.mkdtemp(prefix="stga_video_"))
     except OSError as error:
-        raise StgaError(f"{tempfile.gettempdir()}: cannot be written ({error.strerror or error})") from error
+        raise StgaError(
+            f"{tempfile.gettempdir()}: cannot be written ({error.strerror or error})"
+        ) from error

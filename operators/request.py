@@ -1,4 +1,5 @@
-"""Requests from Blender: starting a worker for one, or carrying it out here; cancelling and dismissing it."""
+"""Requests from Blender: starting a worker for one, or carrying it out here; cancelling and
+dismissing it."""
 
 import shutil
 import sys
@@ -11,7 +12,16 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.folder import check_request, request_folder, worker_arguments, write_request
-from ..stga_addon.jobs.table import DISMISSIBLE, JOBS, KINDS, STORED, TRAINS, TRANSIENT, Kind, Request
+from ..stga_addon.jobs.table import (
+    DISMISSIBLE,
+    JOBS,
+    KINDS,
+    STORED,
+    TRAINS,
+    TRANSIENT,
+    Kind,
+    Request,
+)
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, failure_report, inspect_worker
 from ..stga_addon.worker.training_python import missing_packages
@@ -20,20 +30,24 @@ from .common import polled, reporting
 from .training_python import training_python
 
 
-def start(scene: Any, request: Request, python: str | None, folder: Path | None = None, wait: bool = False) -> bool:
+def start(
+    scene: Any, request: Request, python: str | None, folder: Path | None = None, wait: bool = False
+) -> bool:
     """Start a worker for a request about the scene, whose result the monitor brings into the scene.
 
     python: the worker's interpreter; None: Blender's own carries the request out, here and now.
-    folder: of the request; None: in the run or capture, or a temporary one. wait: for the end, as always without a
-    window. Returns whether it was waited for.
-    Raises StgaError for what is known to fail, while a worker is there, and where the interpreter cannot be started;
-    where it was waited for, also with the error of the worker or of its result.
+    folder: of the request; None: in the run or capture, or a temporary one. wait: for the end, as
+    always without a window. Returns whether it was waited for. Raises StgaError for what is known
+    to fail, while a worker is there, and where the interpreter cannot be started; where it was
+    waited for, also with the error of the worker or of its result.
     """
     job = JOBS[type(request)]
     kind, subject = job.kind, getattr(request, job.subject)
     assert kind is not None
     if folder is None:
-        folder = request_folder(subject) if kind in STORED else Path(tempfile.mkdtemp(prefix="stga_"))
+        folder = (
+            request_folder(subject) if kind in STORED else Path(tempfile.mkdtemp(prefix="stga_"))
+        )
     try:
         process = _write_and_start(folder, request, python)
     except StgaError:
@@ -64,7 +78,8 @@ def _write_and_start(folder: Path, request: Request, python: str | None) -> "Pop
 
 
 def _perform_here(folder: Path) -> None:
-    """Carry out the request in the folder in Blender's own Python, with Blender's progress at the pointer.
+    """Carry out the request in the folder in Blender's own Python, with Blender's progress at the
+    pointer.
 
     Raises what the work raises.
     """
@@ -92,7 +107,8 @@ def final_snapshot(folder: Path, process: "Popen[bytes] | None") -> WorkerSnapsh
 
 
 def python_of(operator: Any, context: Any) -> str | None:
-    """The interpreter that is to carry out a request; None: that of Blender, where it waits and has the packages.
+    """The interpreter that is to carry out a request; None: that of Blender, where it waits and has
+    the packages.
 
     Raises StgaError where there is none.
     """
@@ -103,15 +119,23 @@ def python_of(operator: Any, context: Any) -> str | None:
 
 def needs_idle(operator: Any, context: Any, *kinds: Kind) -> bool:
     """Poll: whether no request of these kinds is running."""
-    running = next((kind for kind in kinds if monitor.state_of(context.scene, kind).is_running), None)
-    return running is None or polled(operator, False, f"{KINDS[running].label} is running; wait, or cancel it")
+    running = next(
+        (kind for kind in kinds if monitor.state_of(context.scene, kind).is_running), None
+    )
+    return running is None or polled(
+        operator, False, f"{KINDS[running].label} is running; wait, or cancel it"
+    )
 
 
 def _kind_property(kinds: Any) -> Any:
     return bpy.props.EnumProperty(
         name="Request",
         description="What was asked for",
-        items=[(kind.value, kind.value.capitalize(), KINDS[kind].label) for kind in Kind if kind in kinds],
+        items=[
+            (kind.value, kind.value.capitalize(), KINDS[kind].label)
+            for kind in Kind
+            if kind in kinds
+        ],
     )
 
 
@@ -143,7 +167,8 @@ class Cancel(bpy.types.Operator):
 
 
 class Dismiss(bpy.types.Operator):
-    """Remove status and log of a request that has ended; what it made stays, such as a run with its checkpoints"""
+    """Remove status and log of a request that has ended; what it made stays, such as a run with its
+    checkpoints"""
 
     bl_idname = ids.DISMISS
     bl_label = "Dismiss"
@@ -153,7 +178,9 @@ class Dismiss(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        has_ended = any(monitor.state_of(context.scene, kind).can_be_dismissed for kind in DISMISSIBLE)
+        has_ended = any(
+            monitor.state_of(context.scene, kind).can_be_dismissed for kind in DISMISSIBLE
+        )
         return polled(cls, has_ended, "Nothing has ended in this scene that could be dismissed")
 
     @reporting

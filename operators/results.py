@@ -41,9 +41,11 @@ Answer = SliceBuilt | Shown | None
 class InScene:
     """What a kind of request is in the scene.
 
-    show     puts what was loaded into the scene; None: it is still being read. Raises StgaError or RuntimeError
+    show     puts what was loaded into the scene; None: it is still being read. Raises StgaError or
+             RuntimeError
     changed  the object that `show` changes, which has to leave Edit Mode before
-    stored   properties of the scene's settings: the subject's path, and whether its result was shown
+    stored   properties of the scene's settings: the subject's path, and whether its result was
+             shown
     """
 
     show: Callable[[Any, RequestState], Answer] = lambda scene, state: Shown()
@@ -56,9 +58,14 @@ def _head(scene: Any, state: RequestState) -> Any:
 
 
 def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
-    """Call an operator, which reports in the window that shows the scene, if there is one; undo takes it back there."""
-    window = next((each for each in bpy.context.window_manager.windows if each.scene == scene), None)
-    with bpy.context.temp_override(**({"window": window} if window is not None else {"scene": scene})):
+    """Call an operator, which reports in the window that shows the scene, if there is one; undo
+    takes it back there."""
+    window = next(
+        (each for each in bpy.context.window_manager.windows if each.scene == scene), None
+    )
+    with bpy.context.temp_override(
+        **({"window": window} if window is not None else {"scene": scene})
+    ):
         operator("EXEC_DEFAULT", window is not None, **options)
     return Shown()
 
@@ -80,7 +87,8 @@ def _run_object(scene: Any, state: RequestState) -> Any:
 
 
 def _show_avatar(scene: Any, state: RequestState) -> Answer:
-    """Show the avatar that was loaded, in the object that shows this run or in a new one, a slice at a time."""
+    """Show the avatar that was loaded, in the object that shows this run or in a new one, a slice
+    at a time."""
     loaded = loader.result(scene)
     if loaded is None:
         return None
@@ -94,7 +102,9 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
     return answer
 
 
-def _present(scene: Any, state: RequestState, avatar: Avatar, attributes: SplatAttributes) -> Answer:
+def _present(
+    scene: Any, state: RequestState, avatar: Avatar, attributes: SplatAttributes
+) -> Answer:
     head, shown = _head(scene, state), _run_object(scene, state)
     if not is_head(head):
         raise StgaError("No head in the scene to show the avatar on; import the capture")
@@ -124,7 +134,8 @@ class _Loader:
         self._loading[scene.session_uid] = self._pool.submit(_load, path)
 
     def result(self, scene: Any) -> tuple[Avatar, SplatAttributes] | None:
-        """The file's content; None while it is being read. Raises StgaError where it cannot be read."""
+        """The file's content; None while it is being read. Raises StgaError where it cannot be
+        read."""
         future = self._loading[scene.session_uid]
         return future.result() if future.done() else None
 
@@ -164,8 +175,8 @@ def _import(scene: Any, capture: Path, model: Path | None) -> Shown:
 
 
 def _show_made(scene: Any, state: RequestState) -> Answer:
-    """Import the capture once it is tracked; then show the previews and the avatar, at last on the head that training
-    refined."""
+    """Import the capture once it is tracked; then show the previews and the avatar, at last on the
+    head that training refined."""
     assert state.folder is not None
     assert state.loading is not None
     head, settings = _head(scene, state), getattr(scene, ids.SETTINGS)
@@ -177,9 +188,19 @@ def _show_made(scene: Any, state: RequestState) -> Answer:
         assert isinstance(request, MakeAvatar)
         return _import(scene, state.loading, request.track.model)
     answer = _show_avatar(scene, state)
-    if isinstance(answer, Shown) and state.loading.name == AVATAR and state.files.tracking is not None:
+    if (
+        isinstance(answer, Shown)
+        and state.loading.name == AVATAR
+        and state.files.tracking is not None
+    ):
         first = head[tags.TIMESTEPS][0]
-        _operate(scene, bpy.ops.stga.apply_motion, filepath=str(state.run / TRACKING), own_offsets=True, start=first)
+        _operate(
+            scene,
+            bpy.ops.stga.apply_motion,
+            filepath=str(state.run / TRACKING),
+            own_offsets=True,
+            start=first,
+        )
     return answer
 
 
@@ -221,7 +242,9 @@ def _apply_performance(scene: Any, state: RequestState) -> Answer:
     head = _head(scene, state)
     if not is_head(head):
         raise StgaError(f"{state.subject}: was written, but the scene has no head to apply it to")
-    return _operate(scene, bpy.ops.stga.apply_motion, filepath=str(state.subject), start=scene.frame_start)
+    return _operate(
+        scene, bpy.ops.stga.apply_motion, filepath=str(state.subject), start=scene.frame_start
+    )
 
 
 def _store_light(scene: Any, state: RequestState) -> Answer:
@@ -230,7 +253,9 @@ def _store_light(scene: Any, state: RequestState) -> Answer:
     shown = getattr(scene, ids.SETTINGS).splats
     avatar = read_avatar(state.subject / AVATAR)
     if shown is None or not store_light(shown, avatar):
-        raise StgaError(f"{state.subject}: its avatar is not the one that the scene shows; show it again")
+        raise StgaError(
+            f"{state.subject}: its avatar is not the one that the scene shows; show it again"
+        )
     return Shown(undoable=True)
 
 

@@ -9,27 +9,51 @@ import numpy as np
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import RESIDUAL, has_heat_map, hide_heat_map, show_heat_map, shows_residuals
-from ..stga_addon.scene.vertex_groups import read_regions, read_selection, splats_per_face, write_selection
+from ..stga_addon.scene.display.heat_map import (
+    RESIDUAL,
+    has_heat_map,
+    hide_heat_map,
+    show_heat_map,
+    shows_residuals,
+)
+from ..stga_addon.scene.vertex_groups import (
+    read_regions,
+    read_selection,
+    splats_per_face,
+    write_selection,
+)
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.training.run.folder import read_residuals
 from ..stga_addon.training.settings import TrainingSettings
 from . import ids
-from .common import capture_of, file_path, head_of, needs_head, needs_own_head, path_property, reporting, scene_settings
+from .common import (
+    capture_of,
+    file_path,
+    head_of,
+    needs_head,
+    needs_own_head,
+    path_property,
+    reporting,
+    scene_settings,
+)
 from .options import option_property
 
 LARGEST_RESIDUAL_QUANTILE = 0.98
-"""Triangles with residuals from here up are shown alike, so that a few at the border do not make all others blue."""
+"""Triangles with residuals from here up are shown alike, so that a few at the border do not make
+all others blue."""
 
 
 class Select(bpy.types.Operator):
-    """Select the triangles that move from the neutral face in each frame, as one vertex group for each frame"""
+    """Select the triangles that move from the neutral face in each frame, as one vertex group for
+    each frame"""
 
     bl_idname = ids.SELECT
     bl_label = "Select Moving Triangles"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    threshold: option_property(SelectionOptions, "threshold", soft_max=0.05, step=0.1, precision=4, unit="LENGTH")
+    threshold: option_property(
+        SelectionOptions, "threshold", soft_max=0.05, step=0.1, precision=4, unit="LENGTH"
+    )
     zero_pose: option_property(
         SelectionOptions, "zero_pose", "Ignore", labels={"head": "Head Motion", "all": "Whole Pose"}
     )
@@ -45,9 +69,13 @@ class Select(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         head = head_of(context)
-        names = [name.strip() for name in self.regions.split(",") if name.strip()] or key_regions(head)
+        names = [name.strip() for name in self.regions.split(",") if name.strip()] or key_regions(
+            head
+        )
         capture = _with_painted(capture_of(head), head, names)
-        selection = select_capture(capture, SelectionOptions(self.threshold, self.zero_pose, tuple(names)))
+        selection = select_capture(
+            capture, SelectionOptions(self.threshold, self.zero_pose, tuple(names))
+        )
         write_selection(head, selection)
         head[tags.KEY_REGIONS] = "\n".join(names)
         count_selected(context.scene, head)
@@ -56,7 +84,8 @@ class Select(bpy.types.Operator):
         moving = [faces.mean() for faces in selection.values() if faces.any()]
         share = 100 * sum(moving) / len(moving) if moving else 0.0
         self.report(
-            {"INFO"}, f"{len(moving)} of {len(selection)} frames select triangles, {share:.0f} % of the head on average"
+            {"INFO"},
+            f"{len(moving)} of {len(selection)} frames select triangles, {share:.0f} % of the head on average",
         )
         return {"FINISHED"}
 
@@ -68,7 +97,9 @@ class ToggleRegion(bpy.types.Operator):
     bl_label = "Key Region"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO", "INTERNAL"}
 
-    name: bpy.props.StringProperty(name="Name", description="A region of the capture, or a vertex group of the head")
+    name: bpy.props.StringProperty(
+        name="Name", description="A region of the capture, or a vertex group of the head"
+    )
 
     poll = classmethod(needs_own_head)
 
@@ -78,13 +109,18 @@ class ToggleRegion(bpy.types.Operator):
         if self.name not in possible_regions(head):
             raise StgaError(f"{head.name}: has no region and no vertex group '{self.name}'")
         names = key_regions(head)
-        names = [name for name in names if name != self.name] if self.name in names else [*names, self.name]
+        names = (
+            [name for name in names if name != self.name]
+            if self.name in names
+            else [*names, self.name]
+        )
         head[tags.KEY_REGIONS] = "\n".join(names)
         return {"FINISHED"}
 
 
 class CountSelected(bpy.types.Operator):
-    """Update the number of triangles and splats that each frame trains, after painting vertex groups"""
+    """Update the number of triangles and splats that each frame trains, after painting vertex
+    groups"""
 
     bl_idname = ids.COUNT_SELECTED
     bl_label = "Update Counts"
@@ -99,27 +135,37 @@ class CountSelected(bpy.types.Operator):
 
 
 class HeatMap(bpy.types.Operator):
-    """Color the head's triangles, in the viewport and in renders: by how often each is selected, or by the error of
-    the trained avatar there"""
+    """Color the head's triangles, in the viewport and in renders: by how often each is selected, or
+    by the error of the trained avatar there"""
 
     bl_idname = ids.HEAT_MAP
     bl_label = "Heat Map"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     show: bpy.props.BoolProperty(
-        name="Show", description="Off: restore the head's own colors", default=True, options={"SKIP_SAVE"}
+        name="Show",
+        description="Off: restore the head's own colors",
+        default=True,
+        options={"SKIP_SAVE"},
     )
     of: bpy.props.EnumProperty(
         name="Of",
         description="What the colors show",
         items=(
             ("SELECTION", "Selection", "How often each triangle is selected"),
-            ("RESIDUAL", "Residual", "Mean error of the run's avatar on each triangle over all views: where to refine"),
+            (
+                "RESIDUAL",
+                "Residual",
+                "Mean error of the run's avatar on each triangle over all views: where to refine",
+            ),
         ),
         options={"SKIP_SAVE"},
     )
     directory: path_property(
-        "Run Folder", "Folder of the run whose residuals are shown", "DIR_PATH", options={"SKIP_SAVE"}
+        "Run Folder",
+        "Folder of the run whose residuals are shown",
+        "DIR_PATH",
+        options={"SKIP_SAVE"},
     )
 
     poll = classmethod(needs_own_head)
@@ -134,7 +180,11 @@ class HeatMap(bpy.types.Operator):
         else:
             self._show_shares(head)
         in_view = context.view_layer.objects
-        if splats is not None and in_view.get(splats.name) is splats and in_view.get(head.name) is head:
+        if (
+            splats is not None
+            and in_view.get(splats.name) is splats
+            and in_view.get(head.name) is head
+        ):
             # Only one of the two: each covers the other.
             splats.hide_set(self.show)
             head.hide_set(not self.show)
@@ -144,26 +194,43 @@ class HeatMap(bpy.types.Operator):
     def _show_shares(self, head: Any) -> None:
         share = _shares(head)
         if not share.any():
-            raise StgaError(f"{head.name}: no frame selects a triangle yet; select moving triangles first")
+            raise StgaError(
+                f"{head.name}: no frame selects a triangle yet; select moving triangles first"
+            )
         show_heat_map(head, share)
-        self.report({"INFO"}, f"The most selected triangle is selected in {share.max():.0%} of the frames")
+        self.report(
+            {"INFO"}, f"The most selected triangle is selected in {share.max():.0%} of the frames"
+        )
 
     def _show_residuals(self, head: Any) -> None:
         folder = file_path(self.directory, "run folder")
         residual = np.nan_to_num(read_residuals(folder, len(head.data.polygons)))
-        largest = float(np.quantile(residual[residual > 0], LARGEST_RESIDUAL_QUANTILE)) if residual.any() else 1.0
+        largest = (
+            float(np.quantile(residual[residual > 0], LARGEST_RESIDUAL_QUANTILE))
+            if residual.any()
+            else 1.0
+        )
         show_heat_map(head, residual, RESIDUAL, largest)
-        self.report({"INFO"}, f"Red: a mean error of {100 * largest:.1f} % of full brightness or more")
+        self.report(
+            {"INFO"}, f"Red: a mean error of {100 * largest:.1f} % of full brightness or more"
+        )
 
 
 def possible_regions(head: Any) -> list[str]:
-    """What can be selected as a whole: regions of the capture, and vertex groups of neither selection nor rig."""
+    """What can be selected as a whole: regions of the capture, and vertex groups of neither
+    selection nor rig."""
     names = [name for name in head.data.attributes.keys() if name.startswith(tags.REGION_PREFIX)]  # noqa: SIM118
-    rigs = [modifier.object for modifier in head.modifiers if modifier.type == "ARMATURE" and modifier.object]
+    rigs = [
+        modifier.object
+        for modifier in head.modifiers
+        if modifier.type == "ARMATURE" and modifier.object
+    ]
     bones = {bone.name for rig in rigs for bone in rig.data.bones}
     groups = [group.name for group in head.vertex_groups if tags.group_timestep(group.name) is None]
     painted = [name for name in groups if name not in bones]
-    return list(dict.fromkeys([*(name.removeprefix(tags.REGION_PREFIX) for name in names), *painted]))
+    return list(
+        dict.fromkeys([*(name.removeprefix(tags.REGION_PREFIX) for name in names), *painted])
+    )
 
 
 def key_regions(head: Any) -> list[str]:
@@ -174,13 +241,16 @@ def key_regions(head: Any) -> list[str]:
 
 
 def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
-    """The capture with the named vertex groups as regions; a painted group replaces a region of the same name."""
+    """The capture with the named vertex groups as regions; a painted group replaces a region of the
+    same name."""
     painted = read_regions(head, [name for name in names if name in head.vertex_groups])
     for name in names:
         if name not in painted and name not in capture.regions:
             raise StgaError(f"{head.name}: has no region and no vertex group '{name}'")
         if name in painted and not painted[name].any():
-            raise StgaError(f"{head.name}: no triangle has all its corners in the vertex group '{name}'")
+            raise StgaError(
+                f"{head.name}: no triangle has all its corners in the vertex group '{name}'"
+            )
     return replace(capture, regions={**capture.regions, **painted})
 
 
@@ -194,7 +264,9 @@ def count_selected(scene: Any, head: Any) -> None:
     for timestep, selected in read_selection(head).items():
         row = settings.selected_frames.add()
         row.frame, row.triangles = timestep, int(selected.sum())
-        row.splats = int(selected.sum()) * every if per_face is None else int(per_face[selected].sum())
+        row.splats = (
+            int(selected.sum()) * every if per_face is None else int(per_face[selected].sum())
+        )
 
 
 def _shares(head: Any) -> np.ndarray:
@@ -203,7 +275,8 @@ def _shares(head: Any) -> np.ndarray:
 
 
 def _color_viewports(context: Any, kind: str) -> None:
-    """Set the color type of solid mode in every viewport of the screen; without a window there is none."""
+    """Set the color type of solid mode in every viewport of the screen; without a window there is
+    none."""
     for area in context.screen.areas if context.screen else ():
         if area.type == "VIEW_3D":
             area.spaces.active.shading.color_type = kind

@@ -1,4 +1,5 @@
-"""Selects, frame by frame, the triangles that extending a run by this take would train, before anything is trained."""
+"""Selects, frame by frame, the triangles that extending a run by this take would train, before
+anything is trained."""
 
 from typing import Any, ClassVar
 
@@ -13,12 +14,13 @@ from .training_python import training_python
 
 
 class SelectExtension(bpy.types.Operator):
-    """Select the triangles that extending the run by this head's take would train in each frame: those that move, and
-    those that look different than in the run's images"""
+    """Select the triangles that extending the run by this head's take would train in each frame:
+    those that move, and those that look different than in the run's images"""
 
     bl_idname = ids.SELECT_EXTENSION
     bl_label = "Select What Extend Trains"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}  # the selection, which comes later, is the step to undo
+    # the selection, which comes later, is the step to undo
+    bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     directory: path_property("Run Folder", "Folder of the run to extend", "DIR_PATH")
 

@@ -9,7 +9,15 @@ from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes
 from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
 from . import ids
-from .common import FileImport, file_filter, file_path, head_of, needs_head, reporting, scene_settings
+from .common import (
+    FileImport,
+    file_filter,
+    file_path,
+    head_of,
+    needs_head,
+    reporting,
+    scene_settings,
+)
 
 
 class ShowAvatar(bpy.types.Operator, FileImport):
@@ -37,13 +45,21 @@ class ShowAvatar(bpy.types.Operator, FileImport):
         show_world(path, head)
         scene_settings(context).avatar = self.filepath
         if self.hide_head and head.library is not None:
-            self.report({"WARNING"}, f"{head.name}: is linked, and covers the splats in renders; hide it in its file")
+            self.report(
+                {"WARNING"},
+                f"{head.name}: is linked, and covers the splats in renders; hide it in its file",
+            )
         self.report({"INFO"}, f"{len(avatar.splats)} splats")
         return {"FINISHED"}
 
 
 def show(
-    scene: Any, avatar: Avatar, head: Any, name: str, hide_head: bool = True, attributes: SplatAttributes | None = None
+    scene: Any,
+    avatar: Avatar,
+    head: Any,
+    name: str,
+    hide_head: bool = True,
+    attributes: SplatAttributes | None = None,
 ) -> Any:
     """Show the avatar on the head, and make the splat object the one that the panel works on.
 

@@ -32,11 +32,14 @@ class TrackOptions:
             ("folder", "Folder", "Those of a folder, named as the images"),
         ],
     )
-    matte_folder: path_property("Matte Folder", "Folder of masks, named as the images of the footage", "DIR_PATH")
+    matte_folder: path_property(
+        "Matte Folder", "Folder of masks, named as the images of the footage", "DIR_PATH"
+    )
 
 
 class TrackFootage(bpy.types.Operator, TrackOptions):
-    """Track the head that the footage shows, in a process that continues when Blender is closed, and import it"""
+    """Track the head that the footage shows, in a process that continues when Blender is closed,
+    and import it"""
 
     bl_idname = ids.TRACK_FOOTAGE
     bl_label = "Track Footage"
@@ -59,16 +62,28 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
         names = ("footage", "cameras", "model", "landmarks", "focal", "start", "stop", "step")
         given = {"model": None, **given_values(self, Track, *names)}
         out = file_path(self.directory, "capture").resolve()
-        mattes = str(file_path(self.matte_folder, "mattes").resolve()) if self.mattes == "folder" else self.mattes
-        request, python = Track(**given, out=out, mattes=mattes), training_python(context, self.python)
+        mattes = (
+            str(file_path(self.matte_folder, "mattes").resolve())
+            if self.mattes == "folder"
+            else self.mattes
+        )
+        request, python = (
+            Track(**given, out=out, mattes=mattes),
+            training_python(context, self.python),
+        )
         return start_tracking(self, context, request, python)
 
 
-def start_tracking(operator: Any, context: Any, request: Track | SolveAgain, python: str) -> set[str]:
-    """Start a worker for the request, whose capture is imported when it is done; without a window, wait for that.
+def start_tracking(
+    operator: Any, context: Any, request: Track | SolveAgain, python: str
+) -> set[str]:
+    """Start a worker for the request, whose capture is imported when it is done; without a window,
+    wait for that.
 
     Raises StgaError.
     """
     if start(context.scene, request, python):
-        operator.report({"INFO"}, f"Tracked {request.out if isinstance(request, Track) else request.capture}")
+        operator.report(
+            {"INFO"}, f"Tracked {request.out if isinstance(request, Track) else request.capture}"
+        )
     return {"FINISHED"}

@@ -1,4 +1,5 @@
-"""Shows a tracked head over its cameras' images, and solves it again around frames that were posed by hand."""
+"""Shows a tracked head over its cameras' images, and solves it again around frames that were posed
+by hand."""
 
 import json
 from pathlib import Path
@@ -16,7 +17,17 @@ from ..stga_addon.scene.rig.flame_rig import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
 from . import ids
-from .common import capture_of, flame_of, head_of, is_head, needs_head, needs_rig, polled, reporting, scene_settings
+from .common import (
+    capture_of,
+    flame_of,
+    head_of,
+    is_head,
+    needs_head,
+    needs_rig,
+    polled,
+    reporting,
+    scene_settings,
+)
 from .request import needs_idle
 from .track import start_tracking
 from .training_python import training_python
@@ -25,14 +36,17 @@ XRAY_ALPHA = 0.4
 
 
 class ViewFootage(bpy.types.Operator):
-    """Look through the capture's cameras, at their images behind the see-through head; again: back to the free view"""
+    """Look through the capture's cameras, at their images behind the see-through head; again: back
+    to the free view"""
 
     bl_idname = ids.VIEW_FOOTAGE
     bl_label = "Look Through Camera"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     step: bpy.props.IntProperty(
-        name="Step", description="1: the next camera, -1: the one before, 0: enter and leave", options={"SKIP_SAVE"}
+        name="Step",
+        description="1: the next camera, -1: the one before, 0: enter and leave",
+        options={"SKIP_SAVE"},
     )
 
     @classmethod
@@ -48,7 +62,8 @@ class ViewFootage(bpy.types.Operator):
             raise StgaError("The capture has no cameras in this scene; import it again")
         space, scene = context.space_data, context.scene
         leave = self.step == 0 and space.region_3d.view_perspective == "CAMERA"
-        show_kind(head.parent, tags.CAMERA, context.view_layer, not leave)  # a hidden camera shows no images
+        # a hidden camera shows no images
+        show_kind(head.parent, tags.CAMERA, context.view_layer, not leave)
         if leave:
             space.region_3d.view_perspective, space.shading.show_xray = "PERSP", False
             return {"FINISHED"}
@@ -56,12 +71,17 @@ class ViewFootage(bpy.types.Operator):
         scene.camera = cameras[(row + self.step) % len(cameras)]
         scene.render.resolution_x, scene.render.resolution_y = scene.camera[tags.IMAGE_SIZE]
         space.region_3d.view_perspective = "CAMERA"
-        space.shading.type, space.shading.show_xray, space.shading.xray_alpha = "SOLID", True, XRAY_ALPHA
+        space.shading.type, space.shading.show_xray, space.shading.xray_alpha = (
+            "SOLID",
+            True,
+            XRAY_ALPHA,
+        )
         return {"FINISHED"}
 
 
 class MarkKey(bpy.types.Operator):
-    """Keep the pose and expression of this frame, set by hand, as a key for Solve Again; on a key: no longer"""
+    """Keep the pose and expression of this frame, set by hand, as a key for Solve Again; on a key:
+    no longer"""
 
     bl_idname = ids.MARK_KEY
     bl_label = "Mark as Key"
@@ -83,12 +103,15 @@ class MarkKey(bpy.types.Operator):
         else:
             keys[frame] = sample_pose(head, flame_of(capture_of(head), head.name).model).parameters
             key_current_pose(head, rig_of(head), frame)
-        head[tags.TRACKING_KEYS] = json.dumps({str(timestep): keys[timestep].tolist() for timestep in sorted(keys)})
+        head[tags.TRACKING_KEYS] = json.dumps(
+            {str(timestep): keys[timestep].tolist() for timestep in sorted(keys)}
+        )
         return {"FINISHED"}
 
 
 class SolveAgain(bpy.types.Operator):
-    """Solve the tracked capture again around the keys, in a process beside Blender, and import it"""
+    """Solve the tracked capture again around the keys, in a process beside Blender, and import
+    it"""
 
     bl_idname = ids.SOLVE_AGAIN
     bl_label = "Solve Again"

@@ -21,7 +21,9 @@ from .training_python import test
 
 def preset_property(**more: Any) -> Any:
     """Training preset: of the operator, and of the panel, which also takes over its time."""
-    purposes = [(name, name.capitalize(), preset.purpose.capitalize()) for name, preset in PRESETS.items()]
+    purposes = [
+        (name, name.capitalize(), preset.purpose.capitalize()) for name, preset in PRESETS.items()
+    ]
     return bpy.props.EnumProperty(
         name="Preset",
         description="Accuracy, and with it training time",
@@ -58,8 +60,12 @@ class DeviceOptions:
 class TrainOptions(DeviceOptions):
     """How an avatar is trained: of the operator, and of the panel that calls it."""
 
-    minutes: bpy.props.FloatProperty(name="Minutes", description="Training time", default=5.0, min=0.01)
-    strategy: option_property(TrainingSettings, "strategy", labels={"gaussian-avatars": "GaussianAvatars"})
+    minutes: bpy.props.FloatProperty(
+        name="Minutes", description="Training time", default=5.0, min=0.01
+    )
+    strategy: option_property(
+        TrainingSettings, "strategy", labels={"gaussian-avatars": "GaussianAvatars"}
+    )
     preset: preset_property()
 
 
@@ -86,7 +92,8 @@ class TrainingOperator:
 
 
 class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
-    """Train the avatar on the capture's images, in a process that continues when Blender is closed"""
+    """Train the avatar on the capture's images, in a process that continues when Blender is
+    closed"""
 
     bl_idname = ids.TRAIN
     bl_label = "Train Avatar"
@@ -113,26 +120,50 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
         run = file_path(self.directory, "run folder").resolve()
         capture, flame, principal_point = capture_source(head)
         if not capture.is_dir():
-            raise StgaError(f"{capture}: is not a folder; expected the capture that the head was imported from")
+            raise StgaError(
+                f"{capture}: is not a folder; expected the capture that the head was imported from"
+            )
         if self.resume:
             # The head may be that of any take.
             moved = None if read_run(run).takes else capture
-            return Resume(run, moved, flame, principal_point, device_of(self), training_selection(head))
-        effects = None if self.strategy == "gaussian-avatars" else dict(map(parse_choice, self.effects.split()))
+            return Resume(
+                run, moved, flame, principal_point, device_of(self), training_selection(head)
+            )
+        effects = (
+            None
+            if self.strategy == "gaussian-avatars"
+            else dict(map(parse_choice, self.effects.split()))
+        )
         preset = None if self.preset == "none" else self.preset
-        budget = {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
-        settings = make_settings(self.strategy, preset=preset, seed=self.seed, effects=effects, **budget)
+        budget = (
+            {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
+        )
+        settings = make_settings(
+            self.strategy, preset=preset, seed=self.seed, effects=effects, **budget
+        )
         return TrainRequest(
-            run, capture, settings, flame, principal_point, device=device_of(self), selection=training_selection(head)
+            run,
+            capture,
+            settings,
+            flame,
+            principal_point,
+            device=device_of(self),
+            selection=training_selection(head),
         )
 
 
 def device_of(operator: Any) -> str:
     """What `choose_device` takes, of an operator with `DeviceOptions`."""
-    return f"gpu:{operator.adapter}" if operator.device == "gpu" and operator.adapter else str(operator.device)
+    return (
+        f"gpu:{operator.adapter}"
+        if operator.device == "gpu" and operator.adapter
+        else str(operator.device)
+    )
 
 
-def start_training(operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend) -> set[str]:
+def start_training(
+    operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend
+) -> set[str]:
     """Start a training, or wait for it. Raises StgaError."""
     if start(context.scene, request, python_of(operator, context), wait=operator.wait):
         operator.report({"INFO"}, f"Trained {request.run}")

@@ -88,15 +88,17 @@ test = _Test()
 
 
 class TestPython(bpy.types.Operator):
-    """Start the Python that tracks and trains, and report its versions of torch and numba and its device, or what it
-    lacks"""
+    """Start the Python that tracks and trains, and report its versions of torch and numba and its
+    device, or what it lacks"""
 
     bl_idname = ids.TEST_PYTHON
     bl_label = "Test"
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     python: bpy.props.StringProperty(
-        name="Python", description="The interpreter to test; empty: the one that trains", subtype="FILE_PATH"
+        name="Python",
+        description="The interpreter to test; empty: the one that trains",
+        subtype="FILE_PATH",
     )
 
     @classmethod

@@ -1,3 +1,4 @@
-"""STGA: selective-training Gaussian head avatars. Importing this package needs nothing but Python."""
+"""STGA: selective-training Gaussian head avatars. Importing this package needs nothing but
+Python."""
 
 __version__ = "0.2.0"

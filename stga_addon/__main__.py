@@ -1,4 +1,5 @@
-"""`python -m stga_addon`: the command line, which says in one sentence where this Python lacks a package."""
+"""`python -m stga_addon`: the command line, which says in one sentence where this Python lacks a
+package."""
 
 import sys
 

@@ -16,8 +16,8 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 class StgaError(Exception):
     """A failure with a cause outside the code: bad file, bad option, full disk.
 
-    The message is one sentence that names the file, the field and what was expected. The command line
-    prints it and exits with 2; Blender's operators report it; neither shows a traceback.
+    The message is one sentence that names the file, the field and what was expected. The command
+    line prints it and exits with 2; Blender's operators report it; neither shows a traceback.
     """
 
     def __init__(self, message: str) -> None:
@@ -36,7 +36,8 @@ class DeviceError(StgaError):
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Of a program that does this work: 0, or 2 after a StgaError, whose sentence goes to stderr."""
+    """Of a program that does this work: 0, or 2 after a StgaError, whose sentence goes to
+    stderr."""
     try:
         work()
     except StgaError as error:
@@ -46,8 +47,11 @@ def exit_code(work: Callable[[], object]) -> int:
 
 
 def one_line(message: str) -> str:
-    """The message in bounded length, with control characters and lone surrogates (of a path, say) as escapes."""
-    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS))
+    """The message in bounded length, with control characters and lone surrogates (of a path, say)
+    as escapes."""
+    return _UNPRINTABLE.sub(
+        lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS)
+    )
 
 
 def shorten(value: object) -> str:

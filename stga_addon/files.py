@@ -30,12 +30,16 @@ MAX_TOML_BYTES = 16 << 20
 MAX_UNPACKED_BYTES = 4 << 30
 """Of an npz: a checkpoint of four million splats."""
 MAX_HEADER_BYTES = 1 << 16
-PARTIAL_NAME = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL)
+PARTIAL_NAME = re.compile(
+    r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
+)
 """Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
 RENAME_PATIENCE_S, RENAME_INTERVAL_S = 5.0, 0.1
-"""How long, and how often, a rename is tried again while another program has the file open, on Windows."""
+"""How long, and how often, a rename is tried again while another program has the file open, on
+Windows."""
 WINDOWS_SHARING_ERRORS = (5, 32)
-"""ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION: what Windows says of renaming over an open file."""
+"""ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION: what Windows says of renaming over an open
+file."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
 SEQUENCE_FILE = ".stga_sequence"
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
@@ -44,11 +48,12 @@ _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 
 @contextmanager
 def replacing(path: Path, patience_s: float = RENAME_PATIENCE_S) -> Iterator[Path]:
-    """Yield an empty temporary file beside `path`; rename it over `path` when the block succeeds, else delete it.
+    """Yield an empty temporary file beside `path`; rename it over `path` when the block succeeds,
+    else delete it.
 
     The first call for a folder also removes what killed processes left there (`remove_leftovers`).
-    patience_s: how long the rename is tried again while another program has `path` open, on Windows.
-    Raises StgaError where the folder cannot be written, or `path` is a folder or a device.
+    patience_s: how long the rename is tried again while another program has `path` open, on
+    Windows. Raises StgaError where the folder cannot be written, or `path` is a folder or a device.
     """
     with replacing_together(patience_s) as new_file, new_file(path) as partial:
         yield partial
@@ -56,9 +61,11 @@ def replacing(path: Path, patience_s: float = RENAME_PATIENCE_S) -> Iterator[Pat
 
 @contextmanager
 def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFile]:
-    """Yield a function like `replacing` whose files are renamed together when this block succeeds, else all deleted.
+    """Yield a function like `replacing` whose files are renamed together when this block succeeds,
+    else all deleted.
 
-    A failure also removes the folders that were made for the files. Raises StgaError as `replacing` does.
+    A failure also removes the folders that were made for the files. Raises StgaError as `replacing`
+    does.
     """
     partials: dict[Path, Path] = {}
     made_folders: list[Path] = []
@@ -67,7 +74,9 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
     def new_file(path: Path) -> Iterator[Path]:
         if not path.name or (os.path.exists(path) and not os.path.isfile(path)):
             raise StgaError(f"{path}: cannot be written (is not a regular file)")
-        partial = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial")
+        partial = path.with_name(
+            f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
+        )
         with _naming(path):
             _make_folders(path.parent, made_folders)
             partials[path] = partial
@@ -92,31 +101,43 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
 
 
 class NumberedFiles:
-    """The numbered files of a folder, which replace those of an earlier sequence there, and nobody else's.
+    """The numbered files of a folder, which replace those of an earlier sequence there, and nobody
+    else's.
 
-    SEQUENCE_FILE in the folder lists what was written: name, bytes and time of modification in nanoseconds, a line
-    each; files with such a name that are not listed so are not touched.
+    SEQUENCE_FILE in the folder lists what was written: name, bytes and time of modification in
+    nanoseconds, a line each; files with such a name that are not listed so are not touched.
     """
 
     def __init__(self, folder: Path, names: re.Pattern[str]) -> None:
-        """names: of the files, matched as a whole. Raises StgaError where the folder holds one that is not listed."""
+        """names: of the files, matched as a whole. Raises StgaError where the folder holds one that
+        is not listed."""
         self.folder, self._names, self._written = folder, names, dict[str, str]()
         self._list = folder / SEQUENCE_FILE
-        listed = set(self._list.read_text(errors="replace").splitlines()) if self._list.is_file() else set()
+        listed = (
+            set(self._list.read_text(errors="replace").splitlines())
+            if self._list.is_file()
+            else set()
+        )
         with _naming(folder):
-            self._earlier = [path for path in self._found() if self._line(path.name, path) in listed]
+            self._earlier = [
+                path for path in self._found() if self._line(path.name, path) in listed
+            ]
             other = next((path.name for path in self._found() if path not in self._earlier), None)
         if other is not None:
-            raise StgaError(f"{folder}: holds {other}, which was not written here; choose another folder")
+            raise StgaError(
+                f"{folder}: holds {other}, which was not written here; choose another folder"
+            )
 
     def add(self, name: str, content: Path) -> None:
-        """List a file before it gets its name; `content` is the complete file under a temporary one."""
+        """List a file before it gets its name; `content` is the complete file under a temporary
+        one."""
         with _naming(self._list), self._list.open("a") as stream:
             self._written[name] = self._line(name, content)
             stream.write(self._written[name] + "\n")
 
     def finish(self) -> None:
-        """Remove the earlier sequence's files that none of the written ones replaced, where anything was written.
+        """Remove the earlier sequence's files that none of the written ones replaced, where
+        anything was written.
 
         Raises StgaError where one cannot be removed.
         """
@@ -148,7 +169,8 @@ def _naming(path: Path, done: str = "written") -> Iterator[None]:
 
 
 def _once_free(action: Callable[[], None], patience_s: float) -> None:
-    """Call `action`, again and again for `patience_s` while Windows says that another program has the file open."""
+    """Call `action`, again and again for `patience_s` while Windows says that another program has
+    the file open."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
@@ -175,7 +197,8 @@ def _make_folders(folder: Path, made: list[Path]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise the StgaError of `replacing` where it would not let the file be written; leaves no folder or file behind.
+    """Raise the StgaError of `replacing` where it would not let the file be written; leaves no
+    folder or file behind.
 
     For work that ends in a file after minutes.
     """
@@ -191,13 +214,15 @@ def _create(partial: Path) -> None:
     """Create the file. Raises OSError, also for a name that no file can have."""
     try:
         _remove_leftovers_once(partial.parent)
-        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # O_EXCL follows no symbolic link
+        # O_EXCL follows no symbolic link
+        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     except ValueError as error:  # a null character or a lone surrogate
         raise OSError(str(error)) from error
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that processes of this computer, killed while writing, left in the folder."""
+    """Remove the temporary files that processes of this computer, killed while writing, left in the
+    folder."""
     with suppress(OSError):
         for name in os.listdir(folder):
             match = PARTIAL_NAME.fullmatch(name)
@@ -224,18 +249,22 @@ def _is_running(process: int) -> bool:
 
 
 def file_size(path: Path) -> int:
-    """Size in bytes. Raises StgaError where there is no regular file: reading a pipe or a device need never end."""
+    """Size in bytes. Raises StgaError where there is no regular file: reading a pipe or a device
+    need never end."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        raise StgaError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+        raise StgaError(
+            f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        ) from error
     if not stat.S_ISREG(found.st_mode):
         raise StgaError(f"{path}: cannot be read (is not a regular file)")
     return found.st_size
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """What a file holds. Raises StgaError where it is missing, no regular file or above the limit."""
+    """What a file holds. Raises StgaError where it is missing, no regular file or above the
+    limit."""
     size = file_size(path)
     if size > limit:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
@@ -246,13 +275,17 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing, malformed or above 256 MiB."""
+    """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing, malformed or
+    above 256 MiB."""
     return _parsed(path, "JSON", MAX_JSON_BYTES, parse_json)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Parse a TOML file. Raises StgaError naming the file where it is missing, malformed or above 16 MiB."""
-    found: dict[str, Any] = _parsed(path, "TOML", MAX_TOML_BYTES, lambda data: tomllib.loads(data.decode("utf-8")))
+    """Parse a TOML file. Raises StgaError naming the file where it is missing, malformed or above
+    16 MiB."""
+    found: dict[str, Any] = _parsed(
+        path, "TOML", MAX_TOML_BYTES, lambda data: tomllib.loads(data.decode("utf-8"))
+    )
     return found
 
 
@@ -265,7 +298,8 @@ def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) ->
 
 
 def parse_json(data: bytes) -> Any:
-    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds text that nothing can print."""
+    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds text that nothing can
+    print."""
     value = json.loads(data.decode("utf-8"))
     if b"\\u" in data:  # the only way to write a lone surrogate
         json.dumps(value, ensure_ascii=False).encode("utf-8")
@@ -281,26 +315,36 @@ def write_json(path: Path, value: Any, patience_s: float = RENAME_PATIENCE_S) ->
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read every array of an npz without pickle.
 
-    Raises StgaError naming the file where it is missing, truncated, unpacks to more than 4 GiB or holds objects.
+    Raises StgaError naming the file where it is missing, truncated, unpacks to more than 4 GiB or
+    holds objects.
     """
     file_size(path)  # refuses pipes, whose reading need never end
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())
             if unpacked > MAX_UNPACKED_BYTES:
-                raise StgaError(f"{path}: unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed")
-            return {entry.filename.removesuffix(".npy"): _read_entry(archive, entry) for entry in archive.infolist()}
+                raise StgaError(
+                    f"{path}: unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
+                )
+            return {
+                entry.filename.removesuffix(".npy"): _read_entry(archive, entry)
+                for entry in archive.infolist()
+            }
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except StgaError:
         raise
     except Exception as error:
-        # A damaged archive can make its decompressor or the parser of an array header raise nearly anything.
-        raise StgaError(f"{path}: is not a readable npz file ({error or type(error).__name__})") from error
+        # A damaged archive can make its decompressor or the parser of an array header raise nearly
+        # anything.
+        raise StgaError(
+            f"{path}: is not a readable npz file ({error or type(error).__name__})"
+        ) from error
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read the array of a npy file without pickle. Raises StgaError naming the file, as `read_npz` does."""
+    """Read the array of a npy file without pickle. Raises StgaError naming the file, as `read_npz`
+    does."""
     size = file_size(path)
     try:
         with path.open("rb") as stream:
@@ -308,7 +352,9 @@ def read_npy(path: Path) -> np.ndarray:
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # as above
-        raise StgaError(f"{path}: is not a readable npy file ({error or type(error).__name__})") from error
+        raise StgaError(
+            f"{path}: is not a readable npy file ({error or type(error).__name__})"
+        ) from error
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
@@ -321,14 +367,20 @@ def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
 
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
-    """The array of a npy stream of `size` bytes; numpy alone would allocate whatever the header promises."""
+    """The array of a npy stream of `size` bytes; numpy alone would allocate whatever the header
+    promises."""
     start = stream.read(12).ljust(12, b"\0")
-    length = struct.unpack("<H" if start[6] == 1 else "<L", start[8 : 10 if start[6] == 1 else 12])[0]
+    length = struct.unpack("<H" if start[6] == 1 else "<L", start[8 : 10 if start[6] == 1 else 12])[
+        0
+    ]
     if length > MAX_HEADER_BYTES:
         raise ValueError(f"an array header of {length} bytes")
     stream.seek(0)
     version = np.lib.format.read_magic(stream)  # type: ignore[no-untyped-call]
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
     if version not in readers:
         raise ValueError(f"npy format {version} is not supported")
     shape, _, dtype = readers[version](stream)  # type: ignore[no-untyped-call]
@@ -348,7 +400,8 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = Fals
 def save_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:
     """Write arrays as npz, not atomically. Raises OSError."""
     packing = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
-    # Not numpy's own savez: where the disk is full, it leaves an archive behind that complains when it is collected.
+    # Not numpy's own savez: where the disk is full, it leaves an archive behind that complains when
+    # it is collected.
     with zipfile.ZipFile(path, "w", packing) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as out:

@@ -34,25 +34,37 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
     """Figures of any work as short lines for a narrow panel, without those that are not known yet.
 
     per_second  iterations; left_s: seconds that are left
-    psnr, psnr_unmatched   of the last evaluation, dB, the second one without fitting the exposure of views
-    error_px, unexplained  of a tracked head: median distance from its landmarks, share of the face that images do not
-                           look like
+    psnr, psnr_unmatched   of the last evaluation, dB, the second one without fitting the exposure
+                           of views
+    error_px, unexplained  of a tracked head: median distance from its landmarks, share of the face
+                           that images do not look like
     """
     loss = ("loss", "loss {:.4f}")
     quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)
     if "psnr_unmatched" in figures:
-        quality = (("psnr", "PSNR {:.2f} dB (exposure fitted)"), ("psnr_unmatched", "{:.2f} dB without")), (loss,)
+        quality = (
+            (("psnr", "PSNR {:.2f} dB (exposure fitted)"), ("psnr_unmatched", "{:.2f} dB without")),
+            (loss,),
+        )
     pairs = (
         (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
         *quality,
-        (("error_px", "{:.1f} px off landmarks"), ("unexplained", "{:.0%} of the face unexplained")),
+        (
+            ("error_px", "{:.1f} px off landmarks"),
+            ("unexplained", "{:.0%} of the face unexplained"),
+        ),
         (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
     )
     lines = []
     for pair in pairs:
         known = [
-            (text, figures[name], name) for name, text in pair if figures.get(name) and not math.isnan(figures[name])
+            (text, figures[name], name)
+            for name, text in pair
+            if figures.get(name) and not math.isnan(figures[name])
         ]
-        parts = [text.format(format_duration(value) if name == "left_s" else value) for text, value, name in known]
+        parts = [
+            text.format(format_duration(value) if name == "left_s" else value)
+            for text, value, name in known
+        ]
         lines.append("   ".join(parts).replace(",", "\u202f"))
     return [line for line in lines if line]

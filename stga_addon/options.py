@@ -1,4 +1,5 @@
-"""Fields of dataclasses as options: of the command line here, of Blender's operators in `operators/options.py`."""
+"""Fields of dataclasses as options: of the command line here, of Blender's operators in
+`operators/options.py`."""
 
 import dataclasses
 import errno
@@ -37,15 +38,24 @@ def option(
 ) -> Any:
     """A dataclass field that people choose, with its limits (`schema.setting`).
 
-    help     what it is, for command line and tooltip; of a field that is a dataclass, the title of its options
-    flag     its name on the command line, by default the field's; without dashes: it is given by position
+    help     what it is, for command line and tooltip; of a field that is a dataclass, the title of
+             its options
+    flag     its name on the command line, by default the field's; without dashes: it is given by
+             position
     parse    text -> value, and of a mapping a name and a value, where its type does not say how
     bare     the value where the option is given alone
     offered  those of the field's choices that people have
     group    options of one group exclude each other
     needs    fields that have to be given with it, else it has no effect; of a tuple, one
     """
-    asked = {"help": help, "flag": flag, "metavar": metavar, "parse": parse, "bare": bare, "group": group}
+    asked = {
+        "help": help,
+        "flag": flag,
+        "metavar": metavar,
+        "parse": parse,
+        "bare": bare,
+        "group": group,
+    }
     asked |= {"needs": needs, "offered": offered or limits.get("choices")}
     return setting(default, minimum, maximum, **limits, **asked)
 
@@ -71,7 +81,8 @@ def option_fields(kind: Any) -> Iterator[Any]:
 
 
 def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] = ()) -> None:
-    """Add an argument for each field of a dataclass that is an option, those of its dataclasses in groups.
+    """Add an argument for each field of a dataclass that is an option, those of its dataclasses in
+    groups.
 
     names: some of the fields; none: all. may_lack: fields without a default that need not be given.
     """
@@ -92,7 +103,11 @@ def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] =
 
 def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
     """What `add_argument` takes for a field, by its type."""
-    (kind,), asked, flag = (k for k in alternatives(hint) if k is not NoneType), spec.metadata, flag_of(spec)
+    (kind,), asked, flag = (
+        (k for k in alternatives(hint) if k is not NoneType),
+        spec.metadata,
+        flag_of(spec),
+    )
     is_named = flag.startswith("-")
     form: dict[str, Any] = {"names": (flag,), "dest": spec.name, "required": is_required}
     if not is_named:
@@ -113,12 +128,19 @@ def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
 
 
 def _has_default(spec: Any) -> bool:
-    return spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
+    return (
+        spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
+    )
 
 
 def _help(spec: Any) -> str:
     help, default = str(spec.metadata["help"]), spec.default
-    if isinstance(default, str | int | float) and default and default is not True and "default" not in help:
+    if (
+        isinstance(default, str | int | float)
+        and default
+        and default is not True
+        and "default" not in help
+    ):
         help += f" (default {default})"
     return help.replace("%", "%%")
 
@@ -136,13 +158,18 @@ def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
         if value is None:
             continue
         if isinstance(value, list):
-            value = dict(value) if any(get_origin(part) is Mapping for part in alternatives(hint)) else tuple(value)
+            value = (
+                dict(value)
+                if any(get_origin(part) is Mapping for part in alternatives(hint))
+                else tuple(value)
+            )
         found[spec.name] = value
     return found
 
 
 def refuse_useless(value: Any) -> None:
-    """Raise StgaError for the first option of a dataclass that has no effect without another (`needs`)."""
+    """Raise StgaError for the first option of a dataclass that has no effect without another
+    (`needs`)."""
     specs = {spec.name: spec for spec in dataclasses.fields(value)}
     for spec in option_fields(type(value)):
         for needed in spec.metadata["needs"] if _is_changed(value, spec) else ():
@@ -154,14 +181,18 @@ def refuse_useless(value: Any) -> None:
 
 def _is_changed(value: Any, spec: Any) -> bool:
     factory = spec.default_factory
-    return bool(getattr(value, spec.name) != (spec.default if factory is dataclasses.MISSING else factory()))
+    return bool(
+        getattr(value, spec.name) != (spec.default if factory is dataclasses.MISSING else factory())
+    )
 
 
 def _flag_of_change(value: Any, spec: Any) -> str:
     nested = getattr(value, spec.name)
     if not dataclasses.is_dataclass(nested):
         return flag_of(spec)
-    return next(flag_of(inner) for inner in option_fields(type(nested)) if _is_changed(nested, inner))
+    return next(
+        flag_of(inner) for inner in option_fields(type(nested)) if _is_changed(nested, inner)
+    )
 
 
 # Values on the command line
@@ -223,7 +254,9 @@ def frame_span(text: str) -> tuple[int, int]:
 
 def duration(text: str) -> float:
     """Seconds in "90", "90s", "10m", "1h30m", more than 0. Raises StgaError for anything else."""
-    match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip(), re.ASCII)
+    match = re.fullmatch(
+        r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip(), re.ASCII
+    )
     if not match or not any(match.groups()):
         raise StgaError(f"'{text}' is not a time such as 90s, 10m or 1h30m")
     hours, minutes, seconds = (float(part or 0) for part in match.groups())

@@ -15,7 +15,8 @@ Item = TypeVar("Item")
 PACE_SHARE = 0.1
 """Share of the work, the last that was done, whose pace says how much time is left."""
 MAX_STEP_SHARE = 0.03
-"""Of the work in a step, beyond which it was done before, by what was interrupted, and says nothing of the pace."""
+"""Of the work in a step, beyond which it was done before, by what was interrupted, and says nothing
+of the pace."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Progress:
     stage     what is being done; detail: more about it
     figures   gives named numbers that depend on the kind of work, NaN where one is not known yet
     preview   writes the result so far into a file; None before there is one
-    picture   draws the result so far, (H, W, 3) uint8, or nothing; None where nothing new is to be seen
+    picture   draws the result so far, (H, W, 3) uint8, or nothing; None where nothing new is to be
+              seen
     """
 
     share: float = 0.0
@@ -74,8 +76,11 @@ def ignore(progress: Progress) -> bool:
     return False
 
 
-def counted(items: Iterable[Item], total: int, report: Report, stage: str, unit: str) -> Iterator[Item]:
-    """The items, of which each is reported when the next one is asked for; unit: what one of them is called.
+def counted(
+    items: Iterable[Item], total: int, report: Report, stage: str, unit: str
+) -> Iterator[Item]:
+    """The items, of which each is reported when the next one is asked for; unit: what one of them
+    is called.
 
     Raises Cancelled where the report says to stop.
     """

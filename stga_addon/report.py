@@ -1,4 +1,5 @@
-"""What is shown of a run: the lines of its summary, and its accuracy curve by matplotlib and, for Blender, by numpy."""
+"""What is shown of a run: the lines of its summary, and its accuracy curve by matplotlib and, for
+Blender, by numpy."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -27,7 +28,8 @@ from .training.evaluate.forecast import (
 from .training.run.folder import read_run
 from .training.run.metrics_log import METRICS, read_metrics
 
-if TYPE_CHECKING:  # imported when a chart is drawn: it takes half a second, and the command line starts without it
+# imported when a chart is drawn: it takes half a second, and the command line starts without it
+if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -36,7 +38,8 @@ MAX_DRAWING_SHARE = 0.01
 """Largest share of the time that drawing the curve may take while a run trains."""
 
 FIRST_DRAWING_S = 30.0
-"""Seconds until the first: loading the library takes a few, while the user waits for the first preview."""
+"""Seconds until the first: loading the library takes a few, while the user waits for the first
+preview."""
 
 
 class CurveUpdater:
@@ -61,7 +64,8 @@ class CurveUpdater:
 
 
 def write_curve(folder: Path) -> None:
-    """Write curve.png of the run in `folder`, if there is an evaluation to draw and matplotlib to draw it."""
+    """Write curve.png of the run in `folder`, if there is an evaluation to draw and matplotlib to
+    draw it."""
     metrics = read_metrics(folder)
     if curve_of(metrics) and find_spec("matplotlib") is not None:
         with replacing(folder / CURVE) as partial:
@@ -73,22 +77,33 @@ def report_run(folder: Path) -> list[str]:
     write_curve(folder)
     run, metrics = read_run(folder), read_metrics(folder)
     continued = run.continuation is not None
-    lines = summarize_continuation(metrics) if continued else summarize_run(metrics, run.settings.target_psnr)
+    lines = (
+        summarize_continuation(metrics)
+        if continued
+        else summarize_run(metrics, run.settings.target_psnr)
+    )
     if (folder / CURVE).exists():
         return lines
-    reason = "matplotlib is not installed" if curve_of(metrics) else "no held-out views (split 'val') were evaluated"
+    reason = (
+        "matplotlib is not installed"
+        if curve_of(metrics)
+        else "no held-out views (split 'val') were evaluated"
+    )
     return [*lines, f"{CURVE} was not drawn: {reason}"]
 
 
 def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
-    """Lines on accuracy, the target (dB), checked forecasts, and the cost of evaluation and memory."""
+    """Lines on accuracy, the target (dB), checked forecasts, and the cost of evaluation and
+    memory."""
     if not metrics:
         return []
     lines, curve, last = [], curve_of(metrics), metrics[-1]
     if curve:
         evaluations = [line for line in metrics if "psnr" in line]
         best = saved_line(evaluations, target)
-        fitted = f" (exposure fitted; {best[UNMATCHED]:.2f} dB without)" if UNMATCHED in best else ""
+        fitted = (
+            f" (exposure fitted; {best[UNMATCHED]:.2f} dB without)" if UNMATCHED in best else ""
+        )
         parts = [f"{best['psnr']:.2f} dB{fitted}", f"SSIM {best['ssim']:.4f}"]
         named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
@@ -102,39 +117,52 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     plateau = flat_since(metrics)
     if plateau is not None:
         since = format_duration(plateau)
-        lines.append(f"nothing was gained after {since}: more time does not help with these settings")
+        lines.append(
+            f"nothing was gained after {since}: more time does not help with these settings"
+        )
     held, checked = checked_forecasts(metrics)
     if checked:
         lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
-    lines.append(f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}")
+    lines.append(
+        f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}"
+    )
     return lines
 
 
 def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Lines on the accuracy of the avatar before and after, by region and group of held-out views."""
+    """Lines on the accuracy of the avatar before and after, by region and group of held-out
+    views."""
     if not metrics:
         return []
     first, last = metrics[0], metrics[-1]
     lines = [f"splats: {first['splats']} before, {last['splats']} after"]
     for name, label in _labels(first).items():
         before, after = first[name], last.get(name, math.nan)
-        lines.append(f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})")
+        lines.append(
+            f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})"
+        )
     return lines
 
 
 def _labels(line: Mapping[str, Any]) -> dict[str, str]:
-    """Each PSNR of a metrics line -> what it is called: of all held-out views, then by region and group."""
+    """Each PSNR of a metrics line -> what it is called: of all held-out views, then by region and
+    group."""
     fitted = " (exposure fitted)" if UNMATCHED in line else ""
     labels = {name: f"held-out views{fitted}" for name in ("psnr",) if name in line}
     if UNMATCHED in line:
         labels[UNMATCHED] = "held-out views (exposure not fitted)"
-    parts = [name.removeprefix("psnr_") for name in line if name.startswith("psnr_") and name != UNMATCHED]
+    parts = [
+        name.removeprefix("psnr_")
+        for name in line
+        if name.startswith("psnr_") and name != UNMATCHED
+    ]
     return {**labels, **{f"psnr_{part}": part.replace("_", " ") + fitted for part in parts}}
 
 
 def evaluation_share(lines: Sequence[Mapping[str, Any]]) -> float:
-    """Seconds of evaluation during training over seconds of training; the final evaluation does not count."""
+    """Seconds of evaluation during training over seconds of training; the final evaluation does not
+    count."""
     spent: float = sum(line["evaluation_s"] for line in lines[:-1])
     return spent / max(float(lines[-1]["seconds"]), 1e-9)
 
@@ -146,8 +174,9 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#78
 
 
 def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
-    """PSNR of one run in the whole image, the head mask and the moving region, with the latest forecast; and the detail
-    difference, by which the avatar is kept, on an axis of its own with the best at the top."""
+    """PSNR of one run in the whole image, the head mask and the moving region, with the latest
+    forecast; and the detail difference, by which the avatar is kept, on an axis of its own with the
+    best at the top."""
     fitted = " (exposure fitted)" if is_exposure_fitted(metrics) else ""
     figure, axes = psnr_axes(f"PSNR{fitted} and detail difference on held-out views")
     keys = {"whole image": "psnr", "head mask": "psnr_mask", "moving region": "psnr_moving"}
@@ -160,7 +189,9 @@ def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
         seconds, psnr = [last["seconds"], ahead["seconds"]], np.array([last["psnr"], ahead["psnr"]])
         error = np.array([0, ahead["error"]])
         (line,) = axes.plot(seconds, psnr, linestyle="--", label="forecast")
-        axes.fill_between(seconds, psnr - error, psnr + error, color=line.get_color(), alpha=0.2, linewidth=0)
+        axes.fill_between(
+            seconds, psnr - error, psnr + error, color=line.get_color(), alpha=0.2, linewidth=0
+        )
     detail = np.array(curve_of(metrics, DETAIL)).reshape(-1, 2).T
     if detail.size:
         figure.subplots_adjust(right=0.9)
@@ -180,7 +211,8 @@ def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 5.4), dpi=100)
-    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.1, top=0.93)  # `constrained` takes as long as the drawing
+    # `constrained` takes as long as the drawing
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.1, top=0.93)
     axes = figure.subplots()
     axes.set(title=title, xlabel="training time [s]", ylabel="PSNR [dB]")
     axes.set_prop_cycle(color=COLORS)
@@ -189,7 +221,8 @@ def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
 
 
 def finish_axes(axes: "Axes") -> None:
-    """Add the legend and cut off the steep start: the axis begins at the lowest value after a tenth of the time."""
+    """Add the legend and cut off the steep start: the axis begins at the lowest value after a tenth
+    of the time."""
     curves = [np.asarray(line.get_xydata()).T for line in axes.lines]
     curves = [curve for curve in curves if curve.size]
     if not curves:
@@ -220,12 +253,14 @@ Color = tuple[float, float, float]
 
 
 def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, str] | None:
-    """Held-out PSNR over training time, with the last forecast and its error; None before two evaluations.
+    """Held-out PSNR over training time, with the last forecast and its error; None before two
+    evaluations.
 
-    The detail difference, by which the avatar is kept, is drawn in green over the whole height, the best at the top.
-    lines: of a metrics.jsonl. Returns (SIZE, SIZE, 4) float32 RGBA in 0…1, the bottom row first, and as texts the
-    ranges of the axes and of the detail difference (empty if it was not measured). The steep beginning is cut off: the
-    vertical axis starts at the PSNR of a tenth of the time.
+    The detail difference, by which the avatar is kept, is drawn in green over the whole height, the
+    best at the top.
+    lines: of a metrics.jsonl. Returns (SIZE, SIZE, 4) float32 RGBA in 0…1, the bottom row first,
+    and as texts the ranges of the axes and of the detail difference (empty if it was not measured).
+    The steep beginning is cut off: the vertical axis starts at the PSNR of a tenth of the time.
     """
     curve = curve_of(lines)
     if len(curve) < 2:
@@ -236,7 +271,9 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
     if forecast is not None:
         end, high = forecast["seconds"], max(high, forecast["psnr"] + forecast["error"])
     low = min(float(np.interp(end / 10, seconds, psnr)), psnr[-1])
-    step = next((step for step in GRID_STEPS_DB if (high - low) / step <= MAX_GRID_STEPS), GRID_STEPS_DB[-1])
+    step = next(
+        (step for step in GRID_STEPS_DB if (high - low) / step <= MAX_GRID_STEPS), GRID_STEPS_DB[-1]
+    )
     low, high = step * np.floor(low / step), step * np.ceil(high / step + 1e-9)
     plot = _Plot((0.0, end), (low, high))
     plot.grid(np.arange(low, high + step / 2, step))
@@ -252,8 +289,11 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
     return plot.pixels, f"{low:g} to {high:g} dB{fitted}, 0 to {format_duration(end)}", detail_range
 
 
-def _draw_detail(plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]) -> str:
-    """Draw the detail difference, scaled to the height in dB from a tenth of the time on; returns its range as text."""
+def _draw_detail(
+    plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]
+) -> str:
+    """Draw the detail difference, scaled to the height in dB from a tenth of the time on; returns
+    its range as text."""
     seconds, detail = np.array(detail_curve(lines), np.float64).reshape(-1, 2).T
     if len(detail) < 2:
         return ""
@@ -277,7 +317,8 @@ class _Plot:
         self.pixels[self._rows(y).astype(int), :, :3] = GRID_COLOR
 
     def line(self, x: np.ndarray, y: np.ndarray, color: Color) -> None:
-        """Antialiased by the distance of each pixel's center to the line segment in the pixel's column."""
+        """Antialiased by the distance of each pixel's center to the line segment in the pixel's
+        column."""
         seconds, inside = self._columns(x)
         height = np.interp(seconds, x, self._rows(y))
         slope = np.gradient(height)
@@ -301,4 +342,6 @@ class _Plot:
         return MARGIN + (y - self._y[0]) / (self._y[1] - self._y[0]) * (SIZE - 2 * MARGIN)
 
     def _blend(self, opacity: np.ndarray, color: Color) -> None:
-        self.pixels[..., :3] += opacity[..., None] * (np.array(color, np.float32) - self.pixels[..., :3])
+        self.pixels[..., :3] += opacity[..., None] * (
+            np.array(color, np.float32) - self.pixels[..., :3]
+        )

@@ -42,11 +42,18 @@ def setting(
 
     minimum, maximum  inclusive; above: exclusive lower bound
     choices           allowed texts; a mapping also says what each is
-    accepts           whether a value of the right type is allowed, and `expected`: what it accepts, for the message
+    accepts           whether a value of the right type is allowed, and `expected`: what it accepts,
+                      for the message
     is_path           whether a text is that of a path, where it can be a name as well
     option            what the command line and Blender ask for it with (`options.option`)
     """
-    limits = {"minimum": minimum, "maximum": maximum, "above": above, "choices": choices, "accepts": accepts}
+    limits = {
+        "minimum": minimum,
+        "maximum": maximum,
+        "above": above,
+        "choices": choices,
+        "accepts": accepts,
+    }
     metadata = {**limits, "expected": expected, IS_PATH: is_path, **option}
     if default_factory is not dataclasses.MISSING:
         return field(default_factory=default_factory, metadata=metadata)
@@ -57,10 +64,11 @@ def setting(
 
 
 def validate(value: Any, prefix: str = "") -> None:
-    """Raise StgaError naming the first field of a dataclass, nested ones included, that is not allowed.
+    """Raise StgaError naming the first field of a dataclass, nested ones included, that is not
+    allowed.
 
-    A field is allowed by its type hint and the limits of `setting`; what fields must have in common, a dataclass says
-    in a method `check()` that raises StgaError.
+    A field is allowed by its type hint and the limits of `setting`; what fields must have in
+    common, a dataclass says in a method `check()` that raises StgaError.
     """
     hints = type_hints(type(value))  # type: ignore[arg-type]
     for spec in dataclasses.fields(value):
@@ -84,12 +92,16 @@ def _parts(name: str, value: Any) -> list[tuple[str, Any]]:
     if dataclasses.is_dataclass(value):
         return [(name, value)]
     items = value if isinstance(value, tuple) else ()
-    return [(f"{name}.{row}", item) for row, item in enumerate(items) if dataclasses.is_dataclass(item)]
+    return [
+        (f"{name}.{row}", item) for row, item in enumerate(items) if dataclasses.is_dataclass(item)
+    ]
 
 
 @cache
 def type_hints(kind: Any) -> dict[str, Any]:
-    return {name: hint for name, hint in get_type_hints(kind).items() if hint is not dataclasses.KW_ONLY}
+    return {
+        name: hint for name, hint in get_type_hints(kind).items() if hint is not dataclasses.KW_ONLY
+    }
 
 
 def alternatives(hint: Any) -> tuple[Any, ...]:
@@ -119,9 +131,13 @@ def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | No
         return _expected_number(value, kind, limits)
     choices = limits.get("choices")
     if kind is str and choices is not None:
-        return None if isinstance(value, str) and value in choices else f"one of {', '.join(choices)}"
+        return (
+            None if isinstance(value, str) and value in choices else f"one of {', '.join(choices)}"
+        )
     names = {str: "a text", bool: "True or False", Path: "a path", np.ndarray: "an array"}
-    return None if isinstance(value, origin) else names.get(origin, f"an object of {origin.__name__}")
+    return (
+        None if isinstance(value, origin) else names.get(origin, f"an object of {origin.__name__}")
+    )
 
 
 def _expected_items(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
@@ -135,7 +151,10 @@ def _expected_items(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any
 def _expected_mapping(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
     if not isinstance(value, Mapping):
         return "an object of Mapping"
-    fits = all(isinstance(key, hints[0]) and expectation(item, hints[1], limits) is None for key, item in value.items())
+    fits = all(
+        isinstance(key, hints[0]) and expectation(item, hints[1], limits) is None
+        for key, item in value.items()
+    )
     return None if fits else "texts by name" if hints == (str, str) else "values by name"
 
 
@@ -162,8 +181,9 @@ _UNBOUNDED = {"minimum": -math.inf, "maximum": math.inf, "above": -math.inf}
 def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None) -> Any:
     """A dataclass as plain values of JSON, which `from_json` reads back.
 
-    Paths become texts, tuples lists, and a dataclass where a field allows several an object with its `kind`. Arrays
-    are put into `arrays`, which must then be kept beside the JSON. kinds: type hint of `value`; default: its type.
+    Paths become texts, tuples lists, and a dataclass where a field allows several an object with
+    its `kind`. Arrays are put into `arrays`, which must then be kept beside the JSON. kinds: type
+    hint of `value`; default: its type.
     """
     return _plain(value, kinds or type(value), arrays, "")
 
@@ -172,7 +192,9 @@ def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
     if dataclasses.is_dataclass(value):
         hints = type_hints(type(value))  # type: ignore[arg-type]
         fields = {
-            spec.name: _plain(getattr(value, spec.name), hints[spec.name], arrays, _joined(name, spec.name))
+            spec.name: _plain(
+                getattr(value, spec.name), hints[spec.name], arrays, _joined(name, spec.name)
+            )
             for spec in dataclasses.fields(value)
         }
         several = sum(dataclasses.is_dataclass(kind) for kind in alternatives(hint)) > 1
@@ -186,9 +208,15 @@ def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
     (kind,) = [kind for kind in alternatives(hint) if kind is not types.NoneType][:1]
     items = get_args(kind) or (Any, Any)
     if isinstance(value, Mapping):
-        return {str(key): _plain(item, items[1], arrays, _joined(name, str(key))) for key, item in value.items()}
+        return {
+            str(key): _plain(item, items[1], arrays, _joined(name, str(key)))
+            for key, item in value.items()
+        }
     if isinstance(value, tuple):
-        return [_plain(item, items[0], arrays, _joined(name, str(row))) for row, item in enumerate(value)]
+        return [
+            _plain(item, items[0], arrays, _joined(name, str(row)))
+            for row, item in enumerate(value)
+        ]
     return value
 
 
@@ -196,11 +224,14 @@ def _joined(name: str, part: str) -> str:
     return f"{name}.{part}" if name else part
 
 
-def from_json(kind: Any, values: Any, where: str = "", arrays: Mapping[str, np.ndarray] | None = None) -> Any:
-    """A dataclass (or one of several: a union) from plain values of JSON and the arrays beside them.
+def from_json(
+    kind: Any, values: Any, where: str = "", arrays: Mapping[str, np.ndarray] | None = None
+) -> Any:
+    """A dataclass (or one of several: a union) from plain values of JSON and the arrays beside
+    them.
 
-    Raises StgaError naming the field, after `where`, unless each object has exactly the fields of its dataclass and
-    `validate` allows them.
+    Raises StgaError naming the field, after `where`, unless each object has exactly the fields of
+    its dataclass and `validate` allows them.
     """
     value = _parsed(kind, values, where, arrays or {})
     validate(value)
@@ -208,7 +239,8 @@ def from_json(kind: Any, values: Any, where: str = "", arrays: Mapping[str, np.n
 
 
 def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:
-    """The value in the types of the hint where it has their form; else as it is, for `validate` to name."""
+    """The value in the types of the hint where it has their form; else as it is, for `validate` to
+    name."""
     kinds = [kind for kind in alternatives(hint) if kind is not types.NoneType]
     classes = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
     if isinstance(value, dict) and ARRAY in value and np.ndarray in kinds:
@@ -219,21 +251,31 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
         return Path(value)
     if isinstance(value, list):
         items = next((get_args(kind) for kind in kinds if get_origin(kind) is tuple), (Any,))
-        return tuple(_parsed(items[0], item, _joined(where, str(row)), arrays) for row, item in enumerate(value))
+        return tuple(
+            _parsed(items[0], item, _joined(where, str(row)), arrays)
+            for row, item in enumerate(value)
+        )
     mappings = [get_args(kind) for kind in kinds if get_origin(kind) in (dict, Mapping)]
     if isinstance(value, dict) and mappings:
         return _parsed_mapping(mappings[0], value, where, arrays)
     return value
 
 
-def _parsed_mapping(hints: Any, value: dict[str, Any], where: str, arrays: Mapping[str, np.ndarray]) -> Any:
+def _parsed_mapping(
+    hints: Any, value: dict[str, Any], where: str, arrays: Mapping[str, np.ndarray]
+) -> Any:
     for key in value:
         if hints[0] is int and not re.fullmatch(r"-?\d{1,15}", key, re.ASCII):
             raise StgaError(complaint(where, "whole numbers as names", key))
-    return {hints[0](key): _parsed(hints[1], item, _joined(where, key), arrays) for key, item in value.items()}
+    return {
+        hints[0](key): _parsed(hints[1], item, _joined(where, key), arrays)
+        for key, item in value.items()
+    }
 
 
-def _parsed_dataclass(classes: list[Any], value: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:
+def _parsed_dataclass(
+    classes: list[Any], value: Any, where: str, arrays: Mapping[str, np.ndarray]
+) -> Any:
     kind = classes[0]
     if len(classes) > 1:
         names = {cls.__name__: cls for cls in classes}
@@ -246,4 +288,9 @@ def _parsed_dataclass(classes: list[Any], value: Any, where: str, arrays: Mappin
         differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
         fields = ", ".join(sorted(map(str, differing)))[:200]
         raise StgaError(f"{where}{': ' if where else ''}fields are missing or unknown ({fields})")
-    return kind(**{name: _parsed(hint, value[name], _joined(where, name), arrays) for name, hint in hints.items()})
+    return kind(
+        **{
+            name: _parsed(hint, value[name], _joined(where, name), arrays)
+            for name, hint in hints.items()
+        }
+    )

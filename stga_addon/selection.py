@@ -1,4 +1,5 @@
-"""Selection of the triangles that move in a timestep, whose splats it trains (STGA, selective training)."""
+"""Selection of the triangles that move in a timestep, whose splats it trains (STGA, selective
+training)."""
 
 import math
 from collections.abc import Mapping
@@ -19,22 +20,30 @@ class SelectionOptions:
     """How triangles are selected.
 
     threshold  meters that a triangle must move; finite, at least 0
-    zero_pose  "head": rotation, translation and neck do not count as motion; "all": nor do jaw and eyes
+    zero_pose  "head": rotation, translation and neck do not count as motion; "all": nor do jaw and
+               eyes
     regions    names of key regions, each selected as a whole
     Raises StgaError for other values.
     """
 
     threshold: float = option(
-        "movement from the neutral face from which a triangle is selected", 0.002, 0, metavar="METERS"
+        "movement from the neutral face from which a triangle is selected",
+        0.002,
+        0,
+        metavar="METERS",
     )
     zero_pose: str = option("motion that does not count as expression", "head", choices=ZERO_POSES)
     regions: tuple[str, ...] = KEY_REGIONS
 
     def __post_init__(self) -> None:
         if not (isinstance(self.threshold, int | float) and 0 <= self.threshold < math.inf):
-            raise StgaError(f"selection threshold must be a distance in meters, got {shorten(self.threshold)}")
+            raise StgaError(
+                f"selection threshold must be a distance in meters, got {shorten(self.threshold)}"
+            )
         if self.zero_pose not in ZERO_POSES:
-            raise StgaError(f"zero_pose is {shorten(self.zero_pose)}, expected one of {', '.join(ZERO_POSES)}")
+            raise StgaError(
+                f"zero_pose is {shorten(self.zero_pose)}, expected one of {', '.join(ZERO_POSES)}"
+            )
 
 
 def select_faces(
@@ -47,8 +56,8 @@ def select_faces(
     """(F,) bool: the triangles whose splats this frame trains.
 
     mesh, neutral (V, 3) meters without rigid head motion; faces (F, 3); regions name -> (F,) bool.
-    A region whose mean offset of triangle centers exceeds the threshold is selected as a whole; a triangle outside of
-    the regions is selected by its own offset (STGA, selective training).
+    A region whose mean offset of triangle centers exceeds the threshold is selected as a whole; a
+    triangle outside of the regions is selected by its own offset (STGA, selective training).
     """
     offset = np.linalg.norm((mesh[faces] - neutral[faces]).mean(1), axis=-1)
     in_region = np.zeros(len(faces), bool)
@@ -61,7 +70,8 @@ def select_faces(
 
 
 def select_capture(capture: Capture, options: SelectionOptions) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool for every timestep; a selection that comes with the capture takes precedence."""
+    """timestep -> (F,) bool for every timestep; a selection that comes with the capture takes
+    precedence."""
     regions = {name: capture.regions[name] for name in options.regions if name in capture.regions}
     chosen = {}
     for timestep in capture.timesteps:

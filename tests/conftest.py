@@ -10,8 +10,9 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-# Before OpenMP is loaded: its threads wait in a loop, and in tests, which run one per core, they would take the time of
-# another test. Kernels have threads of their own (`raster/cpu/threads.py`), which sleep.
+# Before OpenMP is loaded: its threads wait in a loop, and in tests, which run one per core, they
+# would take the time of another test. Kernels have threads of their own (`raster/cpu/threads.py`),
+# which sleep.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import kernels
@@ -30,8 +31,8 @@ MIN_MEMORY_BYTES = 8 << 30
 
 
 def memory_disk(folder: str = "/dev/shm") -> dict[str, str]:
-    """The variable that has pytest keep its temporary folders in memory, where this machine has enough: what the tests
-    write, most of it flushed file by file, is then no wait."""
+    """The variable that has pytest keep its temporary folders in memory, where this machine has
+    enough: what the tests write, most of it flushed file by file, is then no wait."""
     if not hasattr(os, "ST_NOEXEC") or not os.path.isdir(folder):
         return {}
     found = os.statvfs(folder)
@@ -46,12 +47,14 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # those inherit it
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Two processes more than cores, because some tests wait: for a cluster, a browser or another process."""
+    """Two processes more than cores, because some tests wait: for a cluster, a browser or another
+    process."""
     return min((os.cpu_count() or 1) + 2, MAX_PROCESSES)
 
 
 def pytest_collection_finish() -> None:
-    """Objects of modules and tests, which stay to the end, are no longer looked through for garbage."""
+    """Objects of modules and tests, which stay to the end, are no longer looked through for
+    garbage."""
     gc.freeze()
 
 
@@ -73,14 +76,18 @@ VALIDATION_LAYER = "vulkan/explicit_layer.d/VkLayer_khronos_validation.json"
 TOOLS: dict[str, tuple[Callable[[], object], str]] = {
     "adapter": (has_adapter, "no WebGPU adapter (Debian's software Vulkan: mesa-vulkan-drivers)"),
     "vulkan-validation": (
-        lambda: any(Path(root, VALIDATION_LAYER).exists() for root in ("/usr/share", "/usr/local/share", "/etc")),
+        lambda: any(
+            Path(root, VALIDATION_LAYER).exists()
+            for root in ("/usr/share", "/usr/local/share", "/etc")
+        ),
         "no Vulkan validation layers (Debian: vulkan-validationlayers)",
     ),
     "chromium": (find_browser, "no Chromium (Debian: chromium)"),
     "node": (lambda: shutil.which("node"), "no Node.js (Debian: nodejs)"),
     "slurm": (has_slurm, "no SLURM (Debian: slurm-wlm, munge)"),
 }
-"""What tests marked `needs` use beyond the README's requirements: whether it is there, and what is said where not."""
+"""What tests marked `needs` use beyond the README's requirements: whether it is there, and what is
+said where not."""
 
 
 @cache
@@ -98,13 +105,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
                 pytest.skip(reason)
 
 
-# A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in one.
+# A shell starts its background jobs deaf to Ctrl-C, which several tests send; the tests may run in
+# one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], FileLock]:
-    """Name -> a lock that one at a time of the processes which run the tests holds, for what they have in common."""
+    """Name -> a lock that one at a time of the processes which run the tests holds, for what they
+    have in common."""
     folder = tmp_path_factory.getbasetemp()
     common = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
     return lambda name: FileLock(common / f"{name}.lock")
@@ -112,8 +121,8 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], FileLock]
 
 @pytest.fixture(scope="session")
 def kernel_bundle() -> tuple[Path, str]:
-    """Folder of all kernels as the complete edition brings them, and what raster/kernel_bits.py printed where they were
-    compiled, in one process, which takes most of a minute."""
+    """Folder of all kernels as the complete edition brings them, and what raster/kernel_bits.py
+    printed where they were compiled, in one process, which takes most of a minute."""
     folder = kernels.bundle()
     if folder is None:
         pytest.skip("no edition brings kernels for this platform")
@@ -122,8 +131,8 @@ def kernel_bundle() -> tuple[Path, str]:
 
 @pytest.fixture(scope="session")
 def toy_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball of 10 cm, of one color per view: timesteps 0, 1, 3, 4 (the last one `test`), cameras 0 to 3 (the last one
-    `val`)."""
+    """A ball of 10 cm, of one color per view: timesteps 0, 1, 3, 4 (the last one `test`), cameras 0
+    to 3 (the last one `val`)."""
     return factory.write_mesh_capture(tmp_path_factory.mktemp("toy"), (0, 1, 3, 4), range(4))
 
 
@@ -134,8 +143,8 @@ def toy(toy_root: Path) -> Capture:
 
 @pytest.fixture(scope="session")
 def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """footage/ of the small head, head.npz and its exact landmarks points/, for tests that only read it; in black, so
-    that landmarks alone are tracked, in a third of the time."""
+    """footage/ of the small head, head.npz and its exact landmarks points/, for tests that only
+    read it; in black, so that landmarks alone are tracked, in a third of the time."""
     from flame.small_head import small_head
     from tracking.recording import record
 
@@ -148,7 +157,8 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Folder of development data (studio_head, raster_reference, …), which is not part of the project."""
+    """Folder of development data (studio_head, raster_reference, …), which is not part of the
+    project."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     folder = Path(os.environ.get("STGA_DATA", beside))
     if not folder.is_dir():
@@ -158,7 +168,8 @@ def shared_data() -> Path:
 
 @pytest.fixture(params=["cpu", pytest.param("gpu", marks=pytest.mark.needs("adapter"))])
 def back_end(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The kernels that a test's `render_differentiable` runs: Numba's, and WebGPU's on the first adapter."""
+    """The kernels that a test's `render_differentiable` runs: Numba's, and WebGPU's on the first
+    adapter."""
     if request.param == "gpu":
         from raster.gpu_autograd import render_differentiable
 

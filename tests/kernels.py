@@ -1,7 +1,9 @@
-"""The kernels that the tests share: those of the complete edition, compiled once, before the tests start.
+"""The kernels that the tests share: those of the complete edition, compiled once, before the tests
+start.
 
-`python tests/kernels.py`, which `make test` runs beside the linters, compiles all of them in one process, in most of
-a minute, and keeps what raster/kernel_bits.py printed there. Without, as after a change, a test compiles what it needs.
+`python tests/kernels.py`, which `make test` runs beside the linters, compiles all of them in one
+process, in most of a minute, and keeps what raster/kernel_bits.py printed there. Without, as after
+a change, a test compiles what it needs.
 """
 
 import os
@@ -34,7 +36,8 @@ SCRIPT = SCRIPT.replace("print(", BITS.format(str(KERNEL_BITS)))
 
 
 def bundle(compiles: bool = True) -> Path | None:
-    """Folder of the kernels and their bits.txt; None where no edition brings any, or where it should not compile."""
+    """Folder of the kernels and their bits.txt; None where no edition brings any, or where it
+    should not compile."""
     with TemporaryDirectory() as name, mock.patch.object(compiled_kernels, "SCRIPT", SCRIPT):
         wheels = Path(name)
         (wheels / f"numba-{version('numba')}-tests{crc32(KERNEL_BITS.read_bytes())}").touch()
@@ -44,7 +47,8 @@ def bundle(compiles: bool = True) -> Path | None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(folder.with_name(f"{folder.name}.lock")):
             if not _are_newer(folder / "bits.txt"):
-                shutil.rmtree(folder, ignore_errors=True)  # half of them, or of files of another time: not loaded
+                # half of them, or of files of another time: not loaded
+                shutil.rmtree(folder, ignore_errors=True)
                 compiled_kernels.compile_kernels(TARGET, wheels)
         return folder if folder.exists() else None
 
@@ -56,8 +60,8 @@ def _are_newer(bits: Path) -> bool:
 
 
 def shared_kernels() -> Mapping[str, str]:
-    """Environment variables of processes that use a copy of the bundle, and add to it; none where there is no bundle
-    of the sources as they are, or Numba is told already what to do."""
+    """Environment variables of processes that use a copy of the bundle, and add to it; none where
+    there is no bundle of the sources as they are, or Numba is told already what to do."""
     folder = bundle(compiles=False)
     if folder is None or any(name.startswith("NUMBA_") for name in os.environ):
         return {}

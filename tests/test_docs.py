@@ -13,7 +13,12 @@ from stga_addon.cli.main import make_parser
 from stga_addon.export.ply import write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "THIRD_PARTY.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "THIRD_PARTY.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 PATH_FOLDERS = ("", "stga_addon/", "tests/", "stga_addon/training/")
 """Folders that the docs leave out when they name a file."""
@@ -39,20 +44,26 @@ def test_links_lead_somewhere(page):
         linked = page if not path else (page.parent / path).resolve()
         assert linked.exists(), f"{name_of(page)}: {target}"
         if anchor:
-            assert anchor in anchors(linked.read_text(encoding="utf-8")), f"{name_of(page)}: {target}"
+            assert anchor in anchors(linked.read_text(encoding="utf-8")), (
+                f"{name_of(page)}: {target}"
+            )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_named_files_exist(page):
     """Catches docs that name a module or test file by an old path."""
     for path in re.findall(r"`([\w./]+/[\w.]+\.py)", TEXTS[page]):
-        assert any((ROOT / folder / path).is_file() for folder in PATH_FOLDERS), f"{name_of(page)}: {path}"
+        assert any((ROOT / folder / path).is_file() for folder in PATH_FOLDERS), (
+            f"{name_of(page)}: {path}"
+        )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_named_tests_exist(page):
     """Catches docs that cite a test which was renamed or removed."""
-    sources = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")}
+    sources = {
+        path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")
+    }
     for path, test in re.findall(r"`([\w./]+\.py)::(test_\w+)`", TEXTS[page]):
         source = next(text for file, text in sources.items() if file.as_posix().endswith(path))
         assert f"def {test}" in source, f"{name_of(page)}: {path}::{test}"

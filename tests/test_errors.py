@@ -4,7 +4,8 @@ from stga_addon.errors import MAX_MESSAGE_CHARACTERS, MAX_VALUE_CHARACTERS, Stga
 
 
 def test_message_is_printable():
-    """Catches a message that no terminal or log file can encode, because a path in it holds a lone surrogate."""
+    """Catches a message that no terminal or log file can encode, because a path in it holds a lone
+    surrogate."""
     assert str(StgaError("a\ud800b: does not exist")) == "a\\ud800b: does not exist"
 
 
@@ -19,7 +20,13 @@ def test_message_length_is_bounded():
 def test_quoted_values_are_short():
     """Catches values of a file that are quoted whole, whatever they are."""
     assert shorten("left") == "'left'"
-    for value in ("x" * 10**6, ["y" * 10**6] * 100, {"k" * 1000: [1] * 1000}, 10**4000, [[[[1] * 50] * 50] * 50] * 50):
+    for value in (
+        "x" * 10**6,
+        ["y" * 10**6] * 100,
+        {"k" * 1000: [1] * 1000},
+        10**4000,
+        [[[[1] * 50] * 50] * 50] * 50,
+    ):
         assert len(shorten(value)) <= MAX_VALUE_CHARACTERS
 
 

@@ -52,7 +52,8 @@ def test_replacing_is_all_or_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["file/a.json", "folder"])
 def test_unwritable_paths(tmp_path: Path, name: str) -> None:
-    """Catches a traceback where a folder is a file or the file is a folder, and temporary files left beside it."""
+    """Catches a traceback where a folder is a file or the file is a folder, and temporary files
+    left beside it."""
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder" / "inner").mkdir(parents=True)
     with pytest.raises(StgaError, match=rf"{tmp_path / name}: cannot be written"):
@@ -61,12 +62,17 @@ def test_unwritable_paths(tmp_path: Path, name: str) -> None:
 
 
 def test_a_path_is_checked_without_a_trace(tmp_path: Path) -> None:
-    """Catches a path that is refused only after minutes of work, and folders or files that the check leaves."""
+    """Catches a path that is refused only after minutes of work, and folders or files that the
+    check leaves."""
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder").mkdir()
     for path in (tmp_path / "new/inner/video.mp4", tmp_path / "video.mp4", tmp_path / "file"):
         check_writable(path)
-    for path in (tmp_path / "file/video.mp4", tmp_path / "file/inner/video.mp4", tmp_path / "folder"):
+    for path in (
+        tmp_path / "file/video.mp4",
+        tmp_path / "file/inner/video.mp4",
+        tmp_path / "folder",
+    ):
         with pytest.raises(StgaError, match="cannot be written"):
             check_writable(path)
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
@@ -82,7 +88,9 @@ def test_json_round_trip(tmp_path: Path) -> None:
     assert read_json(tmp_path / "b.json") == value
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"hello", b"\xff\xfe{}", b"[" * 200_000, b'{"a": 1'])
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"hello", b"\xff\xfe{}", b"[" * 200_000, b'{"a": 1']
+)
 def test_malformed_json(tmp_path: Path, content: bytes) -> None:
     """Catches a traceback, a crash by deep nesting, and a message that does not name the file."""
     (tmp_path / "a.json").write_bytes(content)
@@ -101,7 +109,11 @@ def test_missing_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize("compressed", [False, True])
 def test_npz_round_trip(tmp_path: Path, compressed: bool) -> None:
     """Catches a suffix that numpy adds, and arrays that change their type or shape."""
-    arrays = {"a": np.arange(6, dtype=np.int32).reshape(2, 3), "b/c": np.array([True, False]), "d": np.float64(3)}
+    arrays = {
+        "a": np.arange(6, dtype=np.int32).reshape(2, 3),
+        "b/c": np.array([True, False]),
+        "d": np.float64(3),
+    }
     write_npz(tmp_path / "file.part", arrays, compressed)
     again = read_npz(tmp_path / "file.part")
     assert os.listdir(tmp_path) == ["file.part"]
@@ -140,7 +152,8 @@ def test_flipped_bits(tmp_path: Path) -> None:
 
 
 def test_hostile_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches pickled objects, which run code, oversized arrays, and headers that promise more than follows."""
+    """Catches pickled objects, which run code, oversized arrays, and headers that promise more than
+    follows."""
     path = tmp_path / "a.npz"
     np.savez(path, a=np.array([{"x": 1}], object))
     with pytest.raises(StgaError, match=r"a\.npz: is not a readable npz file"):
@@ -150,8 +163,9 @@ def test_hostile_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stga_addon.files.MAX_UNPACKED_BYTES", 100_000)
     with pytest.raises(StgaError, match=r"unpacks to \d+ bytes, more than the \d+ allowed"):
         read_npz(path)
-    header = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }".ljust(
-        117
+    header = (
+        b"\x93NUMPY\x01\x00v\x00"
+        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }".ljust(117)
     )
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.npy", header + b"\n")
@@ -177,9 +191,7 @@ with replacing(Path(sys.argv[1])) as partial:
     partial.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
-WRITE = (
-    "import sys; from pathlib import Path; from stga_addon.files import write_json; write_json(Path(sys.argv[1]), 1)"
-)
+WRITE = "import sys; from pathlib import Path; from stga_addon.files import write_json; write_json(Path(sys.argv[1]), 1)"
 
 
 def run(code: str, path: Path) -> int:
@@ -188,7 +200,8 @@ def run(code: str, path: Path) -> int:
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
-    """Catches temporary files that stay after kill -9, and others, or those of living processes, that are removed."""
+    """Catches temporary files that stay after kill -9, and others, or those of living processes,
+    that are removed."""
     other_host = ".a.json.00000000-4194304-00000000.partial"
     kept = {".notes.partial", ".a.json.123.partial", other_host, "a.json.partial"}
     for name in kept:
@@ -205,7 +218,8 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
 def test_temporary_name_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a predictable temporary name, and a link under that name that is followed and overwritten."""
+    """Catches a predictable temporary name, and a link under that name that is followed and
+    overwritten."""
     names = set()
     for _ in range(2):
         with replacing(tmp_path / "a.json") as partial:
@@ -242,7 +256,8 @@ def test_mode_follows_the_umask(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", [".", "/", "folder", "pipe"])
 def test_only_regular_files_are_replaced(tmp_path, name):
-    """Catches a device, such as /dev/null, that is replaced by a file, and a traceback for a path without a name."""
+    """Catches a device, such as /dev/null, that is replaced by a file, and a traceback for a path
+    without a name."""
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     path = Path(name) if name in "./" else tmp_path / name
@@ -252,7 +267,8 @@ def test_only_regular_files_are_replaced(tmp_path, name):
 
 
 def refused(times: int, winerror: int | None):
-    """An os.replace that fails `times` times as Windows does (None: as POSIX does), and the number of its calls."""
+    """An os.replace that fails `times` times as Windows does (None: as POSIX does), and the number
+    of its calls."""
     calls, replace = [], os.replace
 
     def fake(source, target):
@@ -269,7 +285,8 @@ def refused(times: int, winerror: int | None):
 
 @pytest.mark.parametrize("winerror", [5, 32])
 def test_a_file_that_another_program_has_open(winerror, tmp_path, monkeypatch):
-    """Catches hours of training that end because a virus scanner, or Blender, reads the last avatar for a moment."""
+    """Catches hours of training that end because a virus scanner, or Blender, reads the last avatar
+    for a moment."""
     write_json(tmp_path / "a.json", 1)
     fake, calls = refused(3, winerror)
     monkeypatch.setattr(files.os, "replace", fake)
@@ -278,9 +295,12 @@ def test_a_file_that_another_program_has_open(winerror, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["a.json"]
 
 
-@pytest.mark.parametrize(("winerror", "most_calls", "patience_s"), [(32, 4, 0.25), (32, 1, 0.0), (None, 1, 60.0)])
+@pytest.mark.parametrize(
+    ("winerror", "most_calls", "patience_s"), [(32, 4, 0.25), (32, 1, 0.0), (None, 1, 60.0)]
+)
 def test_a_file_that_stays_in_use(winerror, most_calls, patience_s, tmp_path, monkeypatch):
-    """Catches a wait without end, one on a system where waiting does not help, and a traceback at its end."""
+    """Catches a wait without end, one on a system where waiting does not help, and a traceback at
+    its end."""
     write_json(tmp_path / "a.json", 1)
     fake, calls = refused(10**6, winerror)
     monkeypatch.setattr(files.os, "replace", fake)
@@ -302,7 +322,8 @@ def write_half_a_pair(folder: Path) -> None:
 
 
 def test_files_that_appear_together(tmp_path):
-    """Catches one file of a pair without the other, the folder made for them that stays, and others' files gone."""
+    """Catches one file of a pair without the other, the folder made for them that stays, and
+    others' files gone."""
     (tmp_path / "old").mkdir()
     write_json(tmp_path / "old/a.json", 1)
     for folder in ("old", "new/inner"):
@@ -315,4 +336,7 @@ def test_files_that_appear_together(tmp_path):
             with new_file(tmp_path / "old" / name) as partial:
                 partial.write_text("2")
         assert not (tmp_path / "old/b.json").exists()
-    assert {path.name: read_json(path) for path in (tmp_path / "old").iterdir()} == {"a.json": 2, "b.json": 2}
+    assert {path.name: read_json(path) for path in (tmp_path / "old").iterdir()} == {
+        "a.json": 2,
+        "b.json": 2,
+    }

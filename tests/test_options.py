@@ -1,4 +1,5 @@
-"""Options by dataclasses of their own: what the command line reads, refuses and leaves at the defaults."""
+"""Options by dataclasses of their own: what the command line reads, refuses and leaves at the
+defaults."""
 
 from argparse import ArgumentParser
 from collections.abc import Mapping
@@ -22,14 +23,22 @@ class Drawing:
     source: Path = option("what is drawn", flag="SOURCE")
     output: Path = option("the drawing", flag="--out")
     count: int = option("of strokes", 3, 1, 9)
-    seconds: float | None = option("time", None, above=0, flag="--time", parse=duration, group="budget")
+    seconds: float | None = option(
+        "time", None, above=0, flag="--time", parse=duration, group="budget"
+    )
     strokes: int | None = option("instead of a time", None, 1, group="budget")
-    style: str = option("of strokes", "plain", choices=("plain", "bold", "own"), offered=("plain", "bold"))
+    style: str = option(
+        "of strokes", "plain", choices=("plain", "bold", "own"), offered=("plain", "bold")
+    )
     turn: float | None = option("degrees", None, 0, 360, bare=0.0)
     frames: tuple[int, int] | None = option("first and last", None)
     color: tuple[float, float, float] = option("of strokes", (1.0, 1.0, 1.0), 0, 1)
-    tones: tuple[str, ...] = option("may be repeated", (), choices=("dark", "light"), needs=("shaded",))
-    shifts: Mapping[str, int] | None = option("NAME=N", None, parse=lambda text: (text[:-2], int(text[-1])))
+    tones: tuple[str, ...] = option(
+        "may be repeated", (), choices=("dark", "light"), needs=("shaded",)
+    )
+    shifts: Mapping[str, int] | None = option(
+        "NAME=N", None, parse=lambda text: (text[:-2], int(text[-1]))
+    )
     shaded: bool = option("with shades", False, needs=(("seconds", "strokes"),))
     again: float = like(Frame, "width", default=2.0)
     frame: Frame = option("frame", default_factory=Frame, needs=("shaded",))
@@ -43,7 +52,8 @@ def parsed(*words: str) -> dict[str, Any]:
 
 
 def test_what_is_given_reaches_its_field() -> None:
-    """Catches an option that is lost, of another type or in another field, and a default that hides the dataclass's."""
+    """Catches an option that is lost, of another type or in another field, and a default that hides
+    the dataclass's."""
     assert Drawing(**parsed()) == Drawing(Path("a.png"), Path("b"))
     line = "--count 4 --time 1m --style bold --turn --frames 2-7 --color 0,1,0.5 --tones dark --tones light"
     more = "--shifts left=3 --shifts x=1 --shaded --again 3 --width 4"
@@ -68,8 +78,11 @@ def test_what_is_given_reaches_its_field() -> None:
         ("--hidden 3", "unrecognized arguments: --hidden 3"),
     ],
 )
-def test_values_without_meaning(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches limits that the command line does not know, and a refusal that does not name the option."""
+def test_values_without_meaning(
+    words: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches limits that the command line does not know, and a refusal that does not name the
+    option."""
     with pytest.raises(SystemExit, match="2"):
         parsed(*words.split())
     assert message in capsys.readouterr().err
@@ -85,7 +98,8 @@ def test_values_without_meaning(words: str, message: str, capsys: pytest.Capture
     ],
 )
 def test_options_that_need_others(words: str, message: str | None) -> None:
-    """Catches an option that is ignored without a message, and one that is refused where it has an effect."""
+    """Catches an option that is ignored without a message, and one that is refused where it has an
+    effect."""
     value = Drawing(**parsed(*words.split()))
     if message is None:
         refuse_useless(value)

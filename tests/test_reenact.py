@@ -17,12 +17,16 @@ from stga_addon.render.render import render_avatar, to_uint8
 
 @pytest.fixture
 def parts(tmp_path: Path) -> dict[str, Path]:
-    """A capture's model, an avatar on its identity, another person's motion of two frames, and cameras."""
+    """A capture's model, an avatar on its identity, another person's motion of two frames, and
+    cameras."""
     folder, model = factory.write_flame_capture(tmp_path / "capture")
     capture = open_capture(folder, model)
     splats = lattice_splats(capture.neutral, capture.faces, order=0)
     splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
-    write_avatar(tmp_path / "a.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces))
+    write_avatar(
+        tmp_path / "a.npz",
+        Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces),
+    )
     rng = np.random.default_rng(1)
     pose, expr = rng.normal(0, 0.3, (2, 15)), rng.normal(size=(2, 2))
     np.savez(tmp_path / "other.npz", expr=expr, pose=pose, shape=np.full(4, 2.0))
@@ -36,30 +40,52 @@ def parts(tmp_path: Path) -> dict[str, Path]:
 
 
 def render(parts: dict[str, Path], out: Path, *more: object) -> int:
-    arguments = ["render", parts["avatar"], "--cameras", parts["cameras"], "--motion", parts["motion"], "--out", out]
+    arguments = [
+        "render",
+        parts["avatar"],
+        "--cameras",
+        parts["cameras"],
+        "--motion",
+        parts["motion"],
+        "--out",
+        out,
+    ]
     return main([str(a) for a in [*arguments, *more]])
 
 
 def test_the_other_person_moves_the_avatar(parts: dict[str, Path], tmp_path: Path) -> None:
-    """Catches the other's identity on this avatar, a wrong timestep, and cameras that come more than once."""
+    """Catches the other's identity on this avatar, a wrong timestep, and cameras that come more
+    than once."""
     out = tmp_path / "out"
     assert render(parts, out, "--flame", parts["model"]) == 0
-    assert sorted(path.name for path in out.iterdir()) == [f"{t:05d}_{c:02d}.png" for t in (0, 1) for c in (0, 1)]
+    assert sorted(path.name for path in out.iterdir()) == [
+        f"{t:05d}_{c:02d}.png" for t in (0, 1) for c in (0, 1)
+    ]
     capture = open_capture(parts["capture"], parts["model"])
-    own, view = capture.flame, next(view for view in capture.views["train"] if view.camera_index == 1)
+    own, view = (
+        capture.flame,
+        next(view for view in capture.views["train"] if view.camera_index == 1),
+    )
     assert own is not None
     arrays = np.load(parts["motion"])
     pose = arrays["pose"][1]
     frame = FlameFrame(arrays["expr"][1], pose[:3], pose[3:6], pose[6:9], np.zeros(3), pose[9:])
     mesh = flame_forward(own.model, own.shape, frame, own.static_offset)
-    expected = to_uint8(render_avatar(read_avatar(parts["avatar"]), mesh, view.camera, (1.0, 1.0, 1.0)))
+    expected = to_uint8(
+        render_avatar(read_avatar(parts["avatar"]), mesh, view.camera, (1.0, 1.0, 1.0))
+    )
     with Image.open(out / "00001_01.png") as image:
         drawn = np.asarray(image)
     assert np.abs(drawn.astype(int) - expected.astype(int)).max() <= 1
-    assert np.abs(drawn.astype(int) - np.asarray(Image.open(out / "00000_01.png")).astype(int)).max() > 50
+    assert (
+        np.abs(drawn.astype(int) - np.asarray(Image.open(out / "00000_01.png")).astype(int)).max()
+        > 50
+    )
 
 
-def test_mistakes(parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes(
+    parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches tracebacks for what a person gets wrong first."""
     assert render(parts, tmp_path / "out") == 2
     assert "give the FLAME model file" in capsys.readouterr().err
@@ -67,6 +93,11 @@ def test_mistakes(parts: dict[str, Path], tmp_path: Path, capsys: pytest.Capture
     assert render(parts | {"motion": meshes}, tmp_path / "out", "--flame", parts["model"]) == 2
     assert "was not tracked with FLAME" in capsys.readouterr().err
     (tmp_path / "scan.ply").write_bytes(b"ply\n")
-    assert render(parts | {"avatar": tmp_path / "scan.ply"}, tmp_path / "out", "--flame", parts["model"]) == 2
+    assert (
+        render(
+            parts | {"avatar": tmp_path / "scan.ply"}, tmp_path / "out", "--flame", parts["model"]
+        )
+        == 2
+    )
     assert "scan.ply: is a PLY" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,5 @@
-"""The schema by dataclasses of its own: what is allowed, what a message says, and JSON in both directions."""
+"""The schema by dataclasses of its own: what is allowed, what a message says, and JSON in both
+directions."""
 
 import json
 import math
@@ -63,7 +64,8 @@ EVERYTHING = Drawing(
 
 
 def test_round_trip() -> None:
-    """Catches a field that is lost, takes another type, or is confused with an alternative of the same form."""
+    """Catches a field that is lost, takes another type, or is confused with an alternative of the
+    same form."""
     arrays: dict[str, np.ndarray] = {}
     plain = to_json(EVERYTHING, arrays)
     again = from_json(Drawing, json.loads(json.dumps(plain)), arrays=arrays)
@@ -87,11 +89,20 @@ def test_round_trip() -> None:
         ({"count": 1.0}, "setting count: expected a whole number from 0, got 1.0"),
         ({"count": True}, "setting count: expected a whole number from 0, got True"),
         ({"count": 13}, "13 is not drawn"),
-        ({"span": (0.0, 1.5)}, "setting span: expected a tuple, each item a finite number from 0.0 up to 1.0, got "),
-        ({"span": (0.0, math.nan)}, "setting span: expected a tuple, each item a finite number from 0.0 up to 1.0"),
+        (
+            {"span": (0.0, 1.5)},
+            "setting span: expected a tuple, each item a finite number from 0.0 up to 1.0, got ",
+        ),
+        (
+            {"span": (0.0, math.nan)},
+            "setting span: expected a tuple, each item a finite number from 0.0 up to 1.0",
+        ),
         ({"span": (0.0,)}, "setting span: expected a tuple of 2, got "),
         ({"span": [0.0, 1.0]}, "setting span: expected a tuple of 2, got "),
-        ({"steps": (1, 0)}, "setting steps: expected a tuple, each item a whole number above 0, got "),
+        (
+            {"steps": (1, 0)},
+            "setting steps: expected a tuple, each item a whole number above 0, got ",
+        ),
         ({"steps": 1}, "setting steps: expected a tuple, got 1"),
         ({"style": "thin"}, "setting style: expected one of plain, bold, got 'thin'"),
         ({"style": None}, "setting style: expected one of plain, bold, got None"),
@@ -104,13 +115,20 @@ def test_round_trip() -> None:
         ({"colors": ()}, "setting colors: expected an object of Mapping, got "),
         ({"frames": {"1": Square()}}, "setting frames: expected values by name, got "),
         ({"main": 3}, "setting main: expected an object of Circle or an object of Square, got 3"),
-        ({"main": Circle(0.0)}, "setting main.radius: expected a finite number above 0.0 up to 9.0, got 0.0"),
-        ({"others": (Circle(), Square(10))}, "setting others.1.side: expected a whole number from 1 up to 9, got 10"),
+        (
+            {"main": Circle(0.0)},
+            "setting main.radius: expected a finite number above 0.0 up to 9.0, got 0.0",
+        ),
+        (
+            {"others": (Circle(), Square(10))},
+            "setting others.1.side: expected a whole number from 1 up to 9, got 10",
+        ),
         ({"last": Square(1, [1])}, "setting last.points: expected an array, got "),  # type: ignore[arg-type]
     ],
 )
 def test_what_is_not_allowed(changes: dict[str, Any], message: str) -> None:
-    """Catches a limit that does not hold, or holds for the value at its end, and a message about another field."""
+    """Catches a limit that does not hold, or holds for the value at its end, and a message about
+    another field."""
     with pytest.raises(StgaError) as caught:
         validate(Drawing(**changes))
     assert str(caught.value).startswith(message)
@@ -118,14 +136,16 @@ def test_what_is_not_allowed(changes: dict[str, Any], message: str) -> None:
 
 @pytest.mark.parametrize("radius", [9.0, 9, 5e-324])
 def test_limits_are_allowed(radius: float) -> None:
-    """Catches an inclusive limit that excludes its value, and whole numbers that are refused as finite ones."""
+    """Catches an inclusive limit that excludes its value, and whole numbers that are refused as
+    finite ones."""
     validate(Circle(radius))
     validate(Square(1))
     validate(Square(9))
 
 
 def test_numbers_that_kernels_cannot_hold() -> None:
-    """Catches a whole number given as a finite one that overflows where it is counted with, at either sign."""
+    """Catches a whole number given as a finite one that overflows where it is counted with, at
+    either sign."""
     validate(Free((1 << 31) - 1))
     validate(Free(1 - (1 << 31)))
     for value in (1 << 31, -(1 << 31)):
@@ -143,9 +163,18 @@ class Free:
     [
         ({"frames": {"x": {}}}, "setting d.frames: expected whole numbers as names, got 'x'"),
         ({"frames": {"1": {"side": 1}}}, "d.frames.1: fields are missing or unknown (points)"),
-        ({"main": {"side": 1, "points": None}}, "setting d.main.kind: expected one of Circle, Square, got None"),
-        ({"main": {"kind": "Cube"}}, "setting d.main.kind: expected one of Circle, Square, got 'Cube'"),
-        ({"main": {"kind": "Circle", "side": 1}}, "d.main: fields are missing or unknown (radius, side)"),
+        (
+            {"main": {"side": 1, "points": None}},
+            "setting d.main.kind: expected one of Circle, Square, got None",
+        ),
+        (
+            {"main": {"kind": "Cube"}},
+            "setting d.main.kind: expected one of Circle, Square, got 'Cube'",
+        ),
+        (
+            {"main": {"kind": "Circle", "side": 1}},
+            "d.main: fields are missing or unknown (radius, side)",
+        ),
         ({"main": None}, "setting d.main.kind: expected one of Circle, Square, got None"),
         ({"others": [{"kind": "Circle"}]}, "d.others.0: fields are missing or unknown (radius)"),
         ({"last": 3}, "d.last: fields are missing or unknown (points, side)"),
@@ -153,12 +182,16 @@ class Free:
             {"last": {"side": 1, "points": {"array": "nowhere"}, "more": 1}},
             "d.last: fields are missing or unknown (more)",
         ),
-        ({"last": {"side": 0, "points": None}}, "setting last.side: expected a whole number from 1 up to 9, got 0"),
+        (
+            {"last": {"side": 0, "points": None}},
+            "setting last.side: expected a whole number from 1 up to 9, got 0",
+        ),
         ({"more": 1}, "d: fields are missing or unknown (more)"),
     ],
 )
 def test_json_of_another_form(changes: dict[str, Any], message: str) -> None:
-    """Catches a traceback for a file edited by hand, and a message that does not say where the mistake is."""
+    """Catches a traceback for a file edited by hand, and a message that does not say where the
+    mistake is."""
     plain = to_json(Drawing())
     with pytest.raises(StgaError) as caught:
         from_json(Drawing, {**plain, **changes}, "d")
@@ -171,7 +204,9 @@ def test_an_array_that_is_not_there(named: object) -> None:
     plain = {"points": {"array": named}}
     with pytest.raises(StgaError, match="setting points: expected an array, got None"):
         from_json(Cloud, plain, arrays={"points": np.zeros(3)})
-    assert from_json(Cloud, {"points": {"array": "a"}}, arrays={"a": np.zeros(3)}).points.shape == (3,)
+    assert from_json(Cloud, {"points": {"array": "a"}}, arrays={"a": np.zeros(3)}).points.shape == (
+        3,
+    )
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture, 
 
 THRESHOLD = 0.01
 COUNT = 8
-FACES = np.arange(3 * COUNT).reshape(COUNT, 3)  # separate triangles, so that each can be moved alone
+# separate triangles, so that each can be moved alone
+FACES = np.arange(3 * COUNT).reshape(COUNT, 3)
 NEUTRAL = np.random.default_rng(0).normal(size=(3 * COUNT, 3))
 
 
@@ -34,13 +35,15 @@ def selected(offsets: dict[int, float], **regions: np.ndarray) -> list[int]:
 
 
 def test_triangles_outside_regions_go_by_their_own_offset():
-    """Catches a mean taken over everything, and a threshold that is not strict enough or too strict."""
+    """Catches a mean taken over everything, and a threshold that is not strict enough or too
+    strict."""
     assert selected({1: 0.011, 2: 0.0099, 5: 0.5}) == [1, 5]
     assert selected({}) == []
 
 
 def test_region_goes_by_its_mean_offset():
-    """Catches the maximum, or a per-triangle rule, inside a region: 0.021 over two of them is 0.0105 on average."""
+    """Catches the maximum, or a per-triangle rule, inside a region: 0.021 over two of them is
+    0.0105 on average."""
     assert selected({0: 0.021}, mouth=region(0, 1)) == [0, 1]
     assert selected({0: 0.019}, mouth=region(0, 1)) == []
 
@@ -70,7 +73,10 @@ def test_offset_is_that_of_the_center():
 def test_triangle_of_two_regions_is_selected_by_either():
     """Catches a later region that unselects what an earlier one selected."""
     for names in (("nose", "mouth"), ("mouth", "nose")):
-        regions = dict.fromkeys(names, region(4)) | {"mouth": region(0, 4), "nose": region(3, 4, 5, 6)}
+        regions = dict.fromkeys(names, region(4)) | {
+            "mouth": region(0, 4),
+            "nose": region(3, 4, 5, 6),
+        }
         assert selected({0: 0.03}, **regions) == [0, 4]
 
 
@@ -104,7 +110,8 @@ def numbers(chosen: dict[int, np.ndarray]) -> dict[int, list[int]]:
 
 
 def test_every_timestep_is_selected_from_its_expression_mesh():
-    """Catches regions that the options do not name, and the wrong zero pose: "ears" is no key region here."""
+    """Catches regions that the options do not name, and the wrong zero pose: "ears" is no key
+    region here."""
     asked: list[tuple[int, str]] = []
     options = SelectionOptions(threshold=THRESHOLD, zero_pose="all")
     chosen = select_capture(capture({}, asked), options)
@@ -133,13 +140,14 @@ def test_threshold_is_a_distance(threshold: object) -> None:
 
 
 def test_defaults_select_flames_regions_and_any_motion() -> None:
-    """Catches a key region under another name than captures give it, which is then never selected as a whole, and a
-    threshold of zero that is refused."""
+    """Catches a key region under another name than captures give it, which is then never selected
+    as a whole, and a threshold of zero that is refused."""
     assert set(KEY_REGIONS) == set(KEY_MASKS)
     assert SelectionOptions(threshold=0.0).threshold == 0
 
 
 def test_zero_pose_is_known() -> None:
-    """Catches a misspelled option that is found only where the first FLAME mesh is posed, or never."""
+    """Catches a misspelled option that is found only where the first FLAME mesh is posed, or
+    never."""
     with pytest.raises(StgaError, match="zero_pose is 'face'"):
         SelectionOptions(zero_pose="face")

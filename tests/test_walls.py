@@ -50,9 +50,11 @@ LAYERS = (
     {"__main__", "__init__"},
 )
 NAMED_WHERE_THERE = dict.fromkeys(
-    ("stga_addon/cli/main.py", "stga_addon/jobs/perform.py", "stga_addon/jobs/table.py"), "development"
+    ("stga_addon/cli/main.py", "stga_addon/jobs/perform.py", "stga_addon/jobs/table.py"),
+    "development",
 )
-"""Files that name modules of a room after their own, because the extension's zip leaves that room out."""
+"""Files that name modules of a room after their own, because the extension's zip leaves that room
+out."""
 LIGHT = (
     "errors",
     "files",
@@ -76,7 +78,8 @@ def name_of(path: Path) -> str:
 
 @cache
 def imports(path: Path) -> tuple[tuple[str, int], ...]:
-    """(dotted module, level) of every import, at the top or inside a function; `from x import y` gives x.y."""
+    """(dotted module, level) of every import, at the top or inside a function; `from x import y`
+    gives x.y."""
     found: list[tuple[str, int]] = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -89,8 +92,8 @@ def imports(path: Path) -> tuple[tuple[str, int], ...]:
 
 @cache
 def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
-    """The same for every string that is the name of a module, whatever reads it: `import_module`, `find_spec`, a table
-    of them, or another Python after `-m`."""
+    """The same for every string that is the name of a module, whatever reads it: `import_module`,
+    `find_spec`, a table of them, or another Python after `-m`."""
     named: list[tuple[str, int]] = []
     depth = len(path.relative_to(ROOT).parts)
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -100,14 +103,19 @@ def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
             continue
         module, level = (found[2], len(found[1])) if found[1] else (f"stga_addon.{found[2]}", depth)
         if level <= depth and module_file(path.parents[level - 1].joinpath(*module.split("."))):
-            inside = level == depth and path.is_relative_to(ROOT / "stga_addon")  # has no name for the folder above
-            named.append((module.removeprefix("stga_addon."), level - 1) if inside else (module, level))
+            # has no name for the folder above
+            inside = level == depth and path.is_relative_to(ROOT / "stga_addon")
+            named.append(
+                (module.removeprefix("stga_addon."), level - 1) if inside else (module, level)
+            )
     return tuple(named)
 
 
 def module_file(path: Path) -> Path | None:
     """The source of the module or package at a path without suffix."""
-    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
+    return next(
+        (file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None
+    )
 
 
 def imported_file(path: Path, module: str, level: int) -> Path | None:
@@ -144,22 +152,32 @@ def reached(graph: dict[T, set[T]], path: T) -> set[T]:
 def test_the_walls_are_looked_at():
     """Catches a move of the sources that leaves every test below without anything to read."""
     assert len(SOURCES) > 30
-    assert {ROOT / "__init__.py", ROOT / "operators/train.py", ROOT / "stga_addon/scene/display/splat_nodes.py"} <= set(
-        SOURCES
-    )
+    assert {
+        ROOT / "__init__.py",
+        ROOT / "operators/train.py",
+        ROOT / "stga_addon/scene/display/splat_nodes.py",
+    } <= set(SOURCES)
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=name_of)
 def test_packages_are_imported_only_where_they_may_be(path):
-    """Catches an engine that cannot run or be tested outside Blender, an extension that needs PyTorch to be enabled, to
-    import and to show, and `import stga_addon…`, which is not there once Blender installs it as bl_ext.….stga."""
+    """Catches an engine that cannot run or be tested outside Blender, an extension that needs
+    PyTorch to be enabled, to import and to show, and `import stga_addon…`, which is not there once
+    Blender installs it as bl_ext.….stga."""
     absolute = {module.split(".")[0] for module, level in imports(path) if level == 0}
     assert not absolute & {"stga_addon", "operators", "ui", "stga"}
-    assert path == ROOT / "__init__.py" or name_of(path).startswith(BLENDERS) or not absolute & BLENDER
-    assert name_of(path).startswith(TRAININGS) or not {module.split(".")[0] for module, _ in imports(path)} & HEAVY
+    assert (
+        path == ROOT / "__init__.py" or name_of(path).startswith(BLENDERS) or not absolute & BLENDER
+    )
+    assert (
+        name_of(path).startswith(TRAININGS)
+        or not {module.split(".")[0] for module, _ in imports(path)} & HEAVY
+    )
 
 
-@pytest.mark.parametrize("path", [p for p in SOURCES if p.is_relative_to(ROOT / "stga_addon")], ids=name_of)
+@pytest.mark.parametrize(
+    "path", [p for p in SOURCES if p.is_relative_to(ROOT / "stga_addon")], ids=name_of
+)
 def test_imports_run_one_way(path):
     """Catches cycles, and an engine that knows of the scene or the command line."""
     parts = path.relative_to(ROOT / "stga_addon").with_suffix("").parts
@@ -167,30 +185,41 @@ def test_imports_run_one_way(path):
     optional = NAMED_WHERE_THERE.get(name_of(path))
     named = [each for each in imports_by_name(path) if each[0].split(".")[0] != optional]
     for module, level in (*imports(path), *named):
-        # level 1 from stga_addon/x.py, level 2 from stga_addon/x/y.py, 3 from stga_addon/x/y/z.py reach stga_addon
+        # level 1 from stga_addon/x.py, level 2 from stga_addon/x/y.py, 3 from stga_addon/x/y/z.py
+        # reach stga_addon
         if level == 0 or level < len(parts):
             continue
         assert level == len(parts), f"{name_of(path)} imports from outside stga_addon"
         other = module.split(".")[0]
         if other == parts[0]:
             continue
-        assert layer(other) < own or {parts[0], other} <= {"avatar", "selection"}, f"{name_of(path)} imports {module}"
+        assert layer(other) < own or {parts[0], other} <= {"avatar", "selection"}, (
+            f"{name_of(path)} imports {module}"
+        )
 
 
 def test_no_file_imports_itself_by_way_of_others():
-    """Catches circles inside a room, those of types only, and those through modules that are loaded by name."""
+    """Catches circles inside a room, those of types only, and those through modules that are loaded
+    by name."""
     graph = import_graph(SOURCES)
     assert not [name_of(path) for path in SOURCES if path in reached(graph, path)]
 
 
-@pytest.mark.parametrize("room", sorted({path.parent for path in SOURCES} - {ROOT, ROOT / "stga_addon"}), ids=name_of)
+@pytest.mark.parametrize(
+    "room", sorted({path.parent for path in SOURCES} - {ROOT, ROOT / "stga_addon"}), ids=name_of
+)
 def test_no_part_of_a_room_imports_itself_by_way_of_others(room):
-    """Catches two folders, or a folder and a file beside it, that need each other though no two of their files do."""
-    inside = {path: path.relative_to(room).parts[0] for path in SOURCES if path.is_relative_to(room)}
+    """Catches two folders, or a folder and a file beside it, that need each other though no two of
+    their files do."""
+    inside = {
+        path: path.relative_to(room).parts[0] for path in SOURCES if path.is_relative_to(room)
+    }
     parts: dict[str, set[str]] = {part: set() for part in inside.values()}
     for path, others in import_graph(SOURCES).items():
         if path in inside:
-            parts[inside[path]] |= {inside[other] for other in others if other in inside} - {inside[path]}
+            parts[inside[path]] |= {inside[other] for other in others if other in inside} - {
+                inside[path]
+            }
     assert not [part for part in parts if part in reached(parts, part)]
 
 
@@ -210,11 +239,14 @@ def test_no_part_of_a_room_imports_itself_by_way_of_others(room):
 def test_every_way_to_import_is_seen(source, target, tmp_path, monkeypatch):
     """Catches a circle that hides: in a function, behind TYPE_CHECKING, or in a string."""
     files = [
-        tmp_path / "stga_addon" / name for name in ("a/a.py", "a/b.py", "a/__init__.py", "c/__init__.py", "c/d.py")
+        tmp_path / "stga_addon" / name
+        for name in ("a/a.py", "a/b.py", "a/__init__.py", "c/__init__.py", "c/d.py")
     ]
     for path in files:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(source if path.name == "a.py" else "NAME = '.npz', 'stga_addon.none', '..c.none'\n")
+        path.write_text(
+            source if path.name == "a.py" else "NAME = '.npz', 'stga_addon.none', '..c.none'\n"
+        )
     monkeypatch.setitem(globals(), "ROOT", tmp_path)
     graph = dict(import_graph(tuple(files)))
     assert graph.pop(files[0]) == {tmp_path / "stga_addon" / target}
@@ -227,10 +259,14 @@ def layer(name: str) -> int:
     return found[0]
 
 
-@pytest.mark.parametrize("path", [p for p in SOURCES if p.is_relative_to(ROOT / "operators")], ids=name_of)
+@pytest.mark.parametrize(
+    "path", [p for p in SOURCES if p.is_relative_to(ROOT / "operators")], ids=name_of
+)
 def test_operators_do_not_know_the_panels(path):
     """Catches operators that only work where the panels are registered."""
-    assert not [module for module, level in imports(path) if level == 2 and module.split(".")[0] == "ui"]
+    assert not [
+        module for module, level in imports(path) if level == 2 and module.split(".")[0] == "ui"
+    ]
 
 
 BLOCKED = """
@@ -248,7 +284,9 @@ for name in sys.argv[1:]:
 
 def test_numpy_is_enough_to_import_the_engine():
     """Catches a top-level import that a plain Blender cannot satisfy."""
-    done = subprocess.run([sys.executable, "-c", BLOCKED, "", *LIGHT], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCKED, "", *LIGHT], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -262,7 +300,8 @@ assert "torch" not in sys.modules
 
 
 def test_training_begins_without_torch():
-    """Catches a worker that waits two seconds for what refining the tracking, LPIPS and autograd alone need."""
+    """Catches a worker that waits two seconds for what refining the tracking, LPIPS and autograd
+    alone need."""
     done = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
@@ -277,6 +316,8 @@ def test_numpy_is_enough_to_import_the_scene():
         path.relative_to(ROOT / "stga_addon").with_suffix("").as_posix().replace("/", ".")
         for path in sorted((ROOT / "stga_addon/scene").rglob("[a-z]*.py"))
     ]
-    done = subprocess.run([sys.executable, "-c", SCENE, *modules], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", SCENE, *modules], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert len(modules) > 5

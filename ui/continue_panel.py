@@ -1,4 +1,5 @@
-"""Below the Train step: refining a region of the trained avatar, and extending it by a further take."""
+"""Below the Train step: refining a region of the trained avatar, and extending it by a further
+take."""
 
 from typing import Any, ClassVar
 
@@ -36,7 +37,10 @@ def _draw_refine(layout: Any, settings: Any) -> None:
     column, head, options = layout.column(), settings.head, settings.refine
     shown = shows_residuals(head)
     residuals = column.operator(
-        ids.HEAT_MAP, text="Hide Residuals" if shown else "Show Residuals", icon="BRUSHES_ALL", depress=shown
+        ids.HEAT_MAP,
+        text="Hide Residuals" if shown else "Show Residuals",
+        icon="BRUSHES_ALL",
+        depress=shown,
     )
     residuals.show, residuals.of, residuals.directory = not shown, "RESIDUAL", settings.run_folder
     editing = head.mode == "EDIT"
@@ -52,7 +56,9 @@ def _draw_refine(layout: Any, settings: Any) -> None:
     row.prop(options, "seconds")
     row.prop(options, "growth")
     refine = column.operator(
-        ids.REFINE, text="Refine Selected Faces" if editing else "Refine Vertex Group", icon="SCULPTMODE_HLT"
+        ids.REFINE,
+        text="Refine Selected Faces" if editing else "Refine Vertex Group",
+        icon="SCULPTMODE_HLT",
     )
     set_options(refine, settings, DeviceOptions)
     set_options(refine, options, RefineOptions)

@@ -18,7 +18,8 @@ _shown: dict[Path, monitor.Curve] = {}
 
 
 def draw_curve(layout: Any, folder: Path) -> None:
-    """Draw the curve of the run in this folder, or the head over the footage that is tracked; nothing before then."""
+    """Draw the curve of the run in this folder, or the head over the footage that is tracked;
+    nothing before then."""
     curve = monitor.curve(folder)
     if curve is None:
         return

@@ -58,7 +58,11 @@ def _draw_source(layout: Any, context: Any, settings: Any) -> None:
     layout.prop(settings, "port", text=f"Port (0: {source.port})")
     draw_text(layout, context, source.hint)
     if settings.address == LOOPBACK:
-        draw_text(layout, context, "Only programs on this computer are heard; for a phone, listen on 0.0.0.0")
+        draw_text(
+            layout,
+            context,
+            "Only programs on this computer are heard; for a phone, listen on 0.0.0.0",
+        )
 
 
 def _draw_status(column: Any, running: Any) -> None:

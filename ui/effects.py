@@ -28,7 +28,9 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
     def _draw_effect(self, context: Any, row: Any) -> None:
         box = self.layout.column(align=True)
         split = box.split(factor=0.6)
-        split.label(text=row.name.replace("-", " ").capitalize(), icon="CHECKMARK" if row.on else "REMOVE")
+        split.label(
+            text=row.name.replace("-", " ").capitalize(), icon="CHECKMARK" if row.on else "REMOVE"
+        )
         split.prop(row, "choice", text="")
         reasons = box.column(align=True)
         reasons.active = False

@@ -47,7 +47,10 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
             self._draw_settings(layout, context, settings)
         if light.damping:
             draw_text(
-                layout, context, f"The capture's light was hard: albedo is evened out by {light.damping:.0%}", "INFO"
+                layout,
+                context,
+                f"The capture's light was hard: albedo is evened out by {light.damping:.0%}",
+                "INFO",
             )
         row = layout.row(align=True)
         row.operator(ids.RELIGHT_FRAME, text="Relight Frame (EEVEE, Cycles)")
@@ -88,7 +91,9 @@ def _pop_up(hint: str) -> None:
     """Show the sentence in the window that was opened last: that of the image, where it has one."""
     manager = bpy.context.window_manager
     with bpy.context.temp_override(window=manager.windows[-1]):
-        manager.popup_menu(lambda menu, _: menu.layout.label(text=hint), title="STGA Lighting", icon="ERROR")
+        manager.popup_menu(
+            lambda menu, _: menu.layout.label(text=hint), title="STGA Lighting", icon="ERROR"
+        )
 
 
 def register() -> None:

@@ -26,7 +26,9 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         row.prop(settings, "motion_source")
         if settings.motion_source is not None:
-            row.operator(ids.APPLY_MOTION, text="", icon="CHECKMARK").source = settings.motion_source.name
+            row.operator(
+                ids.APPLY_MOTION, text="", icon="CHECKMARK"
+            ).source = settings.motion_source.name
 
 
 class ArkitPanel(SidebarPanel, bpy.types.Panel):
@@ -64,7 +66,9 @@ class TrainedPanel(SidebarPanel, bpy.types.Panel):
             return
         for part, beyond in outside_now(head, rig, trained).items():
             text = (
-                f"{part.capitalize()}: {beyond:.1f} half widths outside" if beyond else f"{part.capitalize()}: inside"
+                f"{part.capitalize()}: {beyond:.1f} half widths outside"
+                if beyond
+                else f"{part.capitalize()}: inside"
             )
             self.layout.progress(factor=min(beyond, 1.0), text=text)
 

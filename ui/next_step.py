@@ -1,4 +1,5 @@
-"""The hint on top of the sidebar tab: what to do next, with its button; once an avatar is shown, what to try."""
+"""The hint on top of the sidebar tab: what to do next, with its button; once an avatar is shown,
+what to try."""
 
 from typing import Any
 
@@ -28,19 +29,30 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
-        training, tracking = (monitor.state_of(context.scene, kind) for kind in (Kind.TRAINING, Kind.TRACKING))
+        training, tracking = (
+            monitor.state_of(context.scene, kind) for kind in (Kind.TRAINING, Kind.TRACKING)
+        )
         making = monitor.state_of(context.scene, Kind.AVATAR)
         if draw_running(layout, context, Kind.AVATAR):
-            draw_text(layout, context, "Head, then splats appear. Go on working, save, or quit Blender", "INFO")
+            draw_text(
+                layout,
+                context,
+                "Head, then splats appear. Go on working, save, or quit Blender",
+                "INFO",
+            )
             return
         if making.subject is not None:
             draw_end(layout, context, making)
             if making.snapshot.state != WorkerState.FINISHED:
-                layout.operator(ids.AVATAR_FROM_VIDEO, text="Continue", icon="FRAME_NEXT").folder = str(making.subject)
+                layout.operator(
+                    ids.AVATAR_FROM_VIDEO, text="Continue", icon="FRAME_NEXT"
+                ).folder = str(making.subject)
         if tracking.is_running:
             done = f"Tracking, {100 * tracking.snapshot.status.progress:.0f} %"
             draw_text(
-                layout, context, f"{done}: the head is imported when it is done. Go on working, save, or quit Blender"
+                layout,
+                context,
+                f"{done}: the head is imported when it is done. Go on working, save, or quit Blender",
             )
         elif not is_head(settings.head) and settings.splats is None:
             draw_text(
@@ -56,7 +68,11 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)
         elif training.is_running:
-            draw_text(layout, context, "Training: splats appear on the head soon. Go on working, save, or quit Blender")
+            draw_text(
+                layout,
+                context,
+                "Training: splats appear on the head soon. Go on working, save, or quit Blender",
+            )
         elif settings.avatar:
             draw_text(layout, context, "Show the trained avatar on the head")
             layout.operator(ids.SHOW_AVATAR, icon="HIDE_OFF").filepath = settings.avatar
@@ -64,7 +80,9 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, context, "Train an avatar, or choose a trained one under 4 Show")
             draw_train_button(layout, settings)
         else:
-            draw_text(layout, context, "Training needs a Python; to show a trained avatar, go to 4 Show")
+            draw_text(
+                layout, context, "Training needs a Python; to show a trained avatar, go to 4 Show"
+            )
             draw_missing_python(layout, context)
 
 
@@ -81,7 +99,9 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
         text = "Done Posing" if posing else "Pose the Head"
         column.operator(ids.POSE_HEAD, text=text, icon="ARMATURE_DATA", depress=posing)
         if posing:
-            draw_text(column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO")
+            draw_text(
+                column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO"
+            )
     groups = settings.head.vertex_groups if is_head(settings.head) else ()
     if any(tags.group_timestep(group.name) is not None for group in groups):
         _draw_selection_toggle(column, settings.splats)
@@ -89,7 +109,8 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
 
 
 def _draw_selection_toggle(layout: Any, splats: Any) -> None:
-    """Draw the switch that grays out what the current frame's selection freezes, where the splats have it."""
+    """Draw the switch that grays out what the current frame's selection freezes, where the splats
+    have it."""
     try:
         modifier = splat_modifier(splats)
     except StgaError:
@@ -97,7 +118,9 @@ def _draw_selection_toggle(layout: Any, splats: Any) -> None:
     identifier = input_identifier(modifier, splat_nodes.SHOW_SELECTION)
     if identifier is not None:
         owner, prop = modifier_input_owner(modifier, identifier)
-        layout.prop(owner, prop, text=splat_nodes.SHOW_SELECTION, icon="RESTRICT_SELECT_OFF", toggle=True)
+        layout.prop(
+            owner, prop, text=splat_nodes.SHOW_SELECTION, icon="RESTRICT_SELECT_OFF", toggle=True
+        )
 
 
 def draw_video(layout: Any, context: Any) -> None:

@@ -11,7 +11,12 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
-from ..stga_addon.scene.display.splat_object import display_mode, input_identifier, splat_modifier, view_transform_hint
+from ..stga_addon.scene.display.splat_object import (
+    display_mode,
+    input_identifier,
+    splat_modifier,
+    view_transform_hint,
+)
 from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.render import viewport_display
 from . import lighting
@@ -59,9 +64,14 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
 def _draw_visibility(layout: Any, context: Any, root: Any) -> None:
     """Draw switches that show and hide the bones and the cameras in viewports."""
     row = layout.row(align=True)
-    for kind, text, icon in ((tags.RIG, "Bones", "BONE_DATA"), (tags.CAMERA, "Cameras", "CAMERA_DATA")):
+    for kind, text, icon in (
+        (tags.RIG, "Bones", "BONE_DATA"),
+        (tags.CAMERA, "Cameras", "CAMERA_DATA"),
+    ):
         for layer in layers_of(root, kind, context.view_layer) if root is not None else ():
-            row.prop(layer, "hide_viewport", text=text, icon=icon, toggle=True, invert_checkbox=True)
+            row.prop(
+                layer, "hide_viewport", text=text, icon=icon, toggle=True, invert_checkbox=True
+            )
 
 
 class ShowPanel(SidebarPanel, bpy.types.Panel):

@@ -1,4 +1,5 @@
-"""Preferences of the add-on: the FLAME model, the Python that tracks and trains, and the device that renders."""
+"""Preferences of the add-on: the FLAME model, the Python that tracks and trains, and the device
+that renders."""
 
 from typing import Any
 
@@ -55,7 +56,10 @@ def _draw_python(box: Any, context: Any, stored: Any) -> None:
         draw_text(box, context, f"{test.python}: {test.found.line}", "CHECKMARK")
     elif not has_training_python(context):
         draw_text(
-            box, context, "Blender's Python lacks packages: choose another, or install the complete edition", "INFO"
+            box,
+            context,
+            "Blender's Python lacks packages: choose another, or install the complete edition",
+            "INFO",
         )
 
 

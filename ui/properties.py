@@ -16,8 +16,12 @@ from ..operators.train import TrainOptions, preset_property
 class SelectedFrame(bpy.types.PropertyGroup):
     """Row of the table of selected triangles; filled by `operators.select`."""
 
-    frame: bpy.props.IntProperty(name="Frame", description="Frame of the scene: the timestep of the capture")
-    triangles: bpy.props.IntProperty(name="Triangles", description="Triangles selected in the frame")
+    frame: bpy.props.IntProperty(
+        name="Frame", description="Frame of the scene: the timestep of the capture"
+    )
+    triangles: bpy.props.IntProperty(
+        name="Triangles", description="Triangles selected in the frame"
+    )
     splats: bpy.props.IntProperty(name="Splats", description="Splats on those triangles")
 
 
@@ -58,7 +62,9 @@ class EffectRow(bpy.types.PropertyGroup):
 class TrackSettings(TrackOptions, bpy.types.PropertyGroup):
     """The panel's options of Track Footage."""
 
-    directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH", default="//stga_capture")
+    directory: path_property(
+        "Capture", "Folder for the tracked capture", "DIR_PATH", default="//stga_capture"
+    )
 
 
 class RefineSettings(RefineOptions, bpy.types.PropertyGroup):
@@ -80,9 +86,11 @@ class DriveSettings(DriveOptions, bpy.types.PropertyGroup):
 
 
 class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
-    """Settings of the panel, one group for each scene; passed to operators as arguments, but for head and splats."""
+    """Settings of the panel, one group for each scene; passed to operators as arguments, but for
+    head and splats."""
 
-    # The module bpy 4.2 crashes when its Python ends where a property has a poll or update function; Blender does not.
+    # The module bpy 4.2 crashes when its Python ends where a property has a poll or update
+    # function; Blender does not.
 
     head: bpy.props.PointerProperty(
         name="Head",
@@ -91,14 +99,18 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
         update=_forget_rows,
     )
     track: bpy.props.PointerProperty(type=TrackSettings)
-    tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last tracking
+    # absolute path of the current or last tracking
+    tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})
     tracking_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it was imported
-    avatar_folder: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last video's avatar
+    # absolute path of the current or last video's avatar
+    avatar_folder: bpy.props.StringProperty(options={"HIDDEN"})
     avatar_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it has reached the scene
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: bpy.props.IntProperty(options={"HIDDEN"})
     motion_source: bpy.props.PointerProperty(
-        name="From", description="Another imported head, whose motion is applied to this one", type=bpy.types.Object
+        name="From",
+        description="Another imported head, whose motion is applied to this one",
+        type=bpy.types.Object,
     )
     drive: bpy.props.PointerProperty(type=DriveSettings)
     splats: bpy.props.PointerProperty(
@@ -113,17 +125,30 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
     live_preview: bpy.props.BoolProperty(
-        name="Live Preview", description="Update the splats every few seconds during training", default=True
+        name="Live Preview",
+        description="Update the splats every few seconds during training",
+        default=True,
     )
     show_result: bpy.props.BoolProperty(
-        name="Show When Trained", description="Show the avatar on the head when training has finished", default=True
+        name="Show When Trained",
+        description="Show the avatar on the head when training has finished",
+        default=True,
     )
-    training_run: bpy.props.StringProperty(options={"HIDDEN"})  # absolute path of the current or last run
+    # absolute path of the current or last run
+    training_run: bpy.props.StringProperty(options={"HIDDEN"})
     result_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # its avatar has reached the scene
     avatar: path_property("Avatar", "Trained avatar file (.npz)")
 
 
-CLASSES = (SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, DriveSettings, SceneSettings)
+CLASSES = (
+    SelectedFrame,
+    EffectRow,
+    TrackSettings,
+    RefineSettings,
+    ExtendSettings,
+    DriveSettings,
+    SceneSettings,
+)
 
 
 def register() -> None:

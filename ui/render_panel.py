@@ -27,5 +27,12 @@ class RenderPanel(bpy.types.Panel):
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
         if missing_packages() and not has_gpu_context():
-            renderer = "Rendered by another Python" if has_training_python(context) else "No Python here can render"
-            layout.label(text=f"{renderer}: Blender's Python lacks {', '.join(missing_packages())}", icon="INFO")
+            renderer = (
+                "Rendered by another Python"
+                if has_training_python(context)
+                else "No Python here can render"
+            )
+            layout.label(
+                text=f"{renderer}: Blender's Python lacks {', '.join(missing_packages())}",
+                icon="INFO",
+            )

@@ -1,4 +1,5 @@
-"""A request in a panel: its progress with Cancel, its end with Dismiss, and its failure with the end of the log."""
+"""A request in a panel: its progress with Cancel, its end with Dismiss, and its failure with the
+end of the log."""
 
 import textwrap
 from typing import Any
@@ -15,14 +16,17 @@ WAITING = "Done; shown as soon as Edit Mode or rendering ends"
 
 
 def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
-    """Draw the progress of the scene's request with its Cancel button; returns False where none is running."""
+    """Draw the progress of the scene's request with its Cancel button; returns False where none is
+    running."""
     state = monitor.state_of(context.scene, kind)
     if state.error:
         draw_text(layout, context, state.error, "ERROR")
     if not state.is_running:
         return False
     now = state.snapshot
-    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(now.state, now.status.message)
+    text = {WorkerState.STARTING: "Starting", WorkerState.CANCELLING: "Cancelling"}.get(
+        now.state, now.status.message
+    )
     text = text if now.state.is_alive else WAITING
     layout.progress(factor=now.status.progress, text=f"{100 * now.status.progress:.0f} %  {text}")
     column = layout.column(align=True)
@@ -35,7 +39,8 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
 
 
 def draw_end(layout: Any, context: Any, state: RequestState) -> Any:
-    """Draw how a request has ended, its failure, and its Dismiss button; returns the box, for more."""
+    """Draw how a request has ended, its failure, and its Dismiss button; returns the box, for
+    more."""
     box, worker = layout.box(), state.snapshot.state
     row = box.row()
     icons = {WorkerState.FINISHED: "CHECKMARK", WorkerState.CANCELLED: "INFO"}
@@ -60,5 +65,7 @@ def draw_failure(layout: Any, context: Any, state: RequestState) -> None:
     log = layout.column(align=True)
     log.active = False
     for line in now.log_tail:
-        log.label(text=textwrap.shorten(line, width, placeholder="…") if len(line) > width else line)
+        log.label(
+            text=textwrap.shorten(line, width, placeholder="…") if len(line) > width else line
+        )
     layout.operator(ids.COPY_REPORT, icon="COPYDOWN").directory = str(state.folder)

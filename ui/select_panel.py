@@ -18,7 +18,14 @@ class SelectedFrames(bpy.types.UIList):
     bl_idname = "STGA_UL_selected_frames"
 
     def draw_item(
-        self, context: Any, layout: Any, data: Any, item: Any, icon: int, active_data: Any, active_propname: str
+        self,
+        context: Any,
+        layout: Any,
+        data: Any,
+        item: Any,
+        icon: int,
+        active_data: Any,
+        active_propname: str,
     ) -> None:
         row = layout.row()
         row.active = item.triangles > 0
@@ -40,12 +47,16 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
         _draw_regions(layout, settings.head)
         if settings.selected_frames:
             _draw_table(layout, settings)
-        if any(tags.group_timestep(group.name) is not None for group in settings.head.vertex_groups):
+        if any(
+            tags.group_timestep(group.name) is not None for group in settings.head.vertex_groups
+        ):
             row = layout.row(align=True)
             row.operator(ids.COUNT_SELECTED, icon="FILE_REFRESH")
             shown = has_heat_map(settings.head) and not shows_residuals(settings.head)
             text = "Hide Heat Map" if shown else "Show Heat Map"
-            row.operator(ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown).show = not shown
+            row.operator(
+                ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown
+            ).show = not shown
         else:
             layout.label(text="No selection yet")
 
@@ -58,7 +69,9 @@ def _draw_regions(layout: Any, head: Any) -> None:
     grid = layout.grid_flow(columns=2, align=True, row_major=True)
     for name in possible:
         icon = "CHECKBOX_HLT" if name in ticked else "CHECKBOX_DEHLT"
-        grid.operator(ids.TOGGLE_REGION, text=name.replace("_", " "), icon=icon, depress=name in ticked).name = name
+        grid.operator(
+            ids.TOGGLE_REGION, text=name.replace("_", " "), icon=icon, depress=name in ticked
+        ).name = name
 
 
 def _draw_table(layout: Any, settings: Any) -> None:
@@ -67,5 +80,12 @@ def _draw_table(layout: Any, settings: Any) -> None:
         heading.label(text=text)
     heading.label(icon="BLANK1")
     layout.template_list(
-        SelectedFrames.bl_idname, "", settings, "selected_frames", settings, "selected_row", rows=4, maxrows=5
+        SelectedFrames.bl_idname,
+        "",
+        settings,
+        "selected_frames",
+        settings,
+        "selected_row",
+        rows=4,
+        maxrows=5,
     )

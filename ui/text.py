@@ -9,7 +9,9 @@ LETTER_WIDTH_PX = 7
 
 def columns(context: Any) -> int:
     """Number of letters that fit into a label of the panel's region."""
-    return max(20, int(context.region.width / (LETTER_WIDTH_PX * context.preferences.system.ui_scale)) - 4)
+    return max(
+        20, int(context.region.width / (LETTER_WIDTH_PX * context.preferences.system.ui_scale)) - 4
+    )
 
 
 def draw_text(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:

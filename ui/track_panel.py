@@ -66,7 +66,9 @@ class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, head = self.layout, scene_settings(context).head
         sheet = Path(head[tags.CAPTURE]) / SHEET_FILE
-        layout.operator("wm.path_open", text="Open Contact Sheet", icon="IMAGE_DATA").filepath = str(sheet)
+        layout.operator(
+            "wm.path_open", text="Open Contact Sheet", icon="IMAGE_DATA"
+        ).filepath = str(sheet)
         row = layout.row(align=True)
         row.operator(ids.VIEW_FOOTAGE, text="", icon="TRIA_LEFT").step = -1
         through = context.space_data.region_3d.view_perspective == "CAMERA"
@@ -80,12 +82,16 @@ def _draw_keys(layout: Any, context: Any, head: Any) -> None:
     layout.operator(ids.POSE_HEAD, icon="ARMATURE_DATA")
     marked = context.scene.frame_current in keys
     text = "Unmark Key" if marked else "Mark as Key"
-    layout.operator(ids.MARK_KEY, text=text, icon="KEYFRAME_HLT" if marked else "KEYFRAME", depress=marked)
+    layout.operator(
+        ids.MARK_KEY, text=text, icon="KEYFRAME_HLT" if marked else "KEYFRAME", depress=marked
+    )
     if keys:
         flow = layout.grid_flow(columns=5, align=True)
         for timestep in sorted(keys):
             jump = flow.operator(
-                "wm.context_set_int", text=str(timestep), depress=timestep == context.scene.frame_current
+                "wm.context_set_int",
+                text=str(timestep),
+                depress=timestep == context.scene.frame_current,
             )
             jump.data_path, jump.value = "scene.frame_current", timestep
     layout.operator(ids.SOLVE_AGAIN, icon="FILE_REFRESH")

@@ -41,7 +41,9 @@ def _draw_choices(layout: Any, context: Any) -> None:
     settings = scene_settings(context)
     layout.prop(settings, "run_folder", text="Folder")
     layout.prop(settings, "preset")
-    times = ", ".join(f"{name} {format_duration(seconds)}" for name, seconds in preset_times(settings).items())
+    times = ", ".join(
+        f"{name} {format_duration(seconds)}" for name, seconds in preset_times(settings).items()
+    )
     if times:
         draw_text(layout, context, f"On this machine: {times}", "TIME")
     layout.prop(settings, "minutes")
@@ -54,7 +56,9 @@ def _draw_choices(layout: Any, context: Any) -> None:
 def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     """Draw the button that starts, or resumes, training with the panel's settings."""
     train = layout.operator(
-        ids.TRAIN, text="Resume" if resume else "Train", icon="FRAME_NEXT" if resume else "MOD_PARTICLES"
+        ids.TRAIN,
+        text="Resume" if resume else "Train",
+        icon="FRAME_NEXT" if resume else "MOD_PARTICLES",
     )
     set_options(train, settings, TrainOptions)
     train.directory, train.resume = settings.run_folder, resume
@@ -64,7 +68,9 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
 def draw_missing_python(layout: Any, context: Any) -> None:
     """Where no Python here can track and train, say where one is chosen."""
     if not has_training_python(context):
-        show = layout.operator("preferences.addon_show", text="Choose a Python in Preferences", icon="PREFERENCES")
+        show = layout.operator(
+            "preferences.addon_show", text="Choose a Python in Preferences", icon="PREFERENCES"
+        )
         show.module = package()
 
 
@@ -86,7 +92,11 @@ class TrainOptionsPanel(SidebarPanel, bpy.types.Panel):
 def _draw_end(layout: Any, context: Any, training: RequestState) -> None:
     box, state = draw_end(layout, context, training), training.snapshot.state
     if state == WorkerState.NONE:
-        draw_text(box, context, f"{training.place}: does not exist; choose its new folder and press Resume")
+        draw_text(
+            box,
+            context,
+            f"{training.place}: does not exist; choose its new folder and press Resume",
+        )
     elif not state.failed:
         for line in describe_figures(training.snapshot.status.figures)[1:]:
             draw_text(box, context, line)
@@ -96,7 +106,8 @@ def _draw_end(layout: Any, context: Any, training: RequestState) -> None:
 
 
 def _draw_refined(layout: Any, context: Any, path: Path) -> None:
-    """Draw a button that exchanges the imported tracking for the refined one, which the splats were trained with."""
+    """Draw a button that exchanges the imported tracking for the refined one, which the splats were
+    trained with."""
     head = scene_settings(context).head
     apply = layout.operator(ids.APPLY_MOTION, text="Apply Refined Tracking", icon="CON_FOLLOWTRACK")
     apply.filepath, apply.own_offsets = str(path), True

@@ -1,4 +1,5 @@
-"""Local frames of triangles, in which splats are stored, and baking to world space (STGA, embedding)."""
+"""Local frames of triangles, in which splats are stored, and baking to world space (STGA,
+embedding)."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,9 +14,11 @@ from .strain import StrainBasis, gram_strain
 CONVENTIONS = ("stga", "gaussian_avatars")
 MIN_DIVISOR = 1e-30
 MIN_AREA_RATIO = 1e-4
-"""A triangle whose area is below this share of its longest edge's square counts as a line: vertices on a line, rounded
-to float32, have ratios of 1e-6 to 1e-5, and their normal and area are those of the rounding."""
-UPRIGHT_COSINE = 0.8  # from this z on, the perpendicular of a unit vector is sought in the x direction
+"""A triangle whose area is below this share of its longest edge's square counts as a line: vertices
+on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and area are those of
+the rounding."""
+# from this z on, the perpendicular of a unit vector is sought in the x direction
+UPRIGHT_COSINE = 0.8
 
 
 @dataclass(frozen=True)
@@ -52,33 +55,41 @@ def face_frames(
 ) -> FaceFrames:
     """Local frame of every triangle of a posed mesh.
 
-    vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the neutral mesh's
-    basis where splats follow strain. neutral_areas (F,): `face_areas` of the neutral mesh, where they are known.
-    "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral area), local unit meters of the neutral mesh
-    (STGA, embedding). "gaussian_avatars": axes [n(p1−p0), normal, ·], scale = mean of edge and height, local
-    unit the triangle (GaussianAvatars' released code).
-    A triangle without area (see MIN_AREA_RATIO) keeps a proper rotation and a finite scale.
+    vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the
+    neutral mesh's basis where splats follow strain. neutral_areas (F,): `face_areas` of the neutral
+    mesh, where they are known. "stga": axes [n(p0−o), ·, normal], scale = sqrt(area / neutral
+    area), local unit meters of the neutral mesh (STGA, embedding). "gaussian_avatars": axes
+    [n(p1−p0), normal, ·], scale = mean of edge and height, local unit the triangle
+    (GaussianAvatars' released code). A triangle without area (see MIN_AREA_RATIO) keeps a proper
+    rotation and a finite scale.
     """
     triangles = _triangles(vertices, faces)
     to_p1, to_p2, _ = triangles.edges
     if convention == "stga":
-        # p0 - origin without computing the origin, whose rounding would not vanish where the corners coincide.
+        # p0 - origin without computing the origin, whose rounding would not vanish where the
+        # corners coincide.
         first, normal = _orthonormal((to_p1 + to_p2) / -3, triangles)
         axes = first, _cross(normal, first), normal
         before = face_areas(neutral, faces) if neutral_areas is None else neutral_areas
         # A triangle without area in the neutral mesh has no meaningful ratio: its scale is 1.
-        scale = np.where(before > 0, np.sqrt(triangles.twice_area / 2 / np.maximum(before, MIN_DIVISOR)), 1.0)
+        scale = np.where(
+            before > 0, np.sqrt(triangles.twice_area / 2 / np.maximum(before, MIN_DIVISOR)), 1.0
+        )
     elif convention == "gaussian_avatars":
         edge, side = _length(to_p1), _length(to_p2)
         first, normal = _orthonormal(to_p1, triangles)
         axes = first, normal, _cross(first, normal)
         no_edge = edge <= MIN_AREA_RATIO * np.sqrt(triangles.longest_squared)
-        scale = (edge + np.where(no_edge, side, triangles.twice_area / np.where(no_edge, 1.0, edge))) / 2
+        scale = (
+            edge + np.where(no_edge, side, triangles.twice_area / np.where(no_edge, 1.0, edge))
+        ) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
     deformed = np.zeros((len(faces), 0), np.float32)
     if strain is not None:
-        deformed = gram_strain(strain, triangles.squared[0], _dot(to_p1, to_p2), triangles.squared[1])
+        deformed = gram_strain(
+            strain, triangles.squared[0], _dot(to_p1, to_p2), triangles.squared[1]
+        )
     p0, p1, p2 = triangles.corners
     origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
     for column, axis in enumerate(axes):
@@ -90,7 +101,9 @@ def face_frames(
 def shifted_frames(frames: FaceFrames, shift: np.ndarray) -> FaceFrames:
     """The frames with their origins moved by shift (F, 3), in each triangle's own axes and unit."""
     # In one type: einsum takes several times as long where it has to convert.
-    moved = frames.scale[:, None] * np.einsum("fij,fj->fi", frames.rotation, shift.astype(np.float64))
+    moved = frames.scale[:, None] * np.einsum(
+        "fij,fj->fi", frames.rotation, shift.astype(np.float64)
+    )
     return replace(frames, origin=frames.origin + moved)
 
 
@@ -102,34 +115,47 @@ def frame_backward(
     torque: np.ndarray,
     growth: np.ndarray,
 ) -> np.ndarray:
-    """Gradient (V, 3) of a scalar with respect to the vertices, from its gradient with respect to "stga" frames.
+    """Gradient (V, 3) of a scalar with respect to the vertices, from its gradient with respect to
+    "stga" frames.
 
-    The reverse of `face_frames`, with all vectors in the frame's own axes: force (F, 3) is the gradient with respect to
-    the origin, torque (F, 3) to a small rotation of the frame, growth (F,) to the logarithm of its scale. Strain passes
-    no gradient on, and a line (see MIN_AREA_RATIO) only its force.
+    The reverse of `face_frames`, with all vectors in the frame's own axes: force (F, 3) is the
+    gradient with respect to the origin, torque (F, 3) to a small rotation of the frame, growth (F,)
+    to the logarithm of its scale. Strain passes no gradient on, and a line (see MIN_AREA_RATIO)
+    only its force.
     """
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * _largest(_squared(_edges(corners.transpose(1, 2, 0)))), MIN_DIVISOR)
+    flat = twice <= np.maximum(
+        2 * MIN_AREA_RATIO * _largest(_squared(_edges(corners.transpose(1, 2, 0)))), MIN_DIVISOR
+    )
     per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
-    # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left, over twice the area.
-    slope_x, slope_y = (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area, (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area
+    # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left,
+    # over twice the area.
+    slope_x, slope_y = (
+        (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area,
+        (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area,
+    )
     # The first axis points from the origin to p0.
     spin = np.where(flat, 0.0, torque[:, 2] / np.where(flat, 1.0, x[:, 0]))
     pull = np.repeat(force[:, None] / 3, 3, axis=1)
     pull[..., 0] += growth[:, None] / 2 * slope_x
-    pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * np.array([2 / 3, -1 / 3, -1 / 3])
+    pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * np.array(
+        [2 / 3, -1 / 3, -1 / 3]
+    )
     pull[..., 2] += torque[:, :1] * slope_y - torque[:, 1:2] * slope_x
     pull = (pull @ frames.rotation.transpose(0, 2, 1)).reshape(-1, 3)
     return np.stack([np.bincount(faces.ravel(), column, len(vertices)) for column in pull.T], -1)
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area (F,) in square meters of every triangle; exactly 0 where it counts as a line (see MIN_AREA_RATIO)."""
+    """Area (F,) in square meters of every triangle; exactly 0 where it counts as a line (see
+    MIN_AREA_RATIO)."""
     triangles = _triangles(vertices, faces)
     area = triangles.twice_area / 2
-    return np.where(area > np.maximum(MIN_AREA_RATIO * triangles.longest_squared, MIN_DIVISOR), area, 0.0)
+    return np.where(
+        area > np.maximum(MIN_AREA_RATIO * triangles.longest_squared, MIN_DIVISOR), area, 0.0
+    )
 
 
 def points_to_world(points: np.ndarray, frames: FaceFrames, face: np.ndarray) -> np.ndarray:
@@ -139,9 +165,11 @@ def points_to_world(points: np.ndarray, frames: FaceFrames, face: np.ndarray) ->
 
 
 def to_world(splats: Splats, frames: FaceFrames) -> Splats:
-    """Bake local splats into world space. SH keep their coefficients: their directions are world directions.
+    """Bake local splats into world space. SH keep their coefficients: their directions are world
+    directions.
 
-    Color that depends on strain is added to the constant coefficient, or left out where `frames` have no strain.
+    Color that depends on strain is added to the constant coefficient, or left out where `frames`
+    have no strain.
     """
     face, scale = splats.face, frames.scale[splats.face]
     xyz = points_to_world(splats.xyz, frames, face)
@@ -163,14 +191,20 @@ def strained_sh(splats: Splats, frames: FaceFrames) -> np.ndarray:
     if not (frames.strain.shape[1] and splats.strain_color.shape[1]):
         return splats.sh
     sh = splats.sh.copy()
-    sh[:, 0] += np.einsum("ns,nsc->nc", frames.strain[splats.face], splats.strain_color) / np.float32(SH_C0)
+    sh[:, 0] += np.einsum(
+        "ns,nsc->nc", frames.strain[splats.face], splats.strain_color
+    ) / np.float32(SH_C0)
     return sh
 
 
 def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
-    """Express world-space splats in the frames of the triangles `face` (N,): the inverse of `to_world`."""
+    """Express world-space splats in the frames of the triangles `face` (N,): the inverse of
+    `to_world`."""
     scale = np.maximum(frames.scale[face], MIN_DIVISOR)
-    xyz = np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face]) / scale[:, None]
+    xyz = (
+        np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face])
+        / scale[:, None]
+    )
     inverse = frames.quaternion[face] * np.array([1.0, -1.0, -1.0, -1.0])
     rotation = multiply(inverse, normalized(world.rotation))
     return replace(
@@ -182,12 +216,14 @@ def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
     )
 
 
-# Vectors of triangles are (3, F) here: arithmetic on whole rows takes a fraction of the time of that on columns.
+# Vectors of triangles are (3, F) here: arithmetic on whole rows takes a fraction of the time of
+# that on columns.
 
 
 class _Triangles(NamedTuple):
-    """corners (3 corners, 3, F); edges p1 − p0, p2 − p0 and p2 − p1, each (3, F), their squared lengths (F,) and the
-    largest of these; normal (3, F), as long as twice the area; twice_area (F,)."""
+    """corners (3 corners, 3, F); edges p1 − p0, p2 − p0 and p2 − p1, each (3, F), their squared
+    lengths (F,) and the largest of these; normal (3, F), as long as twice the area; twice_area
+    (F,)."""
 
     corners: np.ndarray
     edges: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -219,7 +255,9 @@ def _largest(values: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 def _length(v: np.ndarray) -> np.ndarray:
@@ -233,19 +271,25 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _orthonormal(first: np.ndarray, triangles: _Triangles) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors along `first` (3, F) and the triangles' normals, perpendicular to each other.
 
-    Where the triangle is a line, any perpendicular of `first` is used as the normal; where `first` is negligible beside
-    the longest edge, the x axis is used for it. `scene.display.frame_nodes` follows the same rules.
+    Where the triangle is a line, any perpendicular of `first` is used as the normal; where `first`
+    is negligible beside the longest edge, the x axis is used for it. `scene.display.frame_nodes`
+    follows the same rules.
     """
     longest, length, normal = triangles.longest_squared, _length(first), triangles.normal
     no_first = length <= MIN_AREA_RATIO * np.sqrt(longest)
     if no_first.any():
-        first = np.where(no_first, np.array([[1.0], [0.0], [0.0]]), first / np.where(no_first, 1.0, length))
+        first = np.where(
+            no_first, np.array([[1.0], [0.0], [0.0]]), first / np.where(no_first, 1.0, length)
+        )
     else:
         first = first / length
     no_normal = triangles.twice_area <= 2 * MIN_AREA_RATIO * longest
     if no_normal.any():
         upright = np.abs(first[2]) > UPRIGHT_COSINE
-        substitute = _cross(first, np.where(upright, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [0.0], [1.0]])))
+        substitute = _cross(
+            first,
+            np.where(upright, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [0.0], [1.0]])),
+        )
         normal = np.where(no_normal, substitute, normal)
     normal = normal - _dot(normal, first) * first
     return first, normal / _length(normal)

@@ -1,4 +1,5 @@
-"""Reading and writing avatar files: one npz with all that is needed to pose and render an avatar."""
+"""Reading and writing avatar files: one npz with all that is needed to pose and render an
+avatar."""
 
 import json
 from collections.abc import Mapping
@@ -22,7 +23,13 @@ VERSION = 2
 
 
 SOURCES = "estimated", "gray_card", "file"
-_LIGHT_ARRAYS = {"radiance": (9, 3), "transfer": (-1, 9), "occlusion": (-1,), "irradiance": (-1, 3), "roughness": (-1,)}
+_LIGHT_ARRAYS = {
+    "radiance": (9, 3),
+    "transfer": (-1, 9),
+    "occlusion": (-1,),
+    "irradiance": (-1, 3),
+    "roughness": (-1,),
+}
 """Field -> shape, -1: vertices."""
 _PREFIX = "light_"
 
@@ -31,15 +38,18 @@ _PREFIX = "light_"
 class AvatarLight:
     """Estimated once per run (`light.estimate`), by vertex of the neutral mesh.
 
-    radiance    (9, 3) float32: light of the capture, spherical harmonics of linear radiance (`light.harmonics.basis`)
-                in the axes of the capture
-    transfer    (V, 9) float32: irradiance is transfer @ radiance; with the head's own shadow (`light.surface`)
+    radiance    (9, 3) float32: light of the capture, spherical harmonics of linear radiance
+                (`light.harmonics.basis`) in the axes of the capture
+    transfer    (V, 9) float32: irradiance is transfer @ radiance; with the head's own shadow
+                (`light.surface`)
     occlusion   (V,) float32, 0…1: cosine-weighted share of the sky that the head leaves open
-    irradiance  (V, 3) float32: of the capture, with light that the head reflects onto itself, mean over its timesteps;
-                an albedo is π times linear color over this
+    irradiance  (V, 3) float32: of the capture, with light that the head reflects onto itself, mean
+                over its timesteps; an albedo is π times linear color over this
     roughness   (V,) float32: of highlights; 0: skin, whose roughness the scene's lighting says
-    residual    how far recorded colors are from what `radiance` explains, as a share of them (robust deviation)
-    damping     0…1 by which albedo is pulled to its mean, because the light is too hard to take away
+    residual    how far recorded colors are from what `radiance` explains, as a share of them
+                (robust deviation)
+    damping     0…1 by which albedo is pulled to its mean, because the light is too hard to take
+                away
     source      one of SOURCES: where the light, or its level, is from
     """
 
@@ -64,11 +74,14 @@ class Avatar:
     settings    how it was trained; anything that JSON holds
     regions     name -> (F,) bool
     background  red, green, blue in 0 to 1 that it was trained against
-    antialiased  whether it was trained with opacity compensation (`render_forward`), and is rendered so
+    antialiased  whether it was trained with opacity compensation (`render_forward`), and is
+                 rendered so
     principal_point  convention of the capture that it was trained on (`read_transforms`)
-    strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and positions follow
+    strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and
+                  positions follow
                 (`avatar.strain`); None: the same for all, ±MAX_STRAIN
-    driven_offsets  name -> (F, S, 3) float32: how far a triangle's splats move with the signal of that name in
+    driven_offsets  name -> (F, S, 3) float32: how far a triangle's splats move with the signal of
+                    that name in
                 `offsets.OFFSETS`, for each of its S components a vector in the triangle's frame
     light       what relighting needs, None where it was not estimated
     """
@@ -92,13 +105,15 @@ class Avatar:
         return self.splats.strain_color.shape[1] > 0 or bool(self.driven_offsets)
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
-        """The triangles' local frames on a posed mesh (V, 3), with strain where splats follow it, and moved by the
-        driven offsets."""
+        """The triangles' local frames on a posed mesh (V, 3), with strain where splats follow it,
+        and moved by the driven offsets."""
         basis = self._strain
         frames = face_frames(mesh, self.faces, self.neutral, self.convention, basis, self._areas)
         if basis is None:
             return frames
-        return moved_frames(frames, self.driven_offsets, lambda name: OFFSETS[name].signal(basis, frames))
+        return moved_frames(
+            frames, self.driven_offsets, lambda name: OFFSETS[name].signal(basis, frames)
+        )
 
     @cached_property
     def _areas(self) -> np.ndarray:
@@ -106,13 +121,18 @@ class Avatar:
 
     @cached_property
     def _strain(self) -> StrainBasis | None:
-        return strain_basis(self.neutral, self.faces, self.strain_range) if self.follows_strain else None
+        return (
+            strain_basis(self.neutral, self.faces, self.strain_range)
+            if self.follows_strain
+            else None
+        )
 
 
 def write_avatar(path: Path, avatar: Avatar) -> None:
     """Write an avatar file (npz without pickle), atomically.
 
-    Raises StgaError where the avatar would not be read back: wrong shapes, NaN, splats on missing triangles.
+    Raises StgaError where the avatar would not be read back: wrong shapes, NaN, splats on missing
+    triangles.
     """
     _check(path, avatar)
     header = {
@@ -127,7 +147,9 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     }
     arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
     arrays["neutral"], arrays["faces"] = avatar.neutral, avatar.faces
-    arrays["region_faces"] = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
+    arrays["region_faces"] = np.array(list(avatar.regions.values()), bool).reshape(
+        -1, len(avatar.faces)
+    )
     if avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range
     arrays.update(avatar.driven_offsets)
@@ -139,7 +161,8 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
 
 
 def read_avatar(path: Path) -> Avatar:
-    """Read an avatar file. Raises StgaError naming the file and the field that is missing or malformed."""
+    """Read an avatar file. Raises StgaError naming the file and the field that is missing or
+    malformed."""
     arrays = read_npz(path)
     header = _read_header(path, arrays)
     needed = (*(name for name in ARRAYS if name not in ADDED), "neutral", "faces", "region_faces")
@@ -148,7 +171,9 @@ def read_avatar(path: Path) -> Avatar:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
     names, masks = header["regions"], arrays["region_faces"]
     if masks.ndim != 2 or len(masks) != len(names):
-        raise StgaError(f"{path}: region_faces has shape {masks.shape}, expected ({len(names)}, faces)")
+        raise StgaError(
+            f"{path}: region_faces has shape {masks.shape}, expected ({len(names)}, faces)"
+        )
     avatar = Avatar(
         splats=Splats(**{name: arrays[name] for name in ARRAYS if name in arrays}),
         convention=header["convention"],
@@ -161,7 +186,9 @@ def read_avatar(path: Path) -> Avatar:
         principal_point=header["principal_point"],
         strain_range=arrays.get("strain_range"),
         driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
-        light=light_from(path, arrays, header["light"], len(arrays["neutral"])) if "light" in header else None,
+        light=light_from(path, arrays, header["light"], len(arrays["neutral"]))
+        if "light" in header
+        else None,
     )
     _check(path, avatar)
     return avatar
@@ -198,7 +225,9 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
 def _check(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
     if avatar.convention not in CONVENTIONS:
-        raise StgaError(f"{path}: convention is {shorten(avatar.convention)}, expected one of {', '.join(CONVENTIONS)}")
+        raise StgaError(
+            f"{path}: convention is {shorten(avatar.convention)}, expected one of {', '.join(CONVENTIONS)}"
+        )
     if avatar.principal_point not in PRINCIPAL_POINTS:
         raise StgaError(
             f"{path}: principal_point is {shorten(avatar.principal_point)}, "
@@ -212,54 +241,100 @@ def _check(path: Path, avatar: Avatar) -> None:
         array = getattr(avatar.splats, name)
         check_array(path, name, array, kind.dtype, (count, *kind.shape))
         if kind.sizes and array.shape[1] not in kind.sizes:
-            raise StgaError(f"{path}: {name} has {array.shape[1]} coefficients, expected one of {kind.sizes}")
+            raise StgaError(
+                f"{path}: {name} has {array.shape[1]} coefficients, expected one of {kind.sizes}"
+            )
     if avatar.strain_range is not None:
-        check_array(path, "strain_range", avatar.strain_range, "float32", (len(avatar.faces), 2, STRAIN_COMPONENTS))
+        check_array(
+            path,
+            "strain_range",
+            avatar.strain_range,
+            "float32",
+            (len(avatar.faces), 2, STRAIN_COMPONENTS),
+        )
     for name, coefficients in avatar.driven_offsets.items():
-        check_array(path, name, coefficients, "float32", (len(avatar.faces), OFFSETS[name].signals, 3))
+        check_array(
+            path, name, coefficients, "float32", (len(avatar.faces), OFFSETS[name].signals, 3)
+        )
     _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
     for name, mask in avatar.regions.items():
         check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))
-    numbers = [value for value in avatar.background if isinstance(value, (int, float)) and 0 <= value <= 1]
+    numbers = [
+        value for value in avatar.background if isinstance(value, (int, float)) and 0 <= value <= 1
+    ]
     if len(numbers) != 3 or len(avatar.background) != 3:
-        raise StgaError(f"{path}: background is {shorten(avatar.background)}, expected three numbers between 0 and 1")
+        raise StgaError(
+            f"{path}: background is {shorten(avatar.background)}, expected three numbers between 0 and 1"
+        )
 
 
-def check_array(path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]) -> None:
-    """Raise StgaError unless dtype and shape (-1: any) are as expected and every number is finite."""
-    fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, array.shape, strict=True))
+def check_array(
+    path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]
+) -> None:
+    """Raise StgaError unless dtype and shape (-1: any) are as expected and every number is
+    finite."""
+    fits = array.ndim == len(shape) and all(
+        want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
+    )
     if not fits or array.dtype != dtype:
         expected = ", ".join("any" if size < 0 else str(size) for size in shape)
-        raise StgaError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} ({expected})")
+        raise StgaError(
+            f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} ({expected})"
+        )
     if not np.isfinite(array).all():
         raise StgaError(f"{path}: {name} holds a value that is not finite")
 
 
 def _check_index(path: Path, name: str, index: np.ndarray, count: int, of: str) -> None:
     if index.size and (index.min() < 0 or index.max() >= count):
-        raise StgaError(f"{path}: {name} refers to {index.min()}…{index.max()}, but there are {count} {of}")
+        raise StgaError(
+            f"{path}: {name} refers to {index.min()}…{index.max()}, but there are {count} {of}"
+        )
 
 
 def light_arrays(light: AvatarLight) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays for an avatar file, by vertex in half precision (30 bytes a vertex), and the rest for its header."""
-    arrays = {f"{_PREFIX}{name}": np.asarray(getattr(light, name), np.float16) for name in _LIGHT_ARRAYS}
-    rest = {field.name: getattr(light, field.name) for field in fields(light) if field.name not in _LIGHT_ARRAYS}
+    """Arrays for an avatar file, by vertex in half precision (30 bytes a vertex), and the rest for
+    its header."""
+    arrays = {
+        f"{_PREFIX}{name}": np.asarray(getattr(light, name), np.float16) for name in _LIGHT_ARRAYS
+    }
+    rest = {
+        field.name: getattr(light, field.name)
+        for field in fields(light)
+        if field.name not in _LIGHT_ARRAYS
+    }
     return arrays, rest
 
 
-def light_from(path: Path, arrays: Mapping[str, np.ndarray], rest: object, vertices: int) -> AvatarLight:
+def light_from(
+    path: Path, arrays: Mapping[str, np.ndarray], rest: object, vertices: int
+) -> AvatarLight:
     """The reverse of `light_arrays`. Raises StgaError naming the file and what is wrong."""
     found = {}
     for name, shape in _LIGHT_ARRAYS.items():
         array, expected = arrays.get(_PREFIX + name), tuple(vertices if n < 0 else n for n in shape)
-        if array is None or array.dtype != np.float16 or array.shape != expected or not np.isfinite(array).all():
-            raise StgaError(f"{path}: {_PREFIX}{name} is missing or damaged, expected float16 {expected}, finite")
+        if (
+            array is None
+            or array.dtype != np.float16
+            or array.shape != expected
+            or not np.isfinite(array).all()
+        ):
+            raise StgaError(
+                f"{path}: {_PREFIX}{name} is missing or damaged, expected float16 {expected}, finite"
+            )
         found[name] = array.astype(np.float32)
     if not isinstance(rest, dict) or rest.get("source") not in SOURCES:
-        raise StgaError(f"{path}: header field 'light' is {shorten(rest)}, expected residual, damping and source")
+        raise StgaError(
+            f"{path}: header field 'light' is {shorten(rest)}, expected residual, damping and source"
+        )
     for name in ("residual", "damping"):
         value = rest.get(name)
         if not isinstance(value, (int, float)) or not 0 <= value <= 1e6:
-            raise StgaError(f"{path}: header field 'light.{name}' is {shorten(value)}, expected a number from 0 on")
-    values: dict[str, Any] = {**found, **{name: rest[name] for name in ("residual", "damping", "source")}}
+            raise StgaError(
+                f"{path}: header field 'light.{name}' is {shorten(value)}, expected a number from 0 on"
+            )
+    values: dict[str, Any] = {
+        **found,
+        **{name: rest[name] for name in ("residual", "damping", "source")},
+    }
     return AvatarLight(**values)

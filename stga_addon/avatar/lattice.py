@@ -7,9 +7,11 @@ from .splats import Splats
 
 NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}  # which local axis is the triangle's normal
 SCALE, FLATNESS = 0.6, 0.5
-"""Standard deviation per spacing of the lattice, and along the normal per that in the triangle's plane."""
+"""Standard deviation per spacing of the lattice, and along the normal per that in the triangle's
+plane."""
 INSET = 0.1
-"""Share of the way to the centroid by which points lie inside their triangle: neighbors' points must not coincide."""
+"""Share of the way to the centroid by which points lie inside their triangle: neighbors' points
+must not coincide."""
 MIN_SPACING_M = 1e-6  # the scale of splats on a triangle without area still needs a logarithm
 
 
@@ -21,17 +23,22 @@ def lattice_splats(
     opacity_logit: float = 0.0,
     convention: str = "stga",
 ) -> Splats:
-    """(order + 1)(order + 2) / 2 splats on every triangle, triangle by triangle, in its local frame.
+    """(order + 1)(order + 2) / 2 splats on every triangle, triangle by triangle, in its local
+    frame.
 
-    neutral (V, 3) meters, faces (F, 3). Order 0 puts one splat on the centroid, order 2 the corners of the four
-    triangles that the edge midpoints cut, order 4 their midpoints too (STGA, initialization: 15 a triangle).
-    The standard deviation is SCALE · sqrt(2 · area) / order in the triangle's plane (sqrt(2 · area): the leg of the
-    right isosceles triangle of that area). Color starts at raw zero: gray.
+    neutral (V, 3) meters, faces (F, 3). Order 0 puts one splat on the centroid, order 2 the corners
+    of the four triangles that the edge midpoints cut, order 4 their midpoints too (STGA,
+    initialization: 15 a triangle). The standard deviation is SCALE · sqrt(2 · area) / order in the
+    triangle's plane (sqrt(2 · area): the leg of the right isosceles triangle of that area). Color
+    starts at raw zero: gray.
     """
     weights = lattice_weights(order, INSET)
     frames = face_frames(neutral, faces, neutral, convention)
     corners = np.asarray(neutral, np.float64)[faces] - frames.origin[:, None]
-    local = np.einsum("fji,fcj->fci", frames.rotation, corners) / np.maximum(frames.scale, MIN_SPACING_M)[:, None, None]
+    local = (
+        np.einsum("fji,fcj->fci", frames.rotation, corners)
+        / np.maximum(frames.scale, MIN_SPACING_M)[:, None, None]
+    )
     xyz = np.einsum("pc,fci->fpi", weights, local).reshape(-1, 3)
 
     spacing = np.sqrt(2 * face_areas(neutral, faces)) / max(order, 1)
@@ -42,7 +49,9 @@ def lattice_splats(
     return Splats(
         xyz=xyz.astype(np.float32),
         rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        log_scale=np.repeat(np.log(sigma[:, None] * stretch), len(weights), axis=0).astype(np.float32),
+        log_scale=np.repeat(np.log(sigma[:, None] * stretch), len(weights), axis=0).astype(
+            np.float32
+        ),
         opacity=np.full(count, opacity_logit, np.float32),
         sh=np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32),
         face=np.repeat(np.arange(len(faces), dtype=np.int32), len(weights)),
@@ -51,7 +60,8 @@ def lattice_splats(
 
 
 def lattice_weights(order: int, inset: float) -> np.ndarray:
-    """Barycentric coordinates (P, 3) of the lattice of `order`, pulled towards the centroid by `inset`."""
+    """Barycentric coordinates (P, 3) of the lattice of `order`, pulled towards the centroid by
+    `inset`."""
     if order == 0:
         return np.full((1, 3), 1 / 3)
     steps = [(order - j - k, j, k) for j in range(order + 1) for k in range(order + 1 - j)]

@@ -1,4 +1,5 @@
-"""3D Gaussians as plain arrays: shapes, units and activations, which every file format of this package shares."""
+"""3D Gaussians as plain arrays: shapes, units and activations, which every file format of this
+package shares."""
 
 import ast
 import inspect
@@ -14,22 +15,27 @@ from .strain import STRAIN_COMPONENTS
 
 MAX_SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2·sqrt(π)): a color is 0.5 + SH_C0 times the degree-0 coefficient."""
+"""The constant spherical harmonic, 1 / (2·sqrt(π)): a color is 0.5 + SH_C0 times the degree-0
+coefficient."""
 
 
 @dataclass(frozen=True)
 class Splats:
     """N Gaussians before activation, float32 unless noted.
 
-    xyz        (N, 3) position in the local frame of its triangle (`embedding`); meters in world space
+    xyz        (N, 3) position in the local frame of its triangle (`embedding`); meters in world
+               space
     rotation   (N, 4) quaternion (w, x, y, z); activation: normalized
-    log_scale  (N, 3) natural logarithm of the standard deviations, in the unit of xyz; activation: exp
+    log_scale  (N, 3) natural logarithm of the standard deviations, in the unit of xyz; activation:
+               exp
     opacity    (N,) activation: sigmoid
-    sh         (N, K, 3) spherical harmonics with directions in world axes, K = (degree + 1)²; activation:
-               color = max(0, 0.5 + Y·sh), sRGB
+    sh         (N, K, 3) spherical harmonics with directions in world axes, K = (degree + 1)²;
+               activation: color = max(0, 0.5 + Y·sh), sRGB
     face       (N,) int32 index of the triangle that the splat is bound to; 0 in world space
-    unbound    (N,) bool: splats of hair and shoulders; they follow their triangle without being limited to it
-    strain_color  (N, S, 3) change of the degree-0 coefficient's color per unit of the triangle's strain (`strain`),
+    unbound    (N,) bool: splats of hair and shoulders; they follow their triangle without being
+               limited to it
+    strain_color  (N, S, 3) change of the degree-0 coefficient's color per unit of the triangle's
+                  strain (`strain`),
                S = 3, or 0 (default) where colors do not depend on deformation
     """
 
@@ -72,7 +78,8 @@ class Splats:
 
 @dataclass(frozen=True)
 class SplatArray:
-    """A row of ARRAYS: type of a field of `Splats`, and its shape after N; sizes: those allowed where that has −1."""
+    """A row of ARRAYS: type of a field of `Splats`, and its shape after N; sizes: those allowed
+    where that has −1."""
 
     dtype: str = "float32"
     shape: tuple[int, ...] = ()
@@ -88,20 +95,24 @@ ARRAYS = {
     "rotation": SplatArray(shape=(4,)),
     "log_scale": SplatArray(shape=(3,)),
     "opacity": SplatArray(),
-    "sh": SplatArray(shape=(-1, 3), sizes=tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))),
+    "sh": SplatArray(
+        shape=(-1, 3), sizes=tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))
+    ),
     "face": SplatArray("int32"),
     "unbound": SplatArray("bool"),
     "strain_color": SplatArray(shape=(-1, 3), sizes=(0, STRAIN_COMPONENTS)),
 }
 """The fields of `Splats`, by which files and checkpoints are read."""
 ADDED = {name: max(array.sizes) for name, array in ARRAYS.items() if 0 in array.sizes}
-"""Arrays that an effect adds, which have no coefficients without it -> how many with it. A field of the same name
-switches them in `TrainingSettings`, and one in `Rates` trains them."""
+"""Arrays that an effect adds, which have no coefficients without it -> how many with it. A field of
+the same name switches them in `TrainingSettings`, and one in `Rates` trains them."""
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
     """All splats of sets with coefficients of the same kinds, in order."""
-    return Splats(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Splats)))
+    return Splats(
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Splats))
+    )
 
 
 def no_strain_color(count: int) -> np.ndarray:
@@ -110,7 +121,8 @@ def no_strain_color(count: int) -> np.ndarray:
 
 
 def harmonics(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
-    """The 16 real spherical harmonics up to degree 3 of unit directions, in order and with the signs of `Splats.sh`.
+    """The 16 real spherical harmonics up to degree 3 of unit directions, in order and with the
+    signs of `Splats.sh`.
 
     Shaders have the same lines, from `harmonics_text`.
     """
@@ -136,13 +148,21 @@ def harmonics(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
 
 
 def harmonics_text() -> list[str]:
-    """What `harmonics` returns as expressions of x, y, z, xx, yy and zz, in GLSL and JavaScript as well as Python."""
-    returned = next(node for node in ast.walk(ast.parse(inspect.getsource(harmonics))) if isinstance(node, ast.Return))
+    """What `harmonics` returns as expressions of x, y, z, xx, yy and zz, in GLSL and JavaScript as
+    well as Python."""
+    returned = next(
+        node
+        for node in ast.walk(ast.parse(inspect.getsource(harmonics)))
+        if isinstance(node, ast.Return)
+    )
     assert isinstance(returned.value, ast.Tuple)
     return [ast.unparse(term) for term in returned.value.elts]
 
 
 def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(N, 3) sRGB, not clipped, of splats' coefficients (N, K, 3) seen in unit directions (N, 3) from the eye."""
+    """(N, 3) sRGB, not clipped, of splats' coefficients (N, K, 3) seen in unit directions (N, 3)
+    from the eye."""
     terms = harmonics(*direction.T)[1 : sh.shape[1]]
-    return np.asarray(0.5 + SH_C0 * sh[:, 0] + sum(term[:, None] * sh[:, k] for k, term in enumerate(terms, 1)))
+    return np.asarray(
+        0.5 + SH_C0 * sh[:, 0] + sum(term[:, None] * sh[:, k] for k, term in enumerate(terms, 1))
+    )

@@ -1,4 +1,5 @@
-"""Strain of triangles, which colors and positions may follow: skin that is compressed darkens and bulges."""
+"""Strain of triangles, which colors and positions may follow: skin that is compressed darkens and
+bulges."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,20 +12,25 @@ STRAIN_COMPONENTS = 3
 STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
 """Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
 MIN_COMPRESSION = 0.2
-"""Compression that colors do not follow yet (E = 0.04): coefficients fitted to so little are mostly noise."""
+"""Compression that colors do not follow yet (E = 0.04): coefficients fitted to so little are mostly
+noise."""
 COLOR_RANGE = np.array(
-    [[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN], [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN]], np.float32
+    [[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN], [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN]],
+    np.float32,
 )
-"""Lowest and highest strain that colors and positions are trained to follow. Folds and their shadows come with
-compression and shear; what is fitted to compression is not to be continued into stretch. Within this range, a mesh at
-rest has −MIN_COMPRESSION, not 0: a constant share of the colors, which the splats' `sh` are trained beside."""
+"""Lowest and highest strain that colors and positions are trained to follow. Folds and their
+shadows come with compression and shear; what is fitted to compression is not to be continued into
+stretch. Within this range, a mesh at rest has −MIN_COMPRESSION, not 0: a constant share of the
+colors, which the splats' `sh` are trained beside."""
 RANGE_MARGIN = 1.2
-"""How far from rest splats follow a triangle's strain, as a multiple of what was seen in training: other expressions
-are a little stronger now and then."""
+"""How far from rest splats follow a triangle's strain, as a multiple of what was seen in training:
+other expressions are a little stronger now and then."""
 AVERAGING_ROUNDS = 3
-"""How often `smoothed_strain` averages over triangles that share an edge: a bulge moves more than one triangle."""
+"""How often `smoothed_strain` averages over triangles that share an edge: a bulge moves more than
+one triangle."""
 MIN_SQUARED_NORMAL = 1e-24
-"""Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as having no area."""
+"""Squared normal (m⁴) of a neutral triangle with edges of a micrometer; a smaller one counts as
+having no area."""
 
 
 class IndexLists(NamedTuple):
@@ -42,7 +48,8 @@ class IndexLists(NamedTuple):
 class RankedLists(NamedTuple):
     """The same lists by rank, so that numpy adds along them without a loop over lists.
 
-    order  lists by falling length; ranks: for each rank, the index at that place of every list that is long enough
+    order  lists by falling length; ranks: for each rank, the index at that place of every list that
+           is long enough
     """
 
     order: np.ndarray
@@ -54,7 +61,8 @@ class StrainBasis:
     """Precomputed terms of a neutral mesh with V vertices and F triangles.
 
     faces (F, 3); gram (F, 3) squared lengths and product of the neutral edges: d1·d1, d1·d2, d2·d2.
-    to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy, yz, zx.
+    to_tensor (F, 3, 6): change of gram → E in neutral space, a symmetric tensor as xx, yy, zz, xy,
+    yz, zx.
     to_plane (F, 3, 6): tensor → E along the first edge, across it, and their shear; both float32.
     corners (3, F): `faces` by corner.
     vertex_faces: V lists of the triangles that touch a vertex.
@@ -79,8 +87,11 @@ class StrainBasis:
     ranked_neighbors: RankedLists
 
 
-def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarray | None = None) -> StrainBasis:
-    """The basis of a neutral mesh: neutral (V, 3) meters, faces (F, 3). A triangle without area stays unstrained.
+def strain_basis(
+    neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarray | None = None
+) -> StrainBasis:
+    """The basis of a neutral mesh: neutral (V, 3) meters, faces (F, 3). A triangle without area
+    stays unstrained.
 
     strain_range: (F, 2, 3) `StrainBasis.range`; None: ±MAX_STRAIN.
     """
@@ -107,7 +118,10 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
             np.stack([_product(a1, a1) / 2, _product(a1, a2), _product(a2, a2) / 2], 1), np.float32
         ),
         to_plane=_by_component(
-            twice * np.stack([_product(along, along), _product(across, across), _product(along, across)], 1),
+            twice
+            * np.stack(
+                [_product(along, along), _product(across, across), _product(along, across)], 1
+            ),
             np.float32,
         ),
         corners=corners,
@@ -122,7 +136,8 @@ def strain_basis(neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarra
 
 
 def _index_lists(owners: np.ndarray, indices: np.ndarray, count: int) -> IndexLists:
-    """The lists of `count` owners, from pairs of an owner (N,) and an index (N,), which stay in order."""
+    """The lists of `count` owners, from pairs of an owner (N,) and an index (N,), which stay in
+    order."""
     indptr = np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=count))])
     return IndexLists(indptr, indices[np.argsort(owners, kind="stable")])
 
@@ -131,11 +146,14 @@ def _ranked(lists: IndexLists) -> RankedLists:
     order = np.argsort(-lists.counts, kind="stable")
     starts, counts = lists.indptr[:-1][order], lists.counts[order]
     lengths = (int((counts > rank).sum()) for rank in range(int(counts.max(initial=0))))
-    return RankedLists(order, tuple(lists.indices[starts[:n] + rank] for rank, n in enumerate(lengths)))
+    return RankedLists(
+        order, tuple(lists.indices[starts[:n] + rank] for rank, n in enumerate(lengths))
+    )
 
 
 def _add_listed(lists: RankedLists, rows: np.ndarray, total: np.ndarray) -> None:
-    """Add to the columns of total (·, L) the columns of rows (·, N) that each of L lists names, in the list's order.
+    """Add to the columns of total (·, L) the columns of rows (·, N) that each of L lists names, in
+    the list's order.
 
     Not by `np.add.at`, which numpy before 1.25, as in Blender 4.2, carries out element by element.
     """
@@ -169,8 +187,8 @@ def edge_neighbors(faces: np.ndarray) -> IndexLists:
 def smoothed_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
     """Strain (F, 3) float32 around each triangle, which positions follow: 0 for a mesh at rest.
 
-    strain (F, 3): of `face_strain`. Less that at rest, then AVERAGING_ROUNDS times the mean of a triangle and those
-    that share an edge with it, component by component.
+    strain (F, 3): of `face_strain`. Less that at rest, then AVERAGING_ROUNDS times the mean of a
+    triangle and those that share an edge with it, component by component.
     """
     smoothed = np.ascontiguousarray((strain - rest_strain(basis.range)).T, np.float32)
     for _ in range(AVERAGING_ROUNDS):
@@ -191,17 +209,21 @@ def rest_strain(limits: np.ndarray) -> np.ndarray:
 
 
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
-    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), with a margin.
+    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), with a
+    margin.
 
-    It includes the neutral mesh, and stays within that of the basis. What is fitted to a few expressions is not
-    extrapolated to stronger ones.
+    It includes the neutral mesh, and stays within that of the basis. What is fitted to a few
+    expressions is not extrapolated to stronger ones.
     """
-    seen = range_with_margin(rest_strain(basis.range), (face_strain(basis, mesh) for mesh in meshes))
+    seen = range_with_margin(
+        rest_strain(basis.range), (face_strain(basis, mesh) for mesh in meshes)
+    )
     return np.clip(seen, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
 
 
 def range_with_margin(rest: np.ndarray, strains: Iterable[np.ndarray]) -> np.ndarray:
-    """Lowest and highest (F, 2, D) of rest (F, D) and of values (F, D) that are RANGE_MARGIN times as far from it."""
+    """Lowest and highest (F, 2, D) of rest (F, D) and of values (F, D) that are RANGE_MARGIN times
+    as far from it."""
     seen = np.stack([rest, rest], axis=1)
     for strain in strains:
         wider = rest + np.float32(RANGE_MARGIN) * (strain - rest)
@@ -210,11 +232,13 @@ def range_with_margin(rest: np.ndarray, strains: Iterable[np.ndarray]) -> np.nda
 
 
 def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
-    """Strain (F, 3) float32 of every triangle of a posed mesh: 5·E within its range; E = 0 for a mesh moved rigidly.
+    """Strain (F, 3) float32 of every triangle of a posed mesh: 5·E within its range; E = 0 for a
+    mesh moved rigidly.
 
-    vertices (V, 3) meters. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the posed mesh, averaged
-    over the triangles that touch a triangle (each vertex's mean over its triangles, then the mean of its three
-    vertices), so that colors do not jump at edges. Columns: along the neutral triangle's first edge, across it, shear.
+    vertices (V, 3) meters. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the
+    posed mesh, averaged over the triangles that touch a triangle (each vertex's mean over its
+    triangles, then the mean of its three vertices), so that colors do not jump at edges. Columns:
+    along the neutral triangle's first edge, across it, shear.
     """
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
     p0, p1, p2 = np.take(rows, basis.corners, axis=1).transpose(1, 0, 2)
@@ -222,9 +246,13 @@ def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     return gram_strain(basis, _row_dot(e1, e1), _row_dot(e1, e2), _row_dot(e2, e2))
 
 
-def gram_strain(basis: StrainBasis, d11: np.ndarray, d12: np.ndarray, d22: np.ndarray) -> np.ndarray:
-    """`face_strain` from scalar products (F,) of the posed triangles' edges p1 − p0 and p2 − p0, in square meters."""
-    # Vectors and tensors are rows (·, F) here: numpy computes whole rows in a fraction of the time of short columns.
+def gram_strain(
+    basis: StrainBasis, d11: np.ndarray, d12: np.ndarray, d22: np.ndarray
+) -> np.ndarray:
+    """`face_strain` from scalar products (F,) of the posed triangles' edges p1 − p0 and p2 − p0, in
+    square meters."""
+    # Vectors and tensors are rows (·, F) here: numpy computes whole rows in a fraction of the time
+    # of short columns.
     change = np.asarray(np.stack([d11, d12, d22]) - basis.gram.T, np.float32)
     tensor = np.einsum("kf,kdf->df", change, basis.to_tensor.transpose(1, 2, 0))
     at_vertex = np.zeros((len(tensor), len(basis.vertex_weight)), np.float32)

@@ -1,5 +1,5 @@
-"""Folders of a batch, which one process holds, and of a job: what it holds from earlier starts, how it is prepared, and
-the digest that tells whether it has to be done again.
+"""Folders of a batch, which one process holds, and of a job: what it holds from earlier starts, how
+it is prepared, and the digest that tells whether it has to be done again.
 
 job.json   beside the request: the job's identity, how long it was expected to take, and took
 """
@@ -30,9 +30,9 @@ from .plan import REPLACED, Job, Plan, input_paths, output_field
 def job_digests(plan: Plan) -> dict[str, str]:
     """Name of each job -> SHA-256 of it.
 
-    Inputs count by name, size and time of change; a run that no job of the batch makes, by the content of its run file
-    and avatar; what another job makes, by that job's digest; what the batch writes into an input, not at all. Raises
-    StgaError where an input cannot be read.
+    Inputs count by name, size and time of change; a run that no job of the batch makes, by the
+    content of its run file and avatar; what another job makes, by that job's digest; what the batch
+    writes into an input, not at all. Raises StgaError where an input cannot be read.
     """
     folders, written = {job.name: job.folder for job in plan.jobs}, _written(plan)
     found: dict[str, str] = {}
@@ -55,7 +55,9 @@ def _written(plan: Plan) -> Set[str]:
     """The batch's folder, and what its jobs write elsewhere, without symbolic links."""
     fields = ((job.request, output_field(type(job.request))) for job in plan.jobs)
     outputs = (getattr(request, name) for request, name in fields if name is not None)
-    elsewhere = (path for path in outputs if isinstance(path, Path) and not path.is_relative_to(plan.out))
+    elsewhere = (
+        path for path in outputs if isinstance(path, Path) and not path.is_relative_to(plan.out)
+    )
     return {os.path.realpath(path) for path in (plan.out, *elsewhere)}
 
 
@@ -69,7 +71,9 @@ def _input_digest(path: Path, written: Set[str]) -> str:
         else:
             lines = [_line(path.name, path.stat())]
     except OSError as error:
-        raise StgaError(f"{error.filename or path}: cannot be read ({error.strerror or error})") from error
+        raise StgaError(
+            f"{error.filename or path}: cannot be read ({error.strerror or error})"
+        ) from error
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
 
 
@@ -95,7 +99,8 @@ JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[SoftFileLease]:
-    """Hold a batch's folder, which is made; one batch works in it, whichever machine it is started on.
+    """Hold a batch's folder, which is made; one batch works in it, whichever machine it is started
+    on.
 
     Raises StgaError while another batch works in it.
     """
@@ -119,7 +124,8 @@ class JobRecord:
     """Content of job.json.
 
     digest    of `job_digests`
-    forecast_s, seconds   how long the job was expected to take, and all its workers worked; 0: unknown
+    forecast_s, seconds   how long the job was expected to take, and all its workers worked; 0:
+                          unknown
     machine   that carried it out last
     """
 
@@ -131,15 +137,22 @@ class JobRecord:
 
 def write_record(job: Job, record: JobRecord) -> None:
     """Raises StgaError on a full disk."""
-    write_json(job.request_folder / JOB_FILE, {"format": FORMAT, "version": VERSION, **to_json(record)})
+    write_json(
+        job.request_folder / JOB_FILE, {"format": FORMAT, "version": VERSION, **to_json(record)}
+    )
 
 
 def read_record(job: Job) -> JobRecord | None:
     """None where the job was never prepared, or by another version."""
     try:
         values = read_json(job.request_folder / JOB_FILE)
-        named = isinstance(values, dict) and (values.pop("format", None), values.pop("version", None))
-        record: JobRecord | None = from_json(JobRecord, values) if named == (FORMAT, VERSION) else None
+        named = isinstance(values, dict) and (
+            values.pop("format", None),
+            values.pop("version", None),
+        )
+        record: JobRecord | None = (
+            from_json(JobRecord, values) if named == (FORMAT, VERSION) else None
+        )
     except StgaError:
         return None
     return record
@@ -157,22 +170,28 @@ def is_done(job: Job, digest: str) -> bool:
 def is_running(job: Job, digest: str) -> bool:
     """Whether a worker of an earlier start is carrying out this very job."""
     record = read_record(job)
-    return record is not None and record.digest == digest and is_locked(job.request_folder / LOCK_FILE)
+    return (
+        record is not None and record.digest == digest and is_locked(job.request_folder / LOCK_FILE)
+    )
 
 
 def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
     """Make the job's folder ready for a worker, which continues what an earlier one began.
 
-    What another request wrote there is moved aside; returns where to. Raises StgaError while a worker is running in
-    the folder, or where it holds files that no job wrote.
+    What another request wrote there is moved aside; returns where to. Raises StgaError while a
+    worker is running in the folder, or where it holds files that no job wrote.
     """
     record, moved = read_record(job), None
     if record is not None and record.digest != digest:
         prepare_status_folder(job.request_folder)  # raises while a worker is running
         moved, record = _move_aside(job.folder), None
     if record is None:
-        if job.folder.is_dir() and any(path.name != job.request_folder.name for path in job.folder.iterdir()):
-            raise StgaError(f"{job.folder}: holds files that no job of a batch wrote; choose another 'out'")
+        if job.folder.is_dir() and any(
+            path.name != job.request_folder.name for path in job.folder.iterdir()
+        ):
+            raise StgaError(
+                f"{job.folder}: holds files that no job of a batch wrote; choose another 'out'"
+            )
         write_record(job, JobRecord(digest, forecast_s))
     if record is None or not has_request(job.request_folder):
         write_request(job.request_folder, job.request)
@@ -191,5 +210,7 @@ def _move_aside(folder: Path) -> Path:
         target.parent.mkdir(exist_ok=True)
         folder.rename(target)
     except OSError as error:
-        raise StgaError(f"{folder}: cannot be moved to {target} ({error.strerror or error})") from error
+        raise StgaError(
+            f"{folder}: cannot be moved to {target} ({error.strerror or error})"
+        ) from error
     return target

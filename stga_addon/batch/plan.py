@@ -1,4 +1,5 @@
-"""Plan of a batch, a TOML file of jobs or some captures with a job each; and what an engine is, which carries them out.
+"""Plan of a batch, a TOML file of jobs or some captures with a job each; and what an engine is,
+which carries them out.
 
     out = "runs"                       # folder of the batch
 
@@ -55,9 +56,11 @@ def kind_name(kind: type[Any]) -> str:
     return "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__).lstrip("-")
 
 
-KINDS: dict[str, type[Any]] = {kind_name(kind): kind for kind in get_args(Request) if kind not in (Resume, MakeAvatar)}
-"""Name of a request in a plan -> its dataclass: every request but Resume, which is how an interrupted one continues,
-and MakeAvatar, which is two jobs."""
+KINDS: dict[str, type[Any]] = {
+    kind_name(kind): kind for kind in get_args(Request) if kind not in (Resume, MakeAvatar)
+}
+"""Name of a request in a plan -> its dataclass: every request but Resume, which is how an
+interrupted one continues, and MakeAvatar, which is two jobs."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,8 @@ def input_paths(request: Request) -> Mapping[str, tuple[Path, ...]]:
 
 @dataclass(frozen=True)
 class Ended:
-    """What became of a job's worker. is_lost: it was killed, or its machine has gone; the job may be tried again."""
+    """What became of a job's worker. is_lost: it was killed, or its machine has gone; the job may
+    be tried again."""
 
     snapshot: WorkerSnapshot
     is_lost: bool = False
@@ -162,7 +166,8 @@ class Ended:
 class Engine(Protocol):
     """Carries out jobs.
 
-    takes_all    it is given all jobs at once, and minds what they come after itself; else each when it can start
+    takes_all    it is given all jobs at once, and minds what they come after itself; else each when
+                 it can start
     interval_s   seconds between two questions after what has ended
     """
 
@@ -173,13 +178,15 @@ class Engine(Protocol):
         """Whether the job can be submitted now."""
 
     def submit(self, jobs: Sequence[Job]) -> None:
-        """Carry out jobs, which follow those that they come after. Raises StgaError where that cannot be begun."""
+        """Carry out jobs, which follow those that they come after. Raises StgaError where that
+        cannot be begun."""
 
     def adopt(self, job: Job) -> None:
         """Watch the worker that an earlier start of the batch left running."""
 
     def running(self) -> Mapping[str, str]:
-        """Name of each job that a machine carries out -> the machine, "" where only the worker knows it."""
+        """Name of each job that a machine carries out -> the machine, "" where only the worker
+        knows it."""
 
     def ended(self) -> Mapping[str, Ended]:
         """The jobs whose workers have ended since this was called last."""
@@ -233,23 +240,31 @@ def read_plan(path: Path) -> Plan:
 def plan_of_captures(
     captures: Sequence[Path], out: Path, settings: Mapping[str, Any], fields: Mapping[str, Any]
 ) -> Plan:
-    """A training of each capture. settings: of `make_settings`; fields: further ones of `Train`. Raises StgaError."""
+    """A training of each capture. settings: of `make_settings`; fields: further ones of `Train`.
+    Raises StgaError."""
     folders = [path.resolve() for path in captures]
     table = {"request": "train", "settings": dict(settings), **fields}
     jobs = {
-        f"train-{name}": {**table, "capture": str(path)} for name, path in zip(_names(folders), folders, strict=True)
+        f"train-{name}": {**table, "capture": str(path)}
+        for name, path in zip(_names(folders), folders, strict=True)
     }
     return make_plan({"out": str(out.resolve()), "job": jobs}, Path.cwd(), "CAPTURES")
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """What the job of each folder is called: the folder's name; with that above it where several have it; and numbered
-    where these are the same in ASCII."""
+    """What the job of each folder is called: the folder's name; with that above it where several
+    have it; and numbered where these are the same in ASCII."""
     names = [_slug(path.name) for path in folders]
     shared = Counter(names)
-    names = [_slug("-".join(p.parts[-2:])) if shared[n] > 1 else n for n, p in zip(names, folders, strict=True)]
+    names = [
+        _slug("-".join(p.parts[-2:])) if shared[n] > 1 else n
+        for n, p in zip(names, folders, strict=True)
+    ]
     earlier = [names[:number].count(name) for number, name in enumerate(names)]
-    return [name if not count else f"{name}_{count + 1}" for name, count in zip(names, earlier, strict=True)]
+    return [
+        name if not count else f"{name}_{count + 1}"
+        for name, count in zip(names, earlier, strict=True)
+    ]
 
 
 def _slug(text: str) -> str:
@@ -257,7 +272,8 @@ def _slug(text: str) -> str:
 
 
 def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
-    """The plan of a TOML file's values; paths are relative to `base`. Raises StgaError as `read_plan` does."""
+    """The plan of a TOML file's values; paths are relative to `base`. Raises StgaError as
+    `read_plan` does."""
     _require_keys(source, values, PLAN_KEYS)
     out, tables = values.get("out"), values.get("job")
     if not isinstance(out, str) or not out:
@@ -269,7 +285,9 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
     jobs = [_job(source, name, table, base, folder, shared) for name, table in tables.items()]
     by_name = {job.name: job for job in _with_inputs(source, jobs)}
     try:
-        order = list(TopologicalSorter({name: job.after for name, job in by_name.items()}).static_order())
+        order = list(
+            TopologicalSorter({name: job.after for name, job in by_name.items()}).static_order()
+        )
     except CycleError as error:
         circle = " → ".join(map(str, error.args[1]))
         raise StgaError(f"{source}: these jobs wait for each other: {circle}") from error
@@ -279,19 +297,25 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
 def _require_keys(where: str, values: Mapping[str, Any], allowed: Sequence[str]) -> None:
     unknown = next((key for key in values if key not in allowed), None)
     if unknown is not None:
-        raise StgaError(f"{where}: {unknown}: is not a key of it; expected one of {', '.join(allowed)}")
+        raise StgaError(
+            f"{where}: {unknown}: is not a key of it; expected one of {', '.join(allowed)}"
+        )
 
 
 def _job(source: str, name: str, table: Any, base: Path, out: Path, shared: Resources) -> Job:
     """The job of a table, which waits for those that its `after` names."""
     where = f"{source}: [job.{name if NAME.fullmatch(name) else shorten(name)}]"
     if not NAME.fullmatch(name) or name == REPLACED:
-        raise StgaError(f"{where}: expected a name of letters, digits, '_', '.' and '-', other than '{REPLACED}'")
+        raise StgaError(
+            f"{where}: expected a name of letters, digits, '_', '.' and '-', other than '{REPLACED}'"
+        )
     if not isinstance(table, dict):
         raise StgaError(f"{where}: expected a table, got {shorten(table)}")
     kind = KINDS.get(table["request"]) if isinstance(table.get("request"), str) else None
     if kind is None:
-        raise StgaError(f"{where}: request: expected one of {', '.join(KINDS)}, got {shorten(table.get('request'))}")
+        raise StgaError(
+            f"{where}: request: expected one of {', '.join(KINDS)}, got {shorten(table.get('request'))}"
+        )
     after, minutes = table.get("after", []), table.get("minutes")
     if not isinstance(after, list) or not all(isinstance(other, str) for other in after):
         raise StgaError(f"{where}: after: expected a list of job names, got {shorten(after)}")
@@ -317,8 +341,11 @@ def _resources(where: str, values: Any, shared: Resources) -> Resources:
 # Requests
 
 
-def _request(where: str, kind: type[Any], values: Mapping[str, Any], base: Path, folder: Path) -> Request:
-    """The request of a kind from the fields that are given; the others have their defaults. Raises StgaError."""
+def _request(
+    where: str, kind: type[Any], values: Mapping[str, Any], base: Path, folder: Path
+) -> Request:
+    """The request of a kind from the fields that are given; the others have their defaults. Raises
+    StgaError."""
     specs, output = {spec.name: spec for spec in fields(kind)}, output_field(kind)
     _require_keys(where, values, list(specs))
     values = dict(values)
@@ -341,10 +368,13 @@ def _request(where: str, kind: type[Any], values: Mapping[str, Any], base: Path,
 
 
 def _completed(spec: Any, value: Any) -> Any:
-    """A field's value or default as JSON has it, MISSING without either; a table is completed by the defaults."""
+    """A field's value or default as JSON has it, MISSING without either; a table is completed by
+    the defaults."""
     if spec.default_factory is not MISSING:
         default = to_json(spec.default_factory())
-        return default if value is None else {**default, **value} if isinstance(value, dict) else value
+        return (
+            default if value is None else {**default, **value} if isinstance(value, dict) else value
+        )
     if value is not None:
         return value
     return list(spec.default) if isinstance(spec.default, tuple) else spec.default
@@ -361,8 +391,8 @@ def _absolute(base: Path, text: str) -> Path:
 
 
 def _set_training(where: str, values: dict[str, Any]) -> None:
-    """Replace the changes in `settings` by whole settings, as `stga train` makes them: with the effects decided from
-    the capture."""
+    """Replace the changes in `settings` by whole settings, as `stga train` makes them: with the
+    effects decided from the capture."""
     changes = values.get("settings", {})
     if not isinstance(changes, dict):
         raise StgaError(f"{where}: settings: expected a table, got {shorten(changes)}")
@@ -372,7 +402,8 @@ def _set_training(where: str, values: dict[str, Any]) -> None:
         changes.setdefault("effects", {})
     nested = {name: changes.pop(name) for name in ("selection", "rates") if name in changes}
     try:
-        # As lists become tuples: the plain form is read back with the nested changes merged into it.
+        # As lists become tuples: the plain form is read back with the nested changes merged into
+        # it.
         whole = to_json(make_settings(**{key: _tuples(item) for key, item in changes.items()}))
         for name, change in nested.items():
             whole[name] = {**whole[name], **change} if isinstance(change, dict) else change
@@ -390,7 +421,8 @@ def _tuples(value: Any) -> Any:
 
 
 def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
-    """The jobs, each also after those whose folders it reads. Raises StgaError for an input that nothing makes."""
+    """The jobs, each also after those whose folders it reads. Raises StgaError for an input that
+    nothing makes."""
     by_name, by_folder = {job.name: job for job in jobs}, {job.folder: job for job in jobs}
     for job in jobs:
         where, after = f"{source}: [job.{job.name}]", list(job.after)
@@ -400,8 +432,13 @@ def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
         for name, paths in input_paths(job.request).items():
             for path in paths:
                 if path == job.folder.parent:
-                    raise StgaError(f"{where}: {name}: {path} is the batch's own folder; choose another 'out'")
-                maker = next((by_folder[folder] for folder in (path, *path.parents) if folder in by_folder), None)
+                    raise StgaError(
+                        f"{where}: {name}: {path} is the batch's own folder; choose another 'out'"
+                    )
+                maker = next(
+                    (by_folder[folder] for folder in (path, *path.parents) if folder in by_folder),
+                    None,
+                )
                 if maker is not None and maker is not job:
                     after.append(maker.name)
                 elif maker is None and not path.exists():

@@ -1,4 +1,5 @@
-"""What is shown of a batch: the live table, the table of what a plan asks for, and the report, one HTML file."""
+"""What is shown of a batch: the live table, the table of what a plan asks for, and the report, one
+HTML file."""
 
 import base64
 import html
@@ -28,7 +29,8 @@ CLEAR_LINE, UP = "\x1b[2K", "\x1b[{}A"
 
 
 class LiveTable:
-    """Shows a batch on a stream: on a terminal a table that is drawn over, else a line for each event."""
+    """Shows a batch on a stream: on a terminal a table that is drawn over, else a line for each
+    event."""
 
     def __init__(self, stream: TextIO, width: int = 100) -> None:
         self._stream, self._width = stream, width
@@ -58,10 +60,18 @@ class LiveTable:
 def table_lines(batch: Batch) -> list[str]:
     """A line on the whole batch, and one for each job that runs or has failed."""
     shown = [entry for entry in batch.entries.values() if entry.state == JobState.RUNNING]
-    shown += [entry for entry in batch.entries.values() if entry.state in (JobState.FAILED, JobState.BLOCKED)]
+    shown += [
+        entry
+        for entry in batch.entries.values()
+        if entry.state in (JobState.FAILED, JobState.BLOCKED)
+    ]
     width = max((len(entry.job.name) for entry in shown[:MAX_LIVE_ROWS]), default=0)
     lines = [summary_line(batch), *(_row(entry, width) for entry in shown[:MAX_LIVE_ROWS])]
-    return lines if len(shown) <= MAX_LIVE_ROWS else [*lines, f"… and {len(shown) - MAX_LIVE_ROWS} more"]
+    return (
+        lines
+        if len(shown) <= MAX_LIVE_ROWS
+        else [*lines, f"… and {len(shown) - MAX_LIVE_ROWS} more"]
+    )
 
 
 def summary_line(batch: Batch) -> str:
@@ -76,13 +86,15 @@ def summary_line(batch: Batch) -> str:
 
 
 def seconds_left(entries: Iterable[Entry]) -> float | None:
-    """Seconds until the batch is done, if as many jobs run at once as now; None where that is unknown."""
+    """Seconds until the batch is done, if as many jobs run at once as now; None where that is
+    unknown."""
     open_ones = [entry for entry in entries if not entry.state.is_over]
     each = [entry.left_s for entry in open_ones]
     known = [seconds for seconds in each if seconds is not None]
     if not known:
         return None
-    running = max(1, sum(entry.status.seconds > 0 for entry in open_ones))  # others wait in an engine's queue
+    # others wait in an engine's queue
+    running = max(1, sum(entry.status.seconds > 0 for entry in open_ones))
     total = sum(known) * len(each) / len(known)
     return max(total / running, *known)
 
@@ -108,17 +120,26 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     """What --dry-run prints: each job, its state, its forecast, and the sum."""
     rows = [_plan_row(entry) for entry in batch.entries.values()]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
     unfinished = [entry for entry in batch.entries.values() if not entry.state.is_over]
     known = [entry.forecast_s for entry in unfinished if entry.forecast_s]
     total = sum(known)
     unknown = len(unfinished) - len(known)
     text = f"{len(rows)} jobs, {len(unfinished)} to do"
     text += f"; {format_duration(total)} of work" if known else ""
-    on_cores = sum(entry.forecast_s * min(max(entry.job.resources.threads, 1), cores) for entry in unfinished)
+    on_cores = sum(
+        entry.forecast_s * min(max(entry.job.resources.threads, 1), cores) for entry in unfinished
+    )
     shared = max(on_cores / max(1, cores), *known, 0.0)
     text += f", about {format_duration(shared)} on this machine" if known else ""
-    text += f"; of {unknown} jobs the time is not known before one of their kind is finished" if unknown else ""
+    text += (
+        f"; of {unknown} jobs the time is not known before one of their kind is finished"
+        if unknown
+        else ""
+    )
     return [*lines, text]
 
 
@@ -156,14 +177,17 @@ Run = tuple[Entry, list[dict[str, Any]]]
 
 
 def write_report(batch: Batch) -> Path:
-    """Write report.html into the batch's folder and return its path. Raises StgaError where it cannot be written."""
+    """Write report.html into the batch's folder and return its path. Raises StgaError where it
+    cannot be written."""
     runs = _runs(batch)
     parts = [_summary(batch), _failures(batch), _chart(runs), _pictures(runs), _table(batch, runs)]
     title = html.escape(batch.plan.out.name)
     head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
     path = batch.plan.out / REPORT
     with replacing(path) as partial:
-        partial.write_text(f"{head}<h1>Batch {title}</h1>{''.join(parts)}</html>\n", encoding="utf-8")
+        partial.write_text(
+            f"{head}<h1>Batch {title}</h1>{''.join(parts)}</html>\n", encoding="utf-8"
+        )
     return path
 
 
@@ -182,7 +206,11 @@ def _figures(run: Run) -> dict[str, Any]:
     entry, metrics = run
     lines = [line for line in metrics if "psnr" in line]
     with suppress(StgaError):
-        return dict(saved_line(lines, read_run(entry.job.folder).settings.target_psnr)) if lines else {}
+        return (
+            dict(saved_line(lines, read_run(entry.job.folder).settings.target_psnr))
+            if lines
+            else {}
+        )
     return {}
 
 
@@ -199,13 +227,16 @@ def _summary(batch: Batch) -> str:
     text = ", ".join(f"{count} {state}" for state, count in counts if count)
     seconds = sum(entry.seconds for entry in entries)
     off = [abs(miss) for entry in entries if (miss := _forecast_error(entry)) is not None]
-    forecasts = f" Forecasts were off by {np.median(off):.0%} (median of {len(off)})." if off else ""
+    forecasts = (
+        f" Forecasts were off by {np.median(off):.0%} (median of {len(off)})." if off else ""
+    )
     source = html.escape(batch.plan.source)
     return f"<p>{source}: {len(entries)} jobs: {text}. {format_duration(seconds)} of work.{forecasts}</p>"
 
 
 def _forecast_error(entry: Entry) -> float | None:
-    """By how much a finished job took longer than expected, as a share of that; None where nothing was expected."""
+    """By how much a finished job took longer than expected, as a share of that; None where nothing
+    was expected."""
     if not (entry.state.is_done and entry.forecast_s and entry.seconds):
         return None
     return entry.seconds / entry.forecast_s - 1
@@ -216,9 +247,13 @@ def _failures(batch: Batch) -> str:
     for entry in failed[:MAX_FAILURES]:
         name, error = html.escape(entry.job.name), html.escape(entry.error or entry.state)
         parts.append(f'<p><b>{name}</b>: <span class="failed">{error}</span></p>')
-        log = log_lines(entry.job.request_folder, LOG_LINES) if entry.state == JobState.FAILED else []
+        log = (
+            log_lines(entry.job.request_folder, LOG_LINES) if entry.state == JobState.FAILED else []
+        )
         parts += [f"<pre>{html.escape(chr(10).join(log))}</pre>"] if log else []
-    parts += [f"<p>… and {len(failed) - MAX_FAILURES} more</p>"] if len(failed) > MAX_FAILURES else []
+    parts += (
+        [f"<p>… and {len(failed) - MAX_FAILURES} more</p>"] if len(failed) > MAX_FAILURES else []
+    )
     return f"<h2>Failures</h2>{''.join(parts)}" if failed else ""
 
 
@@ -241,21 +276,30 @@ def _chart(runs: Sequence[Run]) -> str:
 
 
 def _pictures(runs: Sequence[Run]) -> str:
-    """A held-out image of each run beside its avatar, where its capture has one and can be opened here."""
+    """A held-out image of each run beside its avatar, where its capture has one and can be opened
+    here."""
     shown = []
     for entry, metrics in _spread(runs, MAX_PICTURES):
         with suppress(StgaError, ModuleNotFoundError):
             pair, figures = held_out_pair(entry.job.folder), _figures((entry, metrics))
             if pair is not None:
                 psnr = f", {figures['psnr']:.2f} dB" if "psnr" in figures else ""
-                data, name = base64.b64encode(_jpeg(pair)).decode("ascii"), html.escape(entry.job.name)
+                data, name = (
+                    base64.b64encode(_jpeg(pair)).decode("ascii"),
+                    html.escape(entry.job.name),
+                )
                 image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="data:image/jpeg;base64,{data}">'
                 shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
-    return f"<h2>Held-out views: image and avatar, from the lowest PSNR</h2>{''.join(shown)}" if shown else ""
+    return (
+        f"<h2>Held-out views: image and avatar, from the lowest PSNR</h2>{''.join(shown)}"
+        if shown
+        else ""
+    )
 
 
 def held_out_pair(run: Path) -> np.ndarray | None:
-    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None where its capture has no such view.
+    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None where its capture has
+    no such view.
 
     Raises StgaError where the run or its capture cannot be opened.
     """
@@ -291,9 +335,13 @@ def _table(batch: Batch, runs: Iterable[Run]) -> str:
     figures = {run[0].job.name: _figures(run) for run in runs}
     names = ("job", "request", "state", "machine")
     numbers = ("time", "forecast", "off by", "PSNR", "SSIM", "splats")
-    heads = "".join(f"<th>{name}</th>" for name in names) + "".join(f'<th class="n">{name}</th>' for name in numbers)
+    heads = "".join(f"<th>{name}</th>" for name in names) + "".join(
+        f'<th class="n">{name}</th>' for name in numbers
+    )
     entries = list(batch.entries.values())
-    rows = "".join(_table_row(entry, figures.get(entry.job.name, {})) for entry in entries[:MAX_ROWS])
+    rows = "".join(
+        _table_row(entry, figures.get(entry.job.name, {})) for entry in entries[:MAX_ROWS]
+    )
     more = f"<p>… and {len(entries) - MAX_ROWS} more</p>" if len(entries) > MAX_ROWS else ""
     return f"<h2>Jobs</h2><table><tr>{heads}</tr>{rows}</table>{more}"
 

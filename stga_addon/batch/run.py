@@ -68,7 +68,8 @@ class Entry:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until it is finished, from its share done, else from its forecast; None: unknown."""
+        """Seconds until it is finished, from its share done, else from its forecast; None:
+        unknown."""
         if self.state.is_over:
             return 0.0
         spent = self.status.seconds if self.state == JobState.RUNNING else 0.0
@@ -117,12 +118,14 @@ class Batch:
             self.entries[name].forecast_s = expected
 
 
-def run_batch(batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None], say: Say) -> None:
+def run_batch(
+    batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None], say: Say
+) -> None:
     """Carry out the jobs that are not finished; each that fails fails alone.
 
     show: called now and then; say: told in lines what happened.
-    Raises KeyboardInterrupt after Ctrl-C when the running jobs have saved what they have, and StgaError where another
-    batch has taken the folder.
+    Raises KeyboardInterrupt after Ctrl-C when the running jobs have saved what they have, and
+    StgaError where another batch has taken the folder.
     """
     loop = _Loop(batch, engine, lease, show, say)
     try:
@@ -137,16 +140,29 @@ def run_batch(batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable
 
 class _Loop:
     def __init__(
-        self, batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None], say: Say
+        self,
+        batch: Batch,
+        engine: Engine,
+        lease: SoftFileLease,
+        show: Callable[[Batch], None],
+        say: Say,
     ) -> None:
-        self._batch, self._engine, self._lease, self._show, self._say = batch, engine, lease, show, say
+        self._batch, self._engine, self._lease, self._show, self._say = (
+            batch,
+            engine,
+            lease,
+            show,
+            say,
+        )
         self._entries = batch.entries
         self._shown_s = 0.0
         self._position = {name: number for number, name in enumerate(self._entries)}
         self._children: dict[str, list[str]] = {name: [] for name in self._entries}
         self._waits_for: dict[str, int] = {}
         for name, entry in self._entries.items():
-            open_ones = [other for other in entry.job.after if not self._entries[other].state.is_done]
+            open_ones = [
+                other for other in entry.job.after if not self._entries[other].state.is_done
+            ]
             self._waits_for[name] = len(open_ones)
             for other in open_ones:
                 self._children[other].append(name)
@@ -154,13 +170,17 @@ class _Loop:
         self._left = len(waiting)
         takes_all = engine.takes_all
         # A dictionary as an ordered set: jobs leave it from anywhere.
-        self._ready = dict.fromkeys(name for name in waiting if takes_all or not self._waits_for[name])
+        self._ready = dict.fromkeys(
+            name for name in waiting if takes_all or not self._waits_for[name]
+        )
 
     def work(self) -> None:
         self._adopt()
         while self._left:
             if self._lease.compromise is not None:
-                raise StgaError(f"{self._batch.plan.out}: another batch has taken this folder; this one has ended")
+                raise StgaError(
+                    f"{self._batch.plan.out}: another batch has taken this folder; this one has ended"
+                )
             begun = self._begin()
             ended = self._collect()
             self._look()
@@ -240,21 +260,36 @@ class _Loop:
     def _collect(self, retry: bool = True) -> bool:
         """Take note of what has ended; whether something has."""
         ended = self._engine.ended()
-        for name in sorted(ended, key=self._position.__getitem__):  # a job's end before that of those after it
+        # a job's end before that of those after it
+        for name in sorted(ended, key=self._position.__getitem__):
             entry, end = self._entries[name], ended[name]
             entry.status = end.snapshot.status
             entry.machine = entry.machine or entry.status.machine
             self._add_seconds(entry)
-            missing = next((other for other in entry.job.after if not self._entries[other].state.is_done), None)
-            if end.snapshot.state != WorkerState.FINISHED and missing is not None:  # an engine that takes all
-                self._over(entry, JobState.BLOCKED, f"it comes after {missing}, which is not finished")
-            elif retry and end.is_lost and end.snapshot.state in _LOST and entry.retries < MAX_RETRIES:
+            missing = next(
+                (other for other in entry.job.after if not self._entries[other].state.is_done), None
+            )
+            # an engine that takes all
+            if end.snapshot.state != WorkerState.FINISHED and missing is not None:
+                self._over(
+                    entry, JobState.BLOCKED, f"it comes after {missing}, which is not finished"
+                )
+            elif (
+                retry
+                and end.is_lost
+                and end.snapshot.state in _LOST
+                and entry.retries < MAX_RETRIES
+            ):
                 entry.retries += 1
                 entry.state = JobState.WAITING
                 self._ready[name] = None
                 self._say(f"{name}: its worker was lost; it goes on from its last checkpoint")
             else:
-                self._over(entry, _OUTCOMES.get(end.snapshot.state, JobState.FAILED), end.snapshot.status.error)
+                self._over(
+                    entry,
+                    _OUTCOMES.get(end.snapshot.state, JobState.FAILED),
+                    end.snapshot.status.error,
+                )
         return bool(ended)
 
     def _add_seconds(self, entry: Entry) -> None:
@@ -283,7 +318,9 @@ class _Loop:
         while left:
             child, missing = left.pop()
             if self._entries[child].state == JobState.WAITING:
-                self._end(self._entries[child], after, f"it comes after {missing}, which is not finished")
+                self._end(
+                    self._entries[child], after, f"it comes after {missing}, which is not finished"
+                )
                 left += [(other, child) for other in self._children[child]]
 
     def _end(self, entry: Entry, state: JobState, error: str) -> None:
@@ -293,7 +330,8 @@ class _Loop:
         self._say(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
 
     def _look(self, now: bool = False) -> None:
-        """Read the status of the running jobs, and show the batch, at most every SHOW_INTERVAL_S."""
+        """Read the status of the running jobs, and show the batch, at most every
+        SHOW_INTERVAL_S."""
         if not now and time.monotonic() - self._shown_s < SHOW_INTERVAL_S:
             return
         for name, machine in self._engine.running().items():
@@ -314,8 +352,9 @@ _OUTCOMES = {WorkerState.FINISHED: JobState.FINISHED, WorkerState.CANCELLED: Job
 def forecast_seconds(jobs: Sequence[Job], done: Sequence[Job]) -> dict[str, float]:
     """Name -> seconds that a job is expected to take, of the jobs of which that is known.
 
-    done: jobs that are finished; those of the same kind of request correct the forecast, and stand in where there is
-    none. What a training of so many iterations takes is measured on this machine (`pace`), once for all.
+    done: jobs that are finished; those of the same kind of request correct the forecast, and stand
+    in where there is none. What a training of so many iterations takes is measured on this machine
+    (`pace`), once for all.
     """
     paces: list[float] = []
     stated = {job.name: _stated(job, paces) for job in (*jobs, *done)}
@@ -324,7 +363,9 @@ def forecast_seconds(jobs: Sequence[Job], done: Sequence[Job]) -> dict[str, floa
         record = read_record(job)
         if record is not None and record.seconds:
             taken.setdefault(type(job.request), []).append((record.seconds, stated[job.name]))
-    found = {job.name: _corrected(stated[job.name], taken.get(type(job.request), ())) for job in jobs}
+    found = {
+        job.name: _corrected(stated[job.name], taken.get(type(job.request), ())) for job in jobs
+    }
     return {name: seconds for name, seconds in found.items() if seconds is not None}
 
 
@@ -336,7 +377,8 @@ def _corrected(stated: float | None, taken: Sequence[tuple[float, float | None]]
 
 
 def _stated(job: Job, paces: list[float]) -> float | None:
-    """Seconds by the plan: what it says, the budget of a training, or the time that its iterations take.
+    """Seconds by the plan: what it says, the budget of a training, or the time that its iterations
+    take.
 
     paces: seconds of an iteration, once it is measured.
     """
@@ -358,8 +400,8 @@ def _stated(job: Job, paces: list[float]) -> float | None:
 
 
 def pace(job: Job, request: Train) -> float | None:
-    """Seconds per iteration of a training on this machine, measured; None where its capture is not there yet, cannot
-    be trained on, or training is not installed here."""
+    """Seconds per iteration of a training on this machine, measured; None where its capture is not
+    there yet, cannot be trained on, or training is not installed here."""
     if find_spec("torch") is None or find_spec("numba") is None or not request.capture.is_dir():
         return None
     from ..capture.open import open_capture

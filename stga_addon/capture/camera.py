@@ -1,4 +1,5 @@
-"""Calibrated pinhole cameras, and paths of them: an orbit around a head, as far as its cameras saw it."""
+"""Calibrated pinhole cameras, and paths of them: an orbit around a head, as far as its cameras saw
+it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,19 +7,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 MAX_IMAGE_PIXELS = 1 << 26
-"""The largest machine-vision sensors have 65 million pixels; a small file that claims more could fill the memory."""
+"""The largest machine-vision sensors have 65 million pixels; a small file that claims more could
+fill the memory."""
 MAX_FOCAL_PIXELS = 1e7
 MAX_COORDINATE_M = 1e5
-"""Bound of camera positions and vertices: generous even for a scene in millimeters, and no product of them with focal
-lengths overflows an integer pixel position."""
+"""Bound of camera positions and vertices: generous even for a scene in millimeters, and no product
+of them with focal lengths overflows an integer pixel position."""
 MIN_PROJECTION_DEPTH = 1e-6
-"""Meters: points nearer to the camera's plane, or behind it, are projected as if they were at this depth."""
-# Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks along +z).
+"""Meters: points nearer to the camera's plane, or behind it, are projected as if they were at this
+depth."""
+# Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks
+# along +z).
 GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_image_size(width: float, height: float) -> bool:
-    """Whether an image may have this size: whole numbers of at least one pixel, within the limit."""
+    """Whether an image may have this size: whole numbers of at least one pixel, within the
+    limit."""
     whole = width % 1 == 0 and height % 1 == 0
     return bool(whole and min(width, height) >= 1) and width * height <= MAX_IMAGE_PIXELS
 
@@ -29,7 +34,8 @@ class Camera:
 
     width, height  image size
     fl_x, fl_y     focal lengths
-    cx, cy         principal point from the top-left corner of the image (OpenCV; pixel centers lie at .5)
+    cx, cy         principal point from the top-left corner of the image (OpenCV; pixel centers lie
+                   at .5)
     world_to_camera  (4, 4) float64, meters, OpenCV camera axes
     """
 
@@ -49,14 +55,16 @@ class Camera:
 
     @property
     def camera_to_world_gl(self) -> np.ndarray:
-        """(4, 4) pose with OpenGL camera axes: what `transform_matrix` and a Blender camera hold."""
+        """(4, 4) pose with OpenGL camera axes: what `transform_matrix` and a Blender camera
+        hold."""
         return np.asarray(np.linalg.inv(self.world_to_camera) @ GL_TO_CV)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixel positions (N, 2) and depths (N,) in meters of world points (N, 3) meters.
 
-        Positions count from the top-left corner of the image, pixel centers lie at .5. Depth is the distance along the
-        viewing axis, negative behind the camera; positions of such points mean nothing.
+        Positions count from the top-left corner of the image, pixel centers lie at .5. Depth is the
+        distance along the viewing axis, negative behind the camera; positions of such points mean
+        nothing.
         """
         local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         depth = local[:, 2]
@@ -64,23 +72,32 @@ class Camera:
         return flat * [self.fl_x, self.fl_y] + [self.cx, self.cy], depth
 
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """World points (N, 3) in meters of pixel positions (N, 2) at depths (N,), both as `project` returns them."""
+        """World points (N, 3) in meters of pixel positions (N, 2) at depths (N,), both as `project`
+        returns them."""
         flat = (pixels - [self.cx, self.cy]) / [self.fl_x, self.fl_y]
         local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) * depth[:, None]
         return np.asarray((local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3])
 
     def scaled(self, factor: float) -> "Camera":
-        """The same camera with an image `factor` times as large (sizes rounded, at least one pixel)."""
+        """The same camera with an image `factor` times as large (sizes rounded, at least one
+        pixel)."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         x, y = width / self.width, height / self.height
         return replace(
-            self, width=width, height=height, fl_x=self.fl_x * x, fl_y=self.fl_y * y, cx=self.cx * x, cy=self.cy * y
+            self,
+            width=width,
+            height=height,
+            fl_x=self.fl_x * x,
+            fl_y=self.fl_y * y,
+            cx=self.cx * x,
+            cy=self.cy * y,
         )
 
 
 def orbited(camera: Camera, center: np.ndarray, up: Sequence[float], angle: float) -> Camera:
-    """The camera turned by `angle` radians, counterclockwise seen from above, about the axis `up` (3,) through `center`
-    (3,) in world meters: it sees the center at the same place of the image from another side."""
+    """The camera turned by `angle` radians, counterclockwise seen from above, about the axis `up`
+    (3,) through `center` (3,) in world meters: it sees the center at the same place of the image
+    from another side."""
     x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turn = np.eye(4)
@@ -90,8 +107,8 @@ def orbited(camera: Camera, center: np.ndarray, up: Sequence[float], angle: floa
 
 
 def central_camera(cameras: Sequence[Camera]) -> int:
-    """Index of the camera that looks most nearly in the mean viewing direction; for a head captured from the front and
-    both sides, the one that sees the face."""
+    """Index of the camera that looks most nearly in the mean viewing direction; for a head captured
+    from the front and both sides, the one that sees the face."""
     return most_central(np.array([camera.world_to_camera[2, :3] for camera in cameras]))
 
 
@@ -100,9 +117,11 @@ def most_central(directions: np.ndarray) -> int:
     return int((directions @ directions.mean(0)).argmax())
 
 
-def azimuths(cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float]) -> np.ndarray:
-    """Angle of each camera about the axis `up` (3,) through `center` (3,), in radians from that of `start`, -π to π:
-    what `orbited` turns `start` by to get to its side."""
+def azimuths(
+    cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float]
+) -> np.ndarray:
+    """Angle of each camera about the axis `up` (3,) through `center` (3,), in radians from that of
+    `start`, -π to π: what `orbited` turns `start` by to get to its side."""
     axis = np.asarray(up, np.float64) / np.linalg.norm(up)
     arms = np.array([camera.position for camera in (start, *cameras)]) - center
     first = arms[0] - arms[0] @ axis * axis
@@ -111,7 +130,13 @@ def azimuths(cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: S
 
 
 def camera_from_gl(
-    camera_to_world: np.ndarray, width: int, height: int, fl_x: float, fl_y: float, cx: float, cy: float
+    camera_to_world: np.ndarray,
+    width: int,
+    height: int,
+    fl_x: float,
+    fl_y: float,
+    cx: float,
+    cy: float,
 ) -> Camera:
     """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
     world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
@@ -126,15 +151,19 @@ def look_at(
     focal_length: float,
     up: Sequence[float] = (0.0, 1.0, 0.0),
 ) -> Camera:
-    """Camera at `eye` that looks at `target`, both (3,) in world meters; the principal point is the image's center.
+    """Camera at `eye` that looks at `target`, both (3,) in world meters; the principal point is the
+    image's center.
 
-    width, height, focal_length in pixels. up: the world direction that points up in the image; FLAME's is +y.
-    Raises ValueError where `eye` is at `target`, or `up` is parallel to the viewing direction.
+    width, height, focal_length in pixels. up: the world direction that points up in the image;
+    FLAME's is +y. Raises ValueError where `eye` is at `target`, or `up` is parallel to the viewing
+    direction.
     """
     forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
     right = np.cross(forward, np.asarray(up, np.float64))
     if not np.linalg.norm(right):
-        raise ValueError(f"look_at needs a viewing direction that is not parallel to up, got {forward} and {up}")
+        raise ValueError(
+            f"look_at needs a viewing direction that is not parallel to up, got {forward} and {up}"
+        )
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = right, np.cross(forward, right), forward
@@ -151,11 +180,16 @@ MAX_GAP_RAD = np.radians(100)
 
 
 def turntable(
-    start: Camera, center: np.ndarray, count: int, angles: tuple[float, float], up: Sequence[float] = UP
+    start: Camera,
+    center: np.ndarray,
+    count: int,
+    angles: tuple[float, float],
+    up: Sequence[float] = UP,
 ) -> list[Camera]:
     """`count` cameras that orbit the vertical axis through `center` (3,), from where `start` is.
 
-    angles: radians from `start`, from `covered_angles`; a full turn goes around once, less swings to both sides.
+    angles: radians from `start`, from `covered_angles`; a full turn goes around once, less swings
+    to both sides.
     """
     low, high = angles
     shares = np.arange(count) / count
@@ -169,9 +203,11 @@ def turntable(
 def covered_angles(
     cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float] = UP
 ) -> tuple[float, float]:
-    """The angles about the vertical axis through `center` (3,), in radians from `start`, that the cameras cover.
+    """The angles about the vertical axis through `center` (3,), in radians from `start`, that the
+    cameras cover.
 
-    Of what no camera saw, training has nothing to show. A full turn where they leave no gap of MAX_GAP_RAD.
+    Of what no camera saw, training has nothing to show. A full turn where they leave no gap of
+    MAX_GAP_RAD.
     """
     seen = np.sort(np.append(azimuths(cameras, start, center, up), 0.0))
     gaps = np.diff(np.append(seen, seen[0] + 2 * np.pi))

@@ -22,7 +22,8 @@ WHITE_LEVEL = 247
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 BAND_PIXELS = 1 << 20
-"""Pixels that are converted at a time: wide intermediate numbers of a large image would fill the memory."""
+"""Pixels that are converted at a time: wide intermediate numbers of a large image would fill the
+memory."""
 
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
@@ -30,14 +31,14 @@ SRGB_GAMMA, GAMMA_TOLERANCE = 0.45455, 0.02
 """PNG's gAMA of what is shown as sRGB."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
-# Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what else Pillow warns
-# about, such as damaged metadata, does not concern the pixels.
+# Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what
+# else Pillow warns about, such as damaged metadata, does not concern the pixels.
 warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) as displayed, from the file's header. Raises StgaError where it is no image or larger than images
-    may be."""
+    """(width, height) as displayed, from the file's header. Raises StgaError where it is no image
+    or larger than images may be."""
     try:
         _require_regular(path)
         with Image.open(path, formats=FORMATS) as image:
@@ -45,12 +46,15 @@ def image_size(path: Path) -> tuple[int, int]:
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if not is_image_size(width, height):
-        raise StgaError(f"{path}: claims {width} x {height} pixels; at most {MAX_IMAGE_PIXELS} are read")
+        raise StgaError(
+            f"{path}: claims {width} x {height} pixels; at most {MAX_IMAGE_PIXELS} are read"
+        )
     return width, height
 
 
 def is_plain(path: Path) -> bool:
-    """Whether programs that know neither EXIF's orientation nor color profiles show the image as it is read here."""
+    """Whether programs that know neither EXIF's orientation nor color profiles show the image as it
+    is read here."""
     try:
         with Image.open(path, formats=FORMATS) as image:
             return _orientation(image) == 1 and _conversion(image, path) is None
@@ -59,17 +63,19 @@ def is_plain(path: Path) -> bool:
 
 
 def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarray:
-    """The view's image (H, W, 3) uint8 sRGB; transparent pixels are laid over `background` (0 to 255).
+    """The view's image (H, W, 3) uint8 sRGB; transparent pixels are laid over `background` (0 to
+    255).
 
-    Gray, palette and 16-bit images are converted, and so are color profiles, PNG's gAMA and cICP; EXIF's orientation is
-    applied unless the camera has the size of the pixels as stored. Raises StgaError naming the file where it is
-    missing, truncated or not as large as the camera says.
+    Gray, palette and 16-bit images are converted, and so are color profiles, PNG's gAMA and cICP;
+    EXIF's orientation is applied unless the camera has the size of the pixels as stored. Raises
+    StgaError naming the file where it is missing, truncated or not as large as the camera says.
     """
     return _over(_decode(view.image, view, "image"), background)
 
 
 def read_mask(view: View) -> np.ndarray | None:
-    """The view's foreground mask (H, W) uint8, 255 inside; an image's transparency where it has no mask file.
+    """The view's foreground mask (H, W) uint8, 255 inside; an image's transparency where it has no
+    mask file.
 
     None where there is neither. Raises StgaError as `read_image` does.
     """
@@ -84,7 +90,8 @@ def read_mask(view: View) -> np.ndarray | None:
 def read_view(
     view: View, scale: float = 1.0, background: tuple[int, int, int] = WHITE
 ) -> tuple[View, np.ndarray, np.ndarray | None]:
-    """Image and mask at `scale` in (0, 1]: the view with its camera scaled alike, image and mask as above.
+    """Image and mask at `scale` in (0, 1]: the view with its camera scaled alike, image and mask as
+    above.
 
     Every small pixel is the mean over the area it covers, to avoid aliasing.
     Raises StgaError as `read_image` does.
@@ -95,13 +102,19 @@ def read_view(
     mask = _transparency(pixels) if view.mask is None else read_mask(view)
     small = view if scale == 1 else replace(view, camera=view.camera.scaled(scale))
     size = small.camera.height, small.camera.width
-    return small, area_mean(_over(pixels, background), *size), None if mask is None else area_mean(mask, *size)
+    return (
+        small,
+        area_mean(_over(pixels, background), *size),
+        None if mask is None else area_mean(mask, *size),
+    )
 
 
 def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Shrink (H, W) or (H, W, C) uint8 to height x width: exact mean over each new pixel's area, rounded.
+    """Shrink (H, W) or (H, W, C) uint8 to height x width: exact mean over each new pixel's area,
+    rounded.
 
-    An integral image, read at the new pixels' edges and differenced, down and then across, a band of rows at a time.
+    An integral image, read at the new pixels' edges and differenced, down and then across, a band
+    of rows at a time.
     """
     if pixels.shape[:2] == (height, width):
         return pixels
@@ -117,7 +130,9 @@ def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
         mean = _differences(integral, lines, rows, part[edges]) * (height / len(pixels))
         columns = mean.swapaxes(0, 1)
         integral_across = np.concatenate([np.zeros_like(columns[:1]), np.cumsum(columns, axis=0)])
-        mean = _differences(integral_across, columns, *_edges(len(columns), width)) * (width / len(columns))
+        mean = _differences(integral_across, columns, *_edges(len(columns), width)) * (
+            width / len(columns)
+        )
         small[edges.start : edges.stop - 1] = mean.swapaxes(0, 1) + 0.5
         above = integral[rows[-1]][None]
     return small
@@ -130,13 +145,17 @@ def _edges(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
     return whole, edges - whole
 
 
-def _differences(integral: np.ndarray, lines: np.ndarray, whole: np.ndarray, part: np.ndarray) -> np.ndarray:
+def _differences(
+    integral: np.ndarray, lines: np.ndarray, whole: np.ndarray, part: np.ndarray
+) -> np.ndarray:
     """Sums of `lines` between consecutive edges, from their integral."""
     at_edges = integral[whole] + part.reshape(-1, *[1] * (lines.ndim - 1)) * lines[whole]
     return np.diff(at_edges, axis=0)
 
 
-def _in_bands(pixels: np.ndarray, channels: int, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _in_bands(
+    pixels: np.ndarray, channels: int, convert: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
     """(H, W, channels) uint8 of `convert` applied to the rows of an image, some at a time."""
     converted = np.empty((*pixels.shape[:2], channels), np.uint8)
     step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))
@@ -152,14 +171,21 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
         _require_regular(path)
         with Image.open(path, formats=FORMATS) as image:
             stored, size = image.size, _displayed_size(image)
-            if expected in (stored, size) and is_image_size(*expected):  # before any pixel is unpacked
+            # before any pixel is unpacked
+            if expected in (stored, size) and is_image_size(*expected):
                 convert = _conversion(image, path) if kind == "image" else None
-                turned = ImageOps.exif_transpose(image) if size == expected and _orientation(image) != 1 else image
+                turned = (
+                    ImageOps.exif_transpose(image)
+                    if size == expected and _orientation(image) != 1
+                    else image
+                )
                 return _as_uint8(turned if convert is None else convert(turned))
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
     if size == expected:
-        raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, more than are read ({MAX_IMAGE_PIXELS})")
+        raise StgaError(
+            f"{path}: has {size[0]} x {size[1]} pixels, more than are read ({MAX_IMAGE_PIXELS})"
+        )
     camera = f"the camera of {view.name} has {expected[0]} x {expected[1]}"
     if kind == "mask":
         camera = f"the image {view.image} and its camera have {expected[0]} x {expected[1]}"
@@ -172,7 +198,8 @@ def _displayed_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF's, 1 where there is none. Pillow turns TIFF by itself; a PNG's is not looked for behind its pixels."""
+    """EXIF's, 1 where there is none. Pillow turns TIFF by itself; a PNG's is not looked for behind
+    its pixels."""
     if image.format == "TIFF" or "exif" not in image.info:
         return 1
     try:
@@ -183,16 +210,24 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _conversion(image: Image.Image, path: Path) -> Callable[[Image.Image], Image.Image] | None:
-    """How the image's colors become sRGB, None where they are: by cICP, else its profile, else gAMA."""
+    """How the image's colors become sRGB, None where they are: by cICP, else its profile, else
+    gAMA."""
     if image.mode not in ("RGB", "RGBA", "CMYK"):
         return None
     codes = _cicp(path) if image.format == "PNG" else None
     if codes is not None:
-        return None if is_srgb(*codes) else partial(_by_pixels, lambda pixels: to_srgb(pixels, *codes))
+        return (
+            None if is_srgb(*codes) else partial(_by_pixels, lambda pixels: to_srgb(pixels, *codes))
+        )
     if image.info.get("icc_profile"):
         return _by_profile(image.info["icc_profile"])
     gamma = image.info.get("gamma")
-    if image.format != "PNG" or "srgb" in image.info or not isinstance(gamma, float) or not gamma > 0:
+    if (
+        image.format != "PNG"
+        or "srgb" in image.info
+        or not isinstance(gamma, float)
+        or not gamma > 0
+    ):
         return None
     if abs(gamma - SRGB_GAMMA) <= GAMMA_TOLERANCE:
         return None
@@ -217,7 +252,9 @@ def _by_profile(data: bytes) -> Callable[[Image.Image], Image.Image] | None:
     def convert(image: Image.Image) -> Image.Image:
         mode = "RGB" if image.mode == "CMYK" else image.mode
         try:
-            converted = ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), outputMode=mode)
+            converted = ImageCms.profileToProfile(
+                image, profile, ImageCms.createProfile("sRGB"), outputMode=mode
+            )
         except ImageCms.PyCMSError:  # a profile of another kind of image
             return image
         return image if converted is None else converted
@@ -226,7 +263,8 @@ def _by_profile(data: bytes) -> Callable[[Image.Image], Image.Image] | None:
 
 
 def _cicp(path: Path) -> tuple[int, int] | None:
-    """Codes of primaries and transfer in a PNG's cICP chunk, which stands before the pixels; None without."""
+    """Codes of primaries and transfer in a PNG's cICP chunk, which stands before the pixels; None
+    without."""
     with path.open("rb") as stream:
         if stream.read(8) != PNG_SIGNATURE:
             return None
@@ -246,7 +284,9 @@ def _as_uint8(image: Image.Image) -> np.ndarray:
         wide = np.asarray(image)
         if wide.min(initial=0) < 0 or wide.max(initial=0) > 65535:
             raise ValueError("has more than 16 bits a pixel")
-        return _in_bands(wide, 1, lambda band: (band.astype(np.int64)[..., None] * 255 + 32767) // 65535)[..., 0]
+        return _in_bands(
+            wide, 1, lambda band: (band.astype(np.int64)[..., None] * 255 + 32767) // 65535
+        )[..., 0]
     if image.mode == "F":
         raise ValueError("holds floating-point pixels")
     if image.mode in ("L", "LA", "RGB", "RGBA"):
@@ -255,7 +295,9 @@ def _as_uint8(image: Image.Image) -> np.ndarray:
         return np.asarray(image.convert(named) if named else image)
     if image.mode == "1":
         return np.asarray(image.convert("L"))
-    transparent = image.mode in ("P", "PA", "La", "RGBa") and (image.mode != "P" or "transparency" in image.info)
+    transparent = image.mode in ("P", "PA", "La", "RGBa") and (
+        image.mode != "P" or "transparency" in image.info
+    )
     return np.asarray(image.convert("RGBA" if transparent else "RGB"))
 
 
@@ -267,7 +309,9 @@ def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
 
     def blend(band: np.ndarray) -> np.ndarray:
         alpha = band[..., -1:].astype(np.uint32)
-        return np.asarray((band[..., :-1] * alpha + np.array(background, np.uint32) * (255 - alpha) + 127) // 255)
+        return np.asarray(
+            (band[..., :-1] * alpha + np.array(background, np.uint32) * (255 - alpha) + 127) // 255
+        )
 
     return _in_bands(pixels, 3, blend)
 

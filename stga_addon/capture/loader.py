@@ -18,7 +18,8 @@ Preparation = Callable[[View, np.ndarray, np.ndarray | None], tuple[np.ndarray, 
 
 
 class LoadedView(NamedTuple):
-    """A view with its image (H, W, 3) uint8, mask (H, W) uint8 and mesh (V, 3), which are None if there is none."""
+    """A view with its image (H, W, 3) uint8, mask (H, W) uint8 and mesh (V, 3), which are None if
+    there is none."""
 
     view: View
     image: np.ndarray
@@ -33,16 +34,20 @@ class LoadedView(NamedTuple):
 class ViewLoader:
     """Iterator over the `LoadedView` of each of `views`, read ahead by a thread.
 
-    views    consumed in the thread, only as far ahead as the queue allows; may be endless, must not block
-    scale    position in `views` -> image scale in (0, 1], for coarse-to-fine; the yielded view's camera is scaled too
-    prepare  (view, image, mask) -> image and mask to yield instead, applied once per image read; None: those read
+    views    consumed in the thread, only as far ahead as the queue allows; may be endless, must not
+             block
+    scale    position in `views` -> image scale in (0, 1], for coarse-to-fine; the yielded view's
+             camera is scaled too
+    prepare  (view, image, mask) -> image and mask to yield instead, applied once per image read;
+             None: those read
     mesh     timestep -> mesh (V, 3), read in the thread as well; None yields no meshes
-    queue_bytes, cache_bytes  bounds on the views that are ready (at least one) and on decoded images that are kept for
+    queue_bytes, cache_bytes  bounds on the views that are ready (at least one) and on decoded
+                              images that are kept for
              later epochs; memory does not depend on the length of the sequence
     waited_s seconds that the consumer has waited so far
 
-    Arrays are read-only and shared with the cache. An exception in the thread is raised where its view would have
-    come. Use as a context manager, or call `close`.
+    Arrays are read-only and shared with the cache. An exception in the thread is raised where its
+    view would have come. Use as a context manager, or call `close`.
     """
 
     def __init__(
@@ -58,8 +63,9 @@ class ViewLoader:
         self.waited_s = 0.0
         self._scale, self._background, self._prepare, self._mesh = scale, background, prepare, mesh
         self._queue_bytes = queue_bytes
-        # The first views of one scale. They come in random order, each once per epoch: one evicted to make room would
-        # be needed sooner than what replaces it, so nothing is evicted until another scale is asked for.
+        # The first views of one scale. They come in random order, each once per epoch: one evicted
+        # to make room would be needed sooner than what replaces it, so nothing is evicted until
+        # another scale is asked for.
         self._cache: dict[tuple[Path, Path | None, int, int, float], LoadedView] = {}
         self._cache_bytes, self._cached_bytes, self._cached_scale = cache_bytes, 0, 1.0
         self._ready: deque[LoadedView] = deque()
@@ -67,7 +73,9 @@ class ViewLoader:
         self._error: BaseException | None = None
         self._finished = self._closed = False
         self._changed = Condition()
-        self._thread = Thread(target=self._work, args=(iter(views),), name="view loader", daemon=True)
+        self._thread = Thread(
+            target=self._work, args=(iter(views),), name="view loader", daemon=True
+        )
         self._thread.start()
 
     def __iter__(self) -> Iterator[LoadedView]:
@@ -91,7 +99,10 @@ class ViewLoader:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -125,7 +136,9 @@ class ViewLoader:
         size = loaded.nbytes
         with self._changed:
             self._changed.wait_for(
-                lambda: self._closed or not self._ready or self._ready_bytes + size <= self._queue_bytes
+                lambda: (
+                    self._closed or not self._ready or self._ready_bytes + size <= self._queue_bytes
+                )
             )
             if self._closed:
                 return False

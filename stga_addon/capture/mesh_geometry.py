@@ -1,4 +1,5 @@
-"""Geometry of triangle meshes: normals, connected parts, rigid alignment, and which triangle a camera's pixels show."""
+"""Geometry of triangle meshes: normals, connected parts, rigid alignment, and which triangle a
+camera's pixels show."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,9 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals, weighted by the area of triangles; 0 where a vertex has none."""
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(n, 3), len(vertices)) for n in normal.T], axis=-1)
+    total = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(n, 3), len(vertices)) for n in normal.T], axis=-1
+    )
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20))
 
 
@@ -53,11 +56,13 @@ class Similarity:
 
 
 def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    """The mesh (V, 3) moved rigidly onto the neutral mesh (V, 3), without scale (STGA, selective training).
+    """The mesh (V, 3) moved rigidly onto the neutral mesh (V, 3), without scale (STGA, selective
+    training).
 
-    A robust Procrustes fit: vertices that the expression moves, such as those of an open jaw, get hardly any weight,
-    provided that less than half of all vertices move against the skull. A plain least-squares fit would tilt the head.
-    The neutral mesh must have an extent (`meshes.check_extent`).
+    A robust Procrustes fit: vertices that the expression moves, such as those of an open jaw, get
+    hardly any weight, provided that less than half of all vertices move against the skull. A plain
+    least-squares fit would tilt the head. The neutral mesh must have an extent
+    (`meshes.check_extent`).
     """
     size = np.linalg.norm(np.ptp(neutral, axis=0))
     weights = np.ones(len(mesh))
@@ -74,8 +79,11 @@ def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     return np.asarray(fitted)
 
 
-def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and translation (3,) with least Σ w·|R·source + t − target|² (Kabsch); points (N, 3)."""
+def weighted_procrustes(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and translation (3,) with least Σ w·|R·source + t − target|² (Kabsch); points
+    (N, 3)."""
     share = (weights / weights.sum())[:, None]
     source_center, target_center = (share * source).sum(0), (share * target).sum(0)
     u, _, vt = np.linalg.svd((target - target_center).T @ (share * (source - source_center)))
@@ -84,7 +92,8 @@ def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndar
 
 
 def similarity(source: np.ndarray, target: np.ndarray, metric: bool = False) -> Similarity:
-    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not coincide (Umeyama).
+    """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not
+    coincide (Umeyama).
 
     metric: of those with a scale of 1.
     """
@@ -100,11 +109,14 @@ MIN_DEPTH_M = 0.01
 """Triangles nearer to the camera's plane, or behind it, are not drawn."""
 
 
-def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """What a camera sees of a mesh: triangle (H, W) int32, -1 for none, and barycentric coordinates (H, W, 3).
+def rasterize(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a camera sees of a mesh: triangle (H, W) int32, -1 for none, and barycentric coordinates
+    (H, W, 3).
 
-    Both sides of a triangle are visible. Triangles that reach behind the camera are left out; barycentric coordinates
-    are those in the image, without perspective.
+    Both sides of a triangle are visible. Triangles that reach behind the camera are left out;
+    barycentric coordinates are those in the image, without perspective.
     """
     flat, depth = camera.project(vertices)
     inverse_depth = 1 / np.where(depth > 0, depth, np.nan)[faces]
@@ -119,7 +131,8 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[
         closeness = _at(closeness_slopes[face], x, y)
         pixel = y * camera.width + x
         np.maximum.at(nearest, pixel, closeness)
-        wins = (closeness > 0) & (closeness == nearest[pixel])  # of several triangles at one depth, the last
+        # of several triangles at one depth, the last
+        wins = (closeness > 0) & (closeness == nearest[pixel])
         owner[pixel[wins]] = face[wins]
     shown = np.flatnonzero(owner >= 0)
     triangle, weights = np.full(len(nearest), -1, np.int32), np.zeros((len(nearest), 3))
@@ -144,7 +157,8 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
 
 
 def _chunks(corners: np.ndarray, camera: Camera) -> list[np.ndarray]:
-    """Triangles (T, 3, 2) that may show a pixel, in groups whose bounding boxes hold about CHUNK_PIXELS."""
+    """Triangles (T, 3, 2) that may show a pixel, in groups whose bounding boxes hold about
+    CHUNK_PIXELS."""
     low, high = corners.min(1), corners.max(1)
     size = np.minimum(high, [camera.width, camera.height]) - np.maximum(low, 0)
     drawn = np.flatnonzero((size >= 0).all(1))
@@ -152,35 +166,45 @@ def _chunks(corners: np.ndarray, camera: Camera) -> list[np.ndarray]:
     return np.split(drawn, np.flatnonzero(np.diff(groups)) + 1)
 
 
-def _covered(group: np.ndarray, corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _covered(
+    group: np.ndarray, corners: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangle, x and y of each pixel center that lies in a triangle of the group, or on its edge.
 
     Pixel by pixel along the lines of the image that cross a triangle, between its edges.
     """
-    face, y = _counted(group, *_whole(corners[group, :, 1].min(1), corners[group, :, 1].max(1), camera.height))
+    face, y = _counted(
+        group, *_whole(corners[group, :, 1].min(1), corners[group, :, 1].max(1), camera.height)
+    )
     left, right = _crossings(corners, face, y + 0.5)
     line, x = _counted(np.arange(len(face)), *_whole(left, right, camera.width))
     return face[line], x, y[line]
 
 
 def _whole(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first pixel with its center from `low` to `high`, inside an image of this size, and how many there are."""
+    """The first pixel with its center from `low` to `high`, inside an image of this size, and how
+    many there are."""
     first = np.ceil(np.clip(low, 0, size + 1) - 0.5).astype(np.int64)
     last = np.floor(np.clip(high, -1, size) - 0.5).astype(np.int64)
     return first, np.maximum(np.minimum(last, size - 1) - first + 1, 0)
 
 
-def _counted(values: np.ndarray, first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _counted(
+    values: np.ndarray, first: np.ndarray, count: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Each value `count` times, and numbers that count from its `first`."""
     begin = np.cumsum(count) - count
     return np.repeat(values, count), np.arange(count.sum()) + np.repeat(first - begin, count)
 
 
-def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x (R,) of the leftmost and the rightmost point of a triangle on a line of the image; face, y (R,).
+def _crossings(
+    corners: np.ndarray, face: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """x (R,) of the leftmost and the rightmost point of a triangle on a line of the image; face, y
+    (R,).
 
-    An edge's ends are taken in the order of y, so that two triangles with a common edge agree where it lies to the
-    last bit and leave no pixel between them.
+    An edge's ends are taken in the order of y, so that two triangles with a common edge agree where
+    it lies to the last bit and leave no pixel between them.
     """
     left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
     for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -198,7 +222,8 @@ def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> tuple[np
 
 
 def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
-    """(T, 3, 3): the barycentric coordinate of corner k at pixel (x, y) is [k, 0]·x + [k, 1]·y + [k, 2].
+    """(T, 3, 3): the barycentric coordinate of corner k at pixel (x, y) is [k, 0]·x + [k, 1]·y +
+    [k, 2].
 
     Zero for triangles that are seen edge-on.
     """

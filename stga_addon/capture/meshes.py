@@ -1,4 +1,5 @@
-"""Tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles; regions of triangles."""
+"""Tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles; regions of
+triangles."""
 
 import io
 import re
@@ -45,41 +46,61 @@ MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
 MIN_EXTENT_M = 1e-9
-"""A mesh smaller than this is a point: it has no shape to train on, and no scale to compare motion with."""
+"""A mesh smaller than this is a point: it has no shape to train on, and no scale to compare motion
+with."""
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 meters and triangles (F, 3) int32, in the file's order; polygons become fans.
+    """Vertices (V, 3) float64 meters and triangles (F, 3) int32, in the file's order; polygons
+    become fans.
 
     STL stores no shared vertices, so V is 3F there. A GLB's nodes are placed and joined.
-    Raises StgaError naming the file where it is missing, malformed, not finite or without triangles,
-    collapsed to a point or far outside of any scene.
+    Raises StgaError naming the file where it is missing, malformed, not finite or without
+    triangles, collapsed to a point or far outside of any scene.
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise StgaError(f"{path}: is not a mesh; expected one of {', '.join(MESH_SUFFIXES)}")
     data = read_bytes(path, MAX_MESH_BYTES)
-    vertices, faces = _parse_obj(path, data) if suffix == ".obj" else _parse_with_trimesh(path, data, suffix[1:])
+    vertices, faces = (
+        _parse_obj(path, data) if suffix == ".obj" else _parse_with_trimesh(path, data, suffix[1:])
+    )
     return checked_mesh(path, vertices, faces)
 
 
-def checked_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same arrays as float64 and int32. Raises StgaError where they are no mesh (`read_mesh`)."""
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
-        raise StgaError(f"{path}: holds no triangles; expected vertices with three coordinates, and triangles")
+def checked_mesh(
+    path: Path, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same arrays as float64 and int32. Raises StgaError where they are no mesh
+    (`read_mesh`)."""
+    if (
+        vertices.ndim != 2
+        or vertices.shape[1] != 3
+        or faces.ndim != 2
+        or faces.shape[1] != 3
+        or not len(faces)
+    ):
+        raise StgaError(
+            f"{path}: holds no triangles; expected vertices with three coordinates, and triangles"
+        )
     if not np.isfinite(vertices).all():
         raise StgaError(f"{path}: vertex {np.argwhere(~np.isfinite(vertices))[0, 0]} is not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise StgaError(f"{path}: a triangle names a vertex outside the {len(vertices)} that the file has")
+        raise StgaError(
+            f"{path}: a triangle names a vertex outside the {len(vertices)} that the file has"
+        )
     vertices = np.array(vertices, np.float64)
     check_extent(str(path), vertices)
     return vertices, np.array(faces, np.int32)
 
 
 def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
-    """The same vertices (V, 3). Raises StgaError, beginning with `source`, for a point and for what lies far away."""
+    """The same vertices (V, 3). Raises StgaError, beginning with `source`, for a point and for what
+    lies far away."""
     if not np.abs(vertices).max() <= MAX_COORDINATE_M:  # also where it is not a number
-        raise StgaError(f"{source}: the mesh reaches farther than {MAX_COORDINATE_M:g} m from the origin")
+        raise StgaError(
+            f"{source}: the mesh reaches farther than {MAX_COORDINATE_M:g} m from the origin"
+        )
     if np.ptp(vertices, axis=0).max() < MIN_EXTENT_M:
         raise StgaError(f"{source}: all vertices of the mesh lie in one point; expected a head")
     return vertices
@@ -94,7 +115,8 @@ def tracked_meshes(
 ) -> Callable[[int], np.ndarray]:
     """timestep -> its vertices (V, 3), parsed when called and cached.
 
-    Raises StgaError where a file has not exactly the `count` vertices and the `faces` of the file `canonical`.
+    Raises StgaError where a file has not exactly the `count` vertices and the `faces` of the file
+    `canonical`.
     """
 
     def mesh(timestep: int) -> np.ndarray:
@@ -121,7 +143,8 @@ def tracked_meshes(
 
 
 def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
-    """The same function with its latest results kept, read-only, within 8 MiB; `vertices` says how large one is."""
+    """The same function with its latest results kept, read-only, within 8 MiB; `vertices` says how
+    large one is."""
 
     @lru_cache(maxsize=max(2, CACHE_BYTES // (24 * max(1, vertices))))
     def kept(timestep: int) -> np.ndarray:
@@ -135,12 +158,15 @@ def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[
 def file_of(files: Mapping[int, Path], timestep: int) -> Path:
     """The timestep's file. Raises StgaError where there is none, naming the range there is."""
     if timestep not in files:
-        raise StgaError(f"timestep {timestep} has no tracked mesh; the capture has {min(files)} to {max(files)}")
+        raise StgaError(
+            f"timestep {timestep} has no tracked mesh; the capture has {min(files)} to {max(files)}"
+        )
     return files[timestep]
 
 
 def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.ndarray]:
-    """Region name -> (F,) bool from a JSON file of vertex indices: a triangle belongs when its three corners do.
+    """Region name -> (F,) bool from a JSON file of vertex indices: a triangle belongs when its
+    three corners do.
 
     Raises StgaError naming the file and the region.
     """
@@ -148,8 +174,12 @@ def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.n
     if not isinstance(values, dict):
         raise StgaError(f"{path}: expected an object: region name -> list of vertex indices")
     for name, value in values.items():
-        if not isinstance(value, list) or not all(type(index) is int and 0 <= index < vertices for index in value):
-            raise StgaError(f"{path}: {name}: expected a list of vertex indices from 0 to {vertices - 1}")
+        if not isinstance(value, list) or not all(
+            type(index) is int and 0 <= index < vertices for index in value
+        ):
+            raise StgaError(
+                f"{path}: {name}: expected a list of vertex indices from 0 to {vertices - 1}"
+            )
     return {name: faces_within(faces, np.array(value, np.int64)) for name, value in values.items()}
 
 
@@ -157,7 +187,9 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
     try:
         import trimesh
     except ImportError as error:
-        raise StgaError(f"{path}: reading {file_type.upper()} needs the Python package trimesh") from error
+        raise StgaError(
+            f"{path}: reading {file_type.upper()} needs the Python package trimesh"
+        ) from error
     try:
         if file_type == "ply":
             _check_ply(data)
@@ -166,23 +198,28 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
         with np.errstate(all="ignore"):
             # From memory, so that a mesh cannot have other files (textures, buffers) read.
             options = {"skip_materials": True} if file_type == "glb" else {}
-            mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False, **options)
+            mesh = trimesh.load_mesh(
+                io.BytesIO(data), file_type=file_type, process=False, **options
+            )
             return np.asarray(mesh.vertices), np.asarray(mesh.faces)
     except Exception as error:  # trimesh's parsers raise any kind of error for a bad file
         raise StgaError(f"{path}: is not a readable {file_type.upper()} mesh ({error})") from error
 
 
 def _check_ply(data: bytes) -> None:
-    """trimesh allocates what the header promises. Raises ValueError where the file cannot hold it."""
+    """trimesh allocates what the header promises. Raises ValueError where the file cannot hold
+    it."""
     header = data[: max(0, data.find(b"end_header"))]
     for name, count in re.findall(rb"^element\s+(\S+)\s+(\S+)", header, re.MULTILINE):
         if not 0 <= int(count) <= len(data):
-            raise ValueError(f"its {len(data)} bytes cannot hold {int(count)} of {name.decode('latin-1')}")
+            raise ValueError(
+                f"its {len(data)} bytes cannot hold {int(count)} of {name.decode('latin-1')}"
+            )
 
 
 def _check_glb(data: bytes) -> None:
-    """trimesh allocates what accessors promise, and follows nodes without end. Raises ValueError where that is more
-    than the file can hold, and where nodes are no trees."""
+    """trimesh allocates what accessors promise, and follows nodes without end. Raises ValueError
+    where that is more than the file can hold, and where nodes are no trees."""
     document, _ = glb_chunks(data)
     nodes = document.get("nodes", [])
     counts = [accessor["count"] for accessor in document.get("accessors", [])]
@@ -200,7 +237,8 @@ def _check_glb(data: bytes) -> None:
 
 
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Own parser, because trimesh regroups and splits the vertices of an OBJ with several materials or objects."""
+    """Own parser, because trimesh regroups and splits the vertices of an OBJ with several materials
+    or objects."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     points = [n for n, line in enumerate(lines) if line.startswith((b"v ", b"v\t"))]
     polygons = [n for n, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]
@@ -210,7 +248,9 @@ def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
         raise StgaError(f"{path}: a vertex line does not hold three numbers") from error
     text = b"\n".join([lines[n] for n in polygons])
     try:
-        faces = _triangles(text, tuple(np.searchsorted(points, polygons)) if b"-" in text else (0,) * len(polygons))
+        faces = _triangles(
+            text, tuple(np.searchsorted(points, polygons)) if b"-" in text else (0,) * len(polygons)
+        )
     except (ValueError, OverflowError) as error:
         raise StgaError(f"{path}: a face line is malformed ({error})") from error
     return vertices, faces
@@ -218,15 +258,19 @@ def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
-    """(F, 3) of an OBJ's face lines, polygons as fans; cached, because all files of a sequence have the same lines.
+    """(F, 3) of an OBJ's face lines, polygons as fans; cached, because all files of a sequence have
+    the same lines.
 
-    OBJ counts vertices from 1 up, or backwards from the latest of the `earlier` ones of each line. Raises ValueError.
+    OBJ counts vertices from 1 up, or backwards from the latest of the `earlier` ones of each line.
+    Raises ValueError.
     """
     corners = [line.split()[1:] for line in text.splitlines()]
     count = np.array([len(words) for words in corners], int)
     if (count < 3).any():
         raise ValueError("fewer than three corners")
-    index = np.array([int(word.partition(b"/")[0]) for words in corners for word in words], np.int64)
+    index = np.array(
+        [int(word.partition(b"/")[0]) for words in corners for word in words], np.int64
+    )
     if (index == 0).any():
         raise ValueError("vertex 0, but OBJ counts from 1")
     index = np.where(index > 0, index - 1, np.repeat(np.array(earlier, int), count) + index)
@@ -249,7 +293,8 @@ def is_region_file(name: str) -> bool:
 
 
 def find_region(capture: Capture, name: str) -> np.ndarray:
-    """(F,) bool: a region of the capture, a vertex mask of FLAME, or the triangles of a region file.
+    """(F,) bool: a region of the capture, a vertex mask of FLAME, or the triangles of a region
+    file.
 
     Raises StgaError where there is none, or it holds no triangle.
     """
@@ -268,7 +313,11 @@ def _find(capture: Capture, name: str) -> np.ndarray:
     path = Path(name)
     if path.suffix.lower() == ".npz":
         weights, expected = read_npz(path).get(WEIGHTS), (len(capture.faces),)
-        if weights is None or weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != expected:
+        if (
+            weights is None
+            or weights.dtype not in (np.float32, np.float64, np.bool_)
+            or weights.shape != expected
+        ):
             found = "no such array" if weights is None else f"{weights.dtype} {weights.shape}"
             raise StgaError(
                 f"{path}: expected '{WEIGHTS}', one number from 0 to 1 per triangle {expected}, found {found}"
@@ -278,4 +327,6 @@ def _find(capture: Capture, name: str) -> np.ndarray:
         regions = read_regions(path, capture.faces, len(capture.neutral))
         return np.asarray(np.any([np.zeros(len(capture.faces), bool), *regions.values()], axis=0))
     known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
-    raise StgaError(f"region '{name}': is neither a region of the capture ({known}) nor an .npz or .json file")
+    raise StgaError(
+        f"region '{name}': is neither a region of the capture ({known}) nor an .npz or .json file"
+    )

@@ -1,4 +1,5 @@
-"""Data model of a capture, independent of its layout on disk; its summary in text; several takes as one capture."""
+"""Data model of a capture, independent of its layout on disk; its summary in text; several takes as
+one capture."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +33,8 @@ class View:
 
 
 ViewExposure = Callable[[View], np.ndarray | None]
-"""View -> gain and offset (2, 3), in levels, of red, green and blue in its image; None where they are not known."""
+"""View -> gain and offset (2, 3), in levels, of red, green and blue in its image; None where they
+are not known."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +47,14 @@ class Capture:
     timesteps  all timesteps that have a mesh, ascending
     regions    key region name -> (F,) bool
     mesh       timestep -> (V, 3) float64, the tracked mesh in world space, read on demand
-    expression_mesh  (timestep, zero_pose) -> (V, 3) float64 without rigid head motion (STGA, selective training)
+    expression_mesh  (timestep, zero_pose) -> (V, 3) float64 without rigid head motion (STGA,
+                     selective training)
     flame      the parameters and model behind the meshes, for FLAME captures
     flame_file the model's file; None without one
     given_selection  timestep -> (F,) bool where the capture comes with a selection
     warnings   one sentence each
-    fps        timesteps per second, counted by their numbers: with 60, timestep 30 was recorded 0.5 s after timestep 0,
-               also where those between are missing; None where unknown
+    fps        timesteps per second, counted by their numbers: with 60, timestep 30 was recorded 0.5
+               s after timestep 0, also where those between are missing; None where unknown
     """
 
     root: Path
@@ -71,7 +74,8 @@ class Capture:
 
 
 def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
-    """At most `limit` of the items, such as views or timesteps: the first, the last, and those evenly between."""
+    """At most `limit` of the items, such as views or timesteps: the first, the last, and those
+    evenly between."""
     if len(items) <= limit:
         return list(items)
     return [items[n] for n in np.linspace(0, len(items) - 1, limit).round().astype(int)]
@@ -79,7 +83,10 @@ def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
 
 def parts_of(timesteps: Sequence[int], limit: int) -> list[list[int]]:
     """Consecutive parts of at most `limit` timesteps, the same on every machine; at least one."""
-    return [part.tolist() for part in np.array_split(np.array(timesteps), max(1, -(-len(timesteps) // limit)))]
+    return [
+        part.tolist()
+        for part in np.array_split(np.array(timesteps), max(1, -(-len(timesteps) // limit)))
+    ]
 
 
 def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
@@ -92,19 +99,35 @@ def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
         ("cameras", format_ranges(sorted({view.camera_index for view in views}))),
         ("image size", ", ".join(f"{width} x {height}" for width, height in sizes)),
         ("masks", f"{masked} of {len(views)} views"),
-        ("splits", "; ".join(f"{name} {_split(split)}" for name, split in capture.views.items() if split)),
+        (
+            "splits",
+            "; ".join(f"{name} {_split(split)}" for name, split in capture.views.items() if split),
+        ),
     ]
-    lines += recorded if views else [("cameras", "none: can be imported and animated, not trained on")]
-    regions = [f"{name} {int(np.count_nonzero(members))}" for name, members in capture.regions.items()]
+    lines += (
+        recorded if views else [("cameras", "none: can be imported and animated, not trained on")]
+    )
+    regions = [
+        f"{name} {int(np.count_nonzero(members))}" for name, members in capture.regions.items()
+    ]
     lines += [
         ("timesteps", format_ranges(capture.timesteps)),
-        *([("frame rate", f"{capture.fps:g} frames per second")] if capture.fps is not None else []),
+        *(
+            [("frame rate", f"{capture.fps:g} frames per second")]
+            if capture.fps is not None
+            else []
+        ),
         ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
         ("regions", ", ".join(regions) + " triangles" if regions else "none"),
     ]
     if capture.given_selection:
         shares = [float(np.mean(selected)) for selected in capture.given_selection.values()]
-        lines.append(("given selection", f"{len(shares)} timesteps, {np.mean(shares):.1%} of the triangles on average"))
+        lines.append(
+            (
+                "given selection",
+                f"{len(shares)} timesteps, {np.mean(shares):.1%} of the triangles on average",
+            )
+        )
     return lines + _flame(capture) + [("warning", warning) for warning in capture.warnings]
 
 
@@ -132,14 +155,21 @@ def _flame(capture: Capture) -> list[tuple[str, str]]:
         return []
     dynamic = capture.flame.frame(capture.flame.timesteps[0]).dynamic_offset
     offsets = (("static offset", capture.flame.static_offset), ("dynamic offset", dynamic))
-    largest = [(name, None if o is None else 1000 * float(np.linalg.norm(o, axis=1).max())) for name, o in offsets]
-    return [(name, "none" if offset is None else f"up to {offset:.1f} mm") for name, offset in largest]
+    largest = [
+        (name, None if o is None else 1000 * float(np.linalg.norm(o, axis=1).max()))
+        for name, o in offsets
+    ]
+    return [
+        (name, "none" if offset is None else f"up to {offset:.1f} mm") for name, offset in largest
+    ]
 
 
 MAX_NEUTRAL_DIFFERENCE_M = 1e-4
-"""Largest distance between the neutral meshes of two takes of one head: trackers write rounded shape coefficients."""
+"""Largest distance between the neutral meshes of two takes of one head: trackers write rounded
+shape coefficients."""
 MAX_SCALE_FACTOR = 5.0
-"""Largest ratio of the head's sizes in two takes; another unit than the meter makes it 10 or more."""
+"""Largest ratio of the head's sizes in two takes; another unit than the meter makes it 10 or
+more."""
 COMPARED = 8
 """Views, and timesteps, of a take whose scale is looked at."""
 
@@ -150,10 +180,11 @@ RATE_TOLERANCE = 0.01
 def join_takes(takes: Sequence[Capture]) -> Capture:
     """One capture of all takes: the timesteps of each follow those of the take before.
 
-    A timestep of take n becomes `first_timesteps(takes)[n]` + timestep, and the first take keeps its own. Neutral mesh
-    and regions are the first take's. A camera of a later take keeps its index where the first take has the same
-    camera under it, so that exposure is corrected alike. The frame rate is the one of all takes that have one, None
-    where they differ. Raises StgaError where the takes are not of one head.
+    A timestep of take n becomes `first_timesteps(takes)[n]` + timestep, and the first take keeps
+    its own. Neutral mesh and regions are the first take's. A camera of a later take keeps its index
+    where the first take has the same camera under it, so that exposure is corrected alike. The
+    frame rate is the one of all takes that have one, None where they differ. Raises StgaError where
+    the takes are not of one head.
     """
     first = takes[0]
     if len(takes) == 1:
@@ -176,11 +207,15 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
         timesteps=timesteps,
         mesh=_dispatch([take.mesh for take in takes], starts),
         expression_mesh=_dispatch([take.expression_mesh for take in takes], starts),
-        flame=replace(flame[0], timesteps=timesteps, frame=_dispatch([each.frame for each in flame], starts))
+        flame=replace(
+            flame[0], timesteps=timesteps, frame=_dispatch([each.frame for each in flame], starts)
+        )
         if len(flame) == len(takes)
         else None,
         given_selection={
-            start + timestep: faces for take, start in numbered for timestep, faces in take.given_selection.items()
+            start + timestep: faces
+            for take, start in numbered
+            for timestep, faces in take.given_selection.items()
         },
         warnings=tuple(dict.fromkeys(warning for take in takes for warning in take.warnings)),
         fps=rates[0] if rates and max(rates) <= (1 + RATE_TOLERANCE) * min(rates) else None,
@@ -208,9 +243,11 @@ def require_same_head(first: Capture, other: Capture) -> None:
 
 
 def require_same_scale(first: Capture, other: Capture) -> None:
-    """Raise StgaError where `other`, a take of the same head, has meshes or cameras in another unit of length.
+    """Raise StgaError where `other`, a take of the same head, has meshes or cameras in another unit
+    of length.
 
-    Its tracked meshes must be as large as the neutral one, and the head must take a similar share of the images.
+    Its tracked meshes must be as large as the neutral one, and the head must take a similar share
+    of the images.
     """
     posed = [_extent(other.mesh(timestep)) for timestep in evenly_spread(other.timesteps, COMPARED)]
     factor = float(np.median(posed)) / _extent(other.neutral)
@@ -242,31 +279,50 @@ def _share_of_images(take: Capture) -> float:
     return float(np.median(shares))
 
 
-def _first_free_index(take: Capture, start: int, first: Capture, joined: Mapping[str, Sequence[View]]) -> int:
-    """What is added to the indices of a take's own cameras, so that none is that of a camera in `joined`.
+def _first_free_index(
+    take: Capture, start: int, first: Capture, joined: Mapping[str, Sequence[View]]
+) -> int:
+    """What is added to the indices of a take's own cameras, so that none is that of a camera in
+    `joined`.
 
     Where possible it counts from the take's start: the identities of runs hold these indices.
     """
     taken = {view.camera_index for members in joined.values() for view in members}
-    free = 1 + start + max((view.camera_index for members in first.views.values() for view in members), default=-1)
-    collides = any(free + view.camera_index in taken for members in take.views.values() for view in members)
+    free = (
+        1
+        + start
+        + max(
+            (view.camera_index for members in first.views.values() for view in members), default=-1
+        )
+    )
+    collides = any(
+        free + view.camera_index in taken for members in take.views.values() for view in members
+    )
     return 1 + max(taken) if collides else free
 
 
 def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
-    """The views at the joined timesteps; `free` is added to indices of cameras that the first take does not have."""
-    cameras = {view.camera_index: view.camera for members in first.views.values() for view in members}
+    """The views at the joined timesteps; `free` is added to indices of cameras that the first take
+    does not have."""
+    cameras = {
+        view.camera_index: view.camera for members in first.views.values() for view in members
+    }
     shifted = []
     for view in views:
         known, camera = cameras.get(view.camera_index), view.camera
-        same = known is not None and np.allclose(known.world_to_camera, camera.world_to_camera, atol=1e-6)
+        same = known is not None and np.allclose(
+            known.world_to_camera, camera.world_to_camera, atol=1e-6
+        )
         index = view.camera_index if start == 0 or same else free + view.camera_index
         shifted.append(replace(view, timestep=start + view.timestep, camera_index=index))
     return shifted
 
 
-def _dispatch(functions: Sequence[Callable[..., Item]], starts: Sequence[int]) -> Callable[..., Item]:
-    """timestep of the joined capture -> what the function of its take says about its own timestep."""
+def _dispatch(
+    functions: Sequence[Callable[..., Item]], starts: Sequence[int]
+) -> Callable[..., Item]:
+    """timestep of the joined capture -> what the function of its take says about its own
+    timestep."""
 
     def of(timestep: int, *rest: str) -> Item:
         take = bisect_right(starts, timestep) - 1

@@ -55,16 +55,19 @@ MAX_COMPARED_VIEWS = 4
 MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
 
 
-def open_capture(folder: Path, flame: Path | None = None, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Capture:
-    """Open a capture: cameras and file names now, images and tracked meshes when they are asked for.
+def open_capture(
+    folder: Path, flame: Path | None = None, principal_point: str = DEFAULT_PRINCIPAL_POINT
+) -> Capture:
+    """Open a capture: cameras and file names now, images and tracked meshes when they are asked
+    for.
 
     An .npz file in place of a folder is a FLAME motion: a capture without views.
 
-    Layouts: "flame" (VHAP and GaussianAvatars; needs the model file `flame`), "mesh" (`mesh_path` per frame, or a
-    bare folder of meshes, which has no views) and "release" (STGA's authors). `principal_point` as in
-    `read_transforms`; `Capture.warnings` says where the masks fit another one better.
-    Raises StgaError in one sentence naming file, field and what was expected, also for any image, mask or tracked
-    file that is missing.
+    Layouts: "flame" (VHAP and GaussianAvatars; needs the model file `flame`), "mesh" (`mesh_path`
+    per frame, or a bare folder of meshes, which has no views) and "release" (STGA's authors).
+    `principal_point` as in `read_transforms`; `Capture.warnings` says where the masks fit another
+    one better. Raises StgaError in one sentence naming file, field and what was expected, also for
+    any image, mask or tracked file that is missing.
     """
     if principal_point not in PRINCIPAL_POINTS:
         raise StgaError(
@@ -73,13 +76,19 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
     if folder.suffix.lower() == ".npz" and isfile(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
-        model_file = BUNDLED_HEAD if EXPRESSION_NAMES in read_npz(path) else _model_file(path, flame)
+        model_file = (
+            BUNDLED_HEAD if EXPRESSION_NAMES in read_npz(path) else _model_file(path, flame)
+        )
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not isdir(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
     root = folder.resolve()
-    transforms = read_splits(root, principal_point) if has_transforms(root) else Transforms({}, None, None)
-    views = {split: tuple(frame.view for frame in frames) for split, frames in transforms.splits.items()}
+    transforms = (
+        read_splits(root, principal_point) if has_transforms(root) else Transforms({}, None, None)
+    )
+    views = {
+        split: tuple(frame.view for frame in frames) for split, frames in transforms.splits.items()
+    }
     _require_files(transforms)
     capture = _open_layout(root, transforms, views, flame)
     warnings = list(capture.warnings)
@@ -88,7 +97,9 @@ def open_capture(folder: Path, flame: Path | None = None, principal_point: str =
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
     if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
-        warnings.append(f"{root}: the neutral mesh measures {size:.3g} m; expected a head of {TYPICAL_HEAD_EXTENT_M} m")
+        warnings.append(
+            f"{root}: the neutral mesh measures {size:.3g} m; expected a head of {TYPICAL_HEAD_EXTENT_M} m"
+        )
     return replace(capture, fps=transforms.fps, warnings=tuple(warnings))
 
 
@@ -100,7 +111,9 @@ def _open_layout(
         return open_flame_capture(root, transforms, views, flame)
     if any(frame.mesh for frame in frames):
         files = tracked_files(frames, "mesh")
-        return _mesh_capture(root, "mesh", files, transforms.canonical_mesh, views, transforms.regions)
+        return _mesh_capture(
+            root, "mesh", files, transforms.canonical_mesh, views, transforms.regions
+        )
     if any((root / "meshes").glob("mesh_*.json")):
         return open_release(root, views)
     if not transforms.splits and mesh_files(root):
@@ -119,19 +132,25 @@ def _require_files(transforms: Transforms) -> None:
     seen: set[Path] = set()
     for frame in transforms.frames:
         names = ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
-        for field, path in zip(names, (frame.view.image, frame.view.mask, frame.mesh, frame.flame), strict=True):
+        for field, path in zip(
+            names, (frame.view.image, frame.view.mask, frame.mesh, frame.flame), strict=True
+        ):
             if path is not None and path not in seen:
                 if not isfile(path):
-                    raise StgaError(f"{path}: does not exist, but {frame.where} names it as its {field}")
+                    raise StgaError(
+                        f"{path}: does not exist, but {frame.where} names it as its {field}"
+                    )
                 seen.add(path)
 
 
-def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str) -> str | None:
+def principal_point_warning(
+    frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str
+) -> str | None:
     """A warning where another convention puts clearly more of the mesh inside the masks, else None.
 
-    Checks a few views in which the conventions differ. Only vertices outside of a mask count: hair and shoulders lie
-    inside the mask but beside the mesh. Without Pillow, which Blender lacks, nothing is checked.
-    Raises StgaError where a mask cannot be read.
+    Checks a few views in which the conventions differ. Only vertices outside of a mask count: hair
+    and shoulders lie inside the mask but beside the mesh. Without Pillow, which Blender lacks,
+    nothing is checked. Raises StgaError where a mask cannot be read.
     """
     if find_spec("PIL") is None:
         return None
@@ -139,7 +158,10 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
 
     apart = []
     for frame in frames:
-        cameras = [with_principal_point(frame.view.camera, frame.principal, name) for name in PRINCIPAL_POINTS]
+        cameras = [
+            with_principal_point(frame.view.camera, frame.principal, name)
+            for name in PRINCIPAL_POINTS
+        ]
         if (np.ptp([(camera.cx, camera.cy) for camera in cameras], axis=0) > 0.5).any():
             apart.append((frame.view, cameras))
     outside = []
@@ -162,7 +184,9 @@ def principal_point_warning(frames: Sequence[Frame], mesh: Callable[[int], np.nd
 def _share_outside(points: np.ndarray, camera: Camera, mask: np.ndarray) -> float:
     pixels, depth = camera.project(points)
     column, row = np.floor(np.clip(pixels, -1, [camera.width, camera.height])).astype(int).T
-    visible = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    visible = (
+        (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    )
     inside = mask[row[visible], column[visible]] > 127
     return 1 - float(inside.sum()) / len(points)
 
@@ -174,24 +198,33 @@ REGIONS_NAME = "regions.json"
 def open_mesh_folder(root: Path) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep.
 
-    Timesteps are the numbers at the end of the names, or the alphabetical order where a name has none. A mesh called
-    `neutral` or `canonical` is the canonical one, and `regions.json` the regions file. Raises StgaError.
+    Timesteps are the numbers at the end of the names, or the alphabetical order where a name has
+    none. A mesh called `neutral` or `canonical` is the canonical one, and `regions.json` the
+    regions file. Raises StgaError.
     """
     meshes = mesh_files(root)
     canonical = next((path for path in meshes if path.stem.lower() in NEUTRAL_NAMES), None)
     tracked = [path for path in meshes if path != canonical]
     if not tracked:
-        raise StgaError(f"{root}: holds no tracked mesh besides {canonical}; expected one file per timestep")
+        raise StgaError(
+            f"{root}: holds no tracked mesh besides {canonical}; expected one file per timestep"
+        )
     numbers = [re.search(r"(\d+)$", path.stem, re.ASCII) for path in tracked]
     numbered = {int(match[1]): path for match, path in zip(numbers, tracked, strict=True) if match}
-    files = dict(sorted(numbered.items())) if len(numbered) == len(tracked) else dict(enumerate(tracked))
+    files = (
+        dict(sorted(numbered.items()))
+        if len(numbered) == len(tracked)
+        else dict(enumerate(tracked))
+    )
     regions = root / REGIONS_NAME
     return _mesh_capture(root, "mesh", files, canonical, {}, regions if regions.is_file() else None)
 
 
 def mesh_files(folder: Path) -> list[Path]:
     """The meshes directly in a folder, by name."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES and path.is_file())
+    return sorted(
+        path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES and path.is_file()
+    )
 
 
 def _mesh_capture(
@@ -206,10 +239,14 @@ def _mesh_capture(
     warnings = []
     if canonical is None:
         canonical = files[min(files)]
-        warnings.append(f"no canonical mesh is given: {canonical.name}, the first timestep, is the neutral mesh")
+        warnings.append(
+            f"no canonical mesh is given: {canonical.name}, the first timestep, is the neutral mesh"
+        )
     neutral, faces = read(canonical)
     if any(path.suffix.lower() == ".stl" for path in (canonical, *files.values())):
-        warnings.append("STL has no shared vertices: of the topology, only the number of triangles can be checked")
+        warnings.append(
+            "STL has no shared vertices: of the topology, only the number of triangles can be checked"
+        )
     regions = {} if regions_file is None else read_regions(regions_file, faces, len(neutral))
     empty = [name for name, members in regions.items() if not members.any()]
     if empty:
@@ -230,24 +267,32 @@ def _mesh_capture(
 
 
 def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
-    """Capture of layout "release": `meshes/mesh_%04d.json` and `training_faces/%04d.npy` by `keyframe`.
+    """Capture of layout "release": `meshes/mesh_%04d.json` and `training_faces/%04d.npy` by
+    `keyframe`.
 
-    The layout names neither a neutral mesh nor regions. Raises StgaError naming the file and the field.
+    The layout names neither a neutral mesh nor regions. Raises StgaError naming the file and the
+    field.
     """
     timesteps = sorted({view.timestep for split in views.values() for view in split})
     files = {timestep: root / "meshes" / f"mesh_{timestep:04d}.json" for timestep in timesteps}
     if not files:
-        raise StgaError(f"{root}: its transforms hold no frame; expected a keyframe for each mesh in {root / 'meshes'}")
+        raise StgaError(
+            f"{root}: its transforms hold no frame; expected a keyframe for each mesh in {root / 'meshes'}"
+        )
     capture = _mesh_capture(root, "release", files, None, views, read=read_soup)
     chosen = {timestep: root / "training_faces" / f"{timestep:04d}.npy" for timestep in timesteps}
     faces = len(capture.faces)
     return replace(
-        capture, given_selection={t: read_face_ids(path, faces) for t, path in chosen.items() if path.is_file()}
+        capture,
+        given_selection={
+            t: read_face_ids(path, faces) for t, path in chosen.items() if path.is_file()
+        },
     )
 
 
 def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]}, meters.
+    """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]},
+    meters.
 
     The layout has no shared vertices. Raises StgaError naming the file and the field.
     """
@@ -255,19 +300,26 @@ def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         corners = np.array([triangle["Vertices"] for triangle in document["triangles"]], np.float64)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise StgaError(f"{path}: triangles: expected a list of objects with Vertices, three points each") from error
+        raise StgaError(
+            f"{path}: triangles: expected a list of objects with Vertices, three points each"
+        ) from error
     if corners.ndim != 3 or corners.shape[1:] != (3, 3):
-        raise StgaError(f"{path}: triangles: expected three Vertices with three coordinates each in every triangle")
+        raise StgaError(
+            f"{path}: triangles: expected three Vertices with three coordinates each in every triangle"
+        )
     return checked_mesh(path, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
 def read_face_ids(path: Path, faces: int) -> np.ndarray:
-    """(F,) bool from a npy file of triangle numbers. Raises StgaError where they are no whole numbers below `faces`."""
+    """(F,) bool from a npy file of triangle numbers. Raises StgaError where they are no whole
+    numbers below `faces`."""
     ids = read_npy(path)
     if ids.dtype.kind not in "iu" or ids.ndim != 1:
         raise StgaError(f"{path}: expected a list of triangle numbers")
     if ids.size and not 0 <= int(ids.min()) <= int(ids.max()) < faces:
-        raise StgaError(f"{path}: names triangles {ids.min()} to {ids.max()}, but the mesh has 0 to {faces - 1}")
+        raise StgaError(
+            f"{path}: names triangles {ids.min()} to {ids.max()}, but the mesh has 0 to {faces - 1}"
+        )
     selected = np.zeros(faces, bool)
     selected[ids] = True
     return selected
@@ -282,14 +334,18 @@ BUNDLED_MODEL = "bundled_head.npz"
 
 
 def open_flame_capture(
-    root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]], model_file: Path | None
+    root: Path,
+    transforms: Transforms,
+    views: Mapping[str, tuple[View, ...]],
+    model_file: Path | None,
 ) -> Capture:
-    """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by timestep.
+    """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by
+    timestep.
 
-    A model with FLAME's published 5023 vertices gets teeth, because VHAP and GaussianAvatars use them; a model of any
-    other size is used as it is. Shape and static offset come from the first timestep.
-    Raises StgaError, also where no model file is given, and none lies in the folder (OWN_MODELS): FLAME's license
-    forbids passing it on.
+    A model with FLAME's published 5023 vertices gets teeth, because VHAP and GaussianAvatars use
+    them; a model of any other size is used as it is. Shape and static offset come from the first
+    timestep. Raises StgaError, also where no model file is given, and none lies in the folder
+    (OWN_MODELS): FLAME's license forbids passing it on.
     """
     model_file = _model_file(root, model_file)
     model = flame_model(model_file)
@@ -297,7 +353,11 @@ def open_flame_capture(
     first = files[min(files)]
     shape, static_offset = read_identity(first, model)
     sequence = FlameSequence(
-        model, shape, static_offset, tuple(files), lambda timestep: read_frame(file_of(files, timestep), model)
+        model,
+        shape,
+        static_offset,
+        tuple(files),
+        lambda timestep: read_frame(file_of(files, timestep), model),
     )
     return sequence_capture(root, sequence, model_file, views)
 
@@ -308,9 +368,13 @@ def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
 
 
 def sequence_capture(
-    root: Path, sequence: FlameSequence, model_file: Path | None, views: Mapping[str, tuple[View, ...]]
+    root: Path,
+    sequence: FlameSequence,
+    model_file: Path | None,
+    views: Mapping[str, tuple[View, ...]],
 ) -> Capture:
-    """The capture of layout "flame" whose meshes a sequence makes; `root` and `model_file` say where it is from."""
+    """The capture of layout "flame" whose meshes a sequence makes; `root` and `model_file` say
+    where it is from."""
     model = sequence.model
     regions = key_regions(model)
     missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): triangles are selected one by one"
@@ -336,13 +400,16 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
 
     return {
         "mesh": cached_meshes(mesh, len(sequence.model.v_template)),
-        "expression_mesh": lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
+        "expression_mesh": lambda timestep, zero_pose: expression_mesh(
+            sequence, timestep, zero_pose
+        ),
         "flame": sequence,
     }
 
 
 def _model_file(root: Path, given: Path | None) -> Path:
-    """The capture's bundled head, else the FLAME model file that is given, else the one in the capture's folder."""
+    """The capture's bundled head, else the FLAME model file that is given, else the one in the
+    capture's folder."""
     if (root / BUNDLED_MODEL).is_file():
         return root / BUNDLED_MODEL
     beside = (root / name for name in OWN_MODELS)
@@ -356,14 +423,20 @@ def _model_file(root: Path, given: Path | None) -> Path:
 
 
 def parameter_files(root: Path, transforms: Transforms) -> dict[int, Path]:
-    """timestep -> parameter file, ascending; without any frames, those in `flame_param`. Raises StgaError."""
+    """timestep -> parameter file, ascending; without any frames, those in `flame_param`. Raises
+    StgaError."""
     frames = transforms.frames
     if any(frame.flame for frame in frames):
         return tracked_files(frames, "flame")
     if frames:
-        return {t: root / PARAMETERS / f"{t:05d}.npz" for t in sorted({frame.view.timestep for frame in frames})}
+        return {
+            t: root / PARAMETERS / f"{t:05d}.npz"
+            for t in sorted({frame.view.timestep for frame in frames})
+        }
     listed = (root / PARAMETERS).glob("*.npz")
     files = {int(path.stem): path for path in listed if re.fullmatch(r"\d+", path.stem, re.ASCII)}
     if not files:
-        raise StgaError(f"{root / PARAMETERS}: holds no parameters; expected one .npz per timestep, such as 00000.npz")
+        raise StgaError(
+            f"{root / PARAMETERS}: holds no parameters; expected one .npz per timestep, such as 00000.npz"
+        )
     return dict(sorted(files.items()))

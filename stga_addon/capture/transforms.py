@@ -47,7 +47,8 @@ class Frame:
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
-    """A camera as an entry of a transforms file has it; cy is counted from the bottom, as VHAP writes it."""
+    """A camera as an entry of a transforms file has it; cy is counted from the bottom, as VHAP
+    writes it."""
     return {
         "transform_matrix": camera.camera_to_world_gl.tolist(),
         "w": camera.width,
@@ -61,7 +62,8 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames of a capture by split, and what the top level says (None where it is missing): files, frame rate."""
+    """All frames of a capture by split, and what the top level says (None where it is missing):
+    files, frame rate."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
@@ -78,35 +80,46 @@ def has_transforms(folder: Path) -> bool:
     return any((folder / name).is_file() for name in ("transforms.json", *map(_split_file, SPLITS)))
 
 
-def read_transforms(path: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> tuple[Frame, ...]:
-    """Read the frames of one transforms file; neither images nor tracked files are opened, nor need they exist.
+def read_transforms(
+    path: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT
+) -> tuple[Frame, ...]:
+    """Read the frames of one transforms file; neither images nor tracked files are opened, nor need
+    they exist.
 
     A frame's own intrinsics take precedence over the top level's, which are wrong in some exports.
-    `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means: "vhap"
-    (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center" (cx and cy are
-    ignored, as GaussianAvatars does). Paths are relative to the file's folder and may leave it only for a
-    sibling folder (union sets of VHAP).
-    Raises StgaError naming the file and the field.
+    `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means:
+    "vhap" (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center"
+    (cx and cy are ignored, as GaussianAvatars does). Paths are relative to the file's folder and
+    may leave it only for a sibling folder (union sets of VHAP). Raises StgaError naming the file
+    and the field.
     """
     return _numbered(_read_frames(path, read_json(path), principal_point))
 
 
 def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Transforms:
-    """Read every split of a capture folder, as `read_transforms` does; `transforms.json` alone is all training.
+    """Read every split of a capture folder, as `read_transforms` does; `transforms.json` alone is
+    all training.
 
     Cameras without `camera_index` are numbered alike in all splits. Raises StgaError.
     """
-    names = {split: _split_file(split) for split in SPLITS if (folder / _split_file(split)).is_file()}
+    names = {
+        split: _split_file(split) for split in SPLITS if (folder / _split_file(split)).is_file()
+    }
     documents = {}
     for split, name in (names or {"train": "transforms.json"}).items():
         values = read_json(folder / name)
         if not isinstance(values, dict):
             raise StgaError(f"{folder / name}: expected a JSON object with the field frames")
         documents[split] = _Record(folder / name, folder.resolve(), "", values)
-    frames = {split: _read_frames(record.path, record.values, principal_point) for split, record in documents.items()}
+    frames = {
+        split: _read_frames(record.path, record.values, principal_point)
+        for split, record in documents.items()
+    }
     rates = [frame_rate(record.path, record.values) for record in documents.values()]
     numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
-    splits = {split: tuple(itertools.islice(numbered, len(frames.get(split, ())))) for split in SPLITS}
+    splits = {
+        split: tuple(itertools.islice(numbered, len(frames.get(split, ())))) for split in SPLITS
+    }
     return Transforms(
         splits,
         canonical_mesh=_first_path(documents.values(), "canonical_mesh_path"),
@@ -116,15 +129,19 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
 
 
 def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
-    """`fps` at the top level of a transforms file; None where it is missing. Raises StgaError naming the file."""
+    """`fps` at the top level of a transforms file; None where it is missing. Raises StgaError
+    naming the file."""
     record = _Record(path, path.parent, "", values)
     return record.number("fps", low=0, high=FPS_LIMIT) if record.has("fps") else None
 
 
 def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:
-    """The camera with the principal point that the file's (cx, cy) mean under the convention (`read_transforms`)."""
+    """The camera with the principal point that the file's (cx, cy) mean under the convention
+    (`read_transforms`)."""
     if convention not in PRINCIPAL_POINTS:
-        raise StgaError(f"principal point convention {convention!r} is not one of {', '.join(PRINCIPAL_POINTS)}")
+        raise StgaError(
+            f"principal point convention {convention!r} is not one of {', '.join(PRINCIPAL_POINTS)}"
+        )
     if convention == "center":
         return replace(camera, cx=camera.width / 2, cy=camera.height / 2)
     cx, cy = written
@@ -141,24 +158,33 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
     for frame in frames:
         path, timestep = getattr(frame, field), frame.view.timestep
         if path is None:
-            raise StgaError(f"{frame.where}.{key}: is missing; expected the tracked file of timestep {timestep}")
+            raise StgaError(
+                f"{frame.where}.{key}: is missing; expected the tracked file of timestep {timestep}"
+            )
         if files.setdefault(timestep, path) != path:
-            raise StgaError(f"{frame.where}.{key}: is {path}, but timestep {timestep} already has {files[timestep]}")
+            raise StgaError(
+                f"{frame.where}.{key}: is {path}, but timestep {timestep} already has {files[timestep]}"
+            )
     return dict(sorted(files.items()))
 
 
 def inside(root: Path, relative: str, where: str) -> Path:
     """Resolve a path of a capture's file against the folder `root` of that file.
 
-    `..` may lead to a sibling of `root`, not further; symbolic links inside the capture are followed.
-    Raises StgaError, beginning with `where`, for absolute paths and for those that lead outside.
+    `..` may lead to a sibling of `root`, not further; symbolic links inside the capture are
+    followed. Raises StgaError, beginning with `where`, for absolute paths and for those that lead
+    outside.
     """
     text = relative.replace("\\", "/")
     parts = posixpath.normpath(text).split("/")
-    absolute = text.startswith("/") or any(":" in part and PureWindowsPath(part).drive for part in parts)
+    absolute = text.startswith("/") or any(
+        ":" in part and PureWindowsPath(part).drive for part in parts
+    )
     if absolute or "\0" in text or parts == ["."]:
         raise StgaError(f"{where}: {shorten(relative)} is not a path of a file relative to {root}")
-    if len(text) > MAX_PATH_CHARACTERS or any(len(part.encode()) > MAX_NAME_BYTES for part in parts):
+    if len(text) > MAX_PATH_CHARACTERS or any(
+        len(part.encode()) > MAX_NAME_BYTES for part in parts
+    ):
         raise StgaError(f"{where}: {shorten(relative)} is longer than a path can be")
     # Behind a first "..", only the name of a sibling may follow.
     if parts[:2] == ["..", ".."] or parts == [".."]:
@@ -168,7 +194,8 @@ def inside(root: Path, relative: str, where: str) -> Path:
 
 @dataclass(frozen=True)
 class _Record:
-    """A JSON object, its file, that file's folder without symbolic links, and its place in the file for messages."""
+    """A JSON object, its file, that file's folder without symbolic links, and its place in the file
+    for messages."""
 
     path: Path
     folder: Path
@@ -190,7 +217,11 @@ class _Record:
             or not low < value < high
             or abs(value) > MAX_NUMBER
         ):
-            limits = [f"{word} {limit:g}" for word, limit in (("above", low), ("below", high)) if math.isfinite(limit)]
+            limits = [
+                f"{word} {limit:g}"
+                for word, limit in (("above", low), ("below", high))
+                if math.isfinite(limit)
+            ]
             expected = " ".join(["a finite number", " and ".join(limits)]).strip()
             raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
         return float(value)
@@ -198,7 +229,9 @@ class _Record:
     def natural(self, key: str) -> int:
         value = self.values[key]
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INDEX_LIMIT:
-            raise StgaError(f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {shorten(value)}")
+            raise StgaError(
+                f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {shorten(value)}"
+            )
         return value
 
     def path_of(self, key: str) -> Path | None:
@@ -225,7 +258,13 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         if not isinstance(entry, dict):
             raise StgaError(f"{path}: frames[{number}]: expected an object, not {shorten(entry)}")
         frames.append(
-            _frame(replace(shared, place=f"frames[{number}].", values=entry), shared, timed, principal_point, cameras)
+            _frame(
+                replace(shared, place=f"frames[{number}].", values=entry),
+                shared,
+                timed,
+                principal_point,
+                cameras,
+            )
         )
     return frames
 
@@ -237,7 +276,8 @@ def _frame(
     principal_point: str,
     cameras: dict[tuple[bytes | float, ...], Camera],
 ) -> Frame:
-    """cameras: those of earlier frames by their numbers in the file, because most frames share theirs."""
+    """cameras: those of earlier frames by their numbers in the file, because most frames share
+    theirs."""
     image = record.path_of("file_path")
     if image is None:
         raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
@@ -245,7 +285,9 @@ def _frame(
         image = image.with_name(image.name + ".png")
     key = _timestep_key(record.values)
     if timed and key is None:
-        raise StgaError(f"{record.where('timestep_index')}: is missing, though other frames have it")
+        raise StgaError(
+            f"{record.where('timestep_index')}: is missing, though other frames have it"
+        )
     width, height = _image_size(record, shared, image)
     written = _principal(record, shared, "cx", width), _principal(record, shared, "cy", height)
     focal = _focal(record, shared, width, height)
@@ -268,31 +310,48 @@ def _frame(
     )
     camera_id = str(record.values["camera_id"]) if record.has("camera_id") else None
     where = record.where("").rstrip(".")
-    return Frame(view, written, camera_id, record.path_of("mesh_path"), record.path_of("flame_param_path"), where)
+    return Frame(
+        view,
+        written,
+        camera_id,
+        record.path_of("mesh_path"),
+        record.path_of("flame_param_path"),
+        where,
+    )
 
 
 def _timestep_key(values: dict[str, Any]) -> str | None:
     """The key of the timestep: VHAP writes timestep_index, the STGA authors' release keyframe."""
-    return next((key for key in ("timestep_index", "keyframe") if values.get(key) is not None), None)
+    return next(
+        (key for key in ("timestep_index", "keyframe") if values.get(key) is not None), None
+    )
 
 
 def _principal(record: _Record, shared: _Record, key: str, size: int) -> float:
     """One coordinate of the principal point as written; the image's center where there is none."""
     source = record if record.has(key) else shared
-    return source.number(key, low=-MAX_FOCAL_PIXELS, high=MAX_FOCAL_PIXELS) if source.has(key) else size / 2
+    return (
+        source.number(key, low=-MAX_FOCAL_PIXELS, high=MAX_FOCAL_PIXELS)
+        if source.has(key)
+        else size / 2
+    )
 
 
 def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int]:
     source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
     if source is None:
         if not isfile(image):
-            raise StgaError(f"{record.where('w')}: w and h are missing, and so is the image {image} to take them from")
+            raise StgaError(
+                f"{record.where('w')}: w and h are missing, and so is the image {image} to take them from"
+            )
         from .images import image_size
 
         return image_size(image)
     width, height = source.number("w", low=0), source.number("h", low=0)
     if not is_image_size(width, height):
-        raise StgaError(f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}")
+        raise StgaError(
+            f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}"
+        )
     return int(width), int(height)
 
 
@@ -300,41 +359,62 @@ def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[f
     focal = _written_focal(record, shared, width, height)
     for name, value in zip(("fl_x", "fl_y"), focal, strict=True):
         if not 1 <= value <= MAX_FOCAL_PIXELS:
-            raise StgaError(f"{record.where(name)}: expected a focal length of 1 to 1e7 pixels, not {value:g}")
+            raise StgaError(
+                f"{record.where(name)}: expected a focal length of 1 to 1e7 pixels, not {value:g}"
+            )
     return focal
 
 
-def _written_focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
+def _written_focal(
+    record: _Record, shared: _Record, width: int, height: int
+) -> tuple[float, float]:
     for source in (record, shared):
         if source.has("fl_x"):
             fl_x = source.number("fl_x", low=0)
         elif source.has("camera_angle_x"):
-            fl_x = width / 2 / math.tan(source.number("camera_angle_x", low=MIN_ANGLE, high=math.pi) / 2)
+            fl_x = (
+                width
+                / 2
+                / math.tan(source.number("camera_angle_x", low=MIN_ANGLE, high=math.pi) / 2)
+            )
         else:
             continue
         if source.has("fl_y"):
             return fl_x, source.number("fl_y", low=0)
         if source.has("camera_angle_y") and not source.has("fl_x"):
-            return fl_x, height / 2 / math.tan(source.number("camera_angle_y", low=MIN_ANGLE, high=math.pi) / 2)
+            return fl_x, height / 2 / math.tan(
+                source.number("camera_angle_y", low=MIN_ANGLE, high=math.pi) / 2
+            )
         return fl_x, fl_x
-    raise StgaError(f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level")
+    raise StgaError(
+        f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level"
+    )
 
 
 def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
     where = record.where("transform_matrix")
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+    if (
+        matrix.shape != (4, 4)
+        or not np.isfinite(matrix).all()
+        or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6)
+    ):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
     if np.abs(matrix).max() > MAX_COORDINATE_M:
-        raise StgaError(f"{where}: the camera lies farther than {MAX_COORDINATE_M:g} from the origin")
+        raise StgaError(
+            f"{where}: the camera lies farther than {MAX_COORDINATE_M:g} from the origin"
+        )
     rotation = matrix[:3, :3]
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(rotation) < 0:
-        raise StgaError(f"{where}: expected a rotation without scale, shear or mirroring in its upper left 3x3 part")
+        raise StgaError(
+            f"{where}: expected a rotation without scale, shear or mirroring in its upper left 3x3 part"
+        )
     return matrix
 
 
 def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
-    """Frames whose cameras all have an index: that of the same camera elsewhere, or the next free number."""
+    """Frames whose cameras all have an index: that of the same camera elsewhere, or the next free
+    number."""
     known = {_camera_key(f): f.view.camera_index for f in frames if f.view.camera_index >= 0}
     taken = set(known.values())
     free = (number for number in itertools.count() if number not in taken)
@@ -356,4 +436,6 @@ def _camera_key(frame: Frame) -> str | bytes:
 
 
 def _first_path(records: Iterable[_Record], key: str) -> Path | None:
-    return next((path for path in (record.path_of(key) for record in records) if path is not None), None)
+    return next(
+        (path for path in (record.path_of(key) for record in records) if path is not None), None
+    )

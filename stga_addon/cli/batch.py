@@ -24,7 +24,9 @@ PLAN_SUFFIX = ".toml"
 class BatchOptions:
     """A plan, or captures with what a plan has in its file."""
 
-    sources: tuple[Path, ...] = option("a plan (docs/batch.md), or captures", flag="PLAN.toml|CAPTURE")
+    sources: tuple[Path, ...] = option(
+        "a plan (docs/batch.md), or captures", flag="PLAN.toml|CAPTURE"
+    )
     out: Path | None = option("folder of the batch, where captures are given", None, metavar="RUNS")
     preset: str | None = like(TrainingSettings, "preset")
     seconds: float | None = like(TrainingSettings, "seconds", help="training time of each capture")
@@ -33,7 +35,9 @@ class BatchOptions:
     flame: Path | None = like(Train, "flame")
     principal_point: str = like(Train, "principal_point")
     device: str = like(Train, "device")
-    commands: bool = option("prepare the jobs and print a command for each, for another scheduler", False)
+    commands: bool = option(
+        "prepare the jobs and print a command for each, for another scheduler", False
+    )
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,11 @@ class EngineOptions:
 
     threads: int | None = option("threads of each job that names none", None, 1, metavar="N")
     dry_run: bool = option("print the jobs, and how long they are expected to take", False)
-    engine: str = option("; ".join(f"{name}: {what}" for name, (_, what) in ENGINES.items()), "local", choices=ENGINES)
+    engine: str = option(
+        "; ".join(f"{name}: {what}" for name, (_, what) in ENGINES.items()),
+        "local",
+        choices=ENGINES,
+    )
     address: str = option("of a running cluster (ray)", "")
 
 
@@ -50,7 +58,9 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     chosen = EngineOptions(**given_options(options, EngineOptions))
     plan = batch_plan(options)
     is_here = chosen.engine == "local" and not options.commands
-    plan = with_threads(plan, chosen.threads or (max(1, processors() // len(plan.jobs)) if is_here else 1))
+    plan = with_threads(
+        plan, chosen.threads or (max(1, processors() // len(plan.jobs)) if is_here else 1)
+    )
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:
@@ -60,7 +70,8 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
 
 
 def batch_plan(options: Namespace) -> Plan:
-    """Raises StgaError for a mistake in the plan, and for options that would have no effect with one."""
+    """Raises StgaError for a mistake in the plan, and for options that would have no effect with
+    one."""
     given = given_options(options, BatchOptions)
     sources = given.pop("sources")
     given.pop("commands", None)
@@ -69,14 +80,18 @@ def batch_plan(options: Namespace) -> Plan:
             raise StgaError(f"{sources[1]}: cannot be given beside a plan")
         for spec in option_fields(BatchOptions):
             if spec.name in given:
-                raise StgaError(f"{flag_of(spec)}: has no effect with a plan, which says that itself")
+                raise StgaError(
+                    f"{flag_of(spec)}: has no effect with a plan, which says that itself"
+                )
         return read_plan(sources[0])
     out = given.pop("out", None)
     if out is None:
         raise StgaError("--out: is missing; expected the folder of the batch")
     missing = next((path for path in sources if not path.is_dir()), None)
     if missing is not None:
-        raise StgaError(f"{missing}: is not a folder; expected that of a capture, or a plan that ends in {PLAN_SUFFIX}")
+        raise StgaError(
+            f"{missing}: is not a folder; expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
+        )
     settings: dict[str, Any] = {
         name: given[name] for name in ("preset", "seconds", "iterations", "seed") if name in given
     }
@@ -91,7 +106,9 @@ def batch_plan(options: Namespace) -> Plan:
 def with_threads(plan: Plan, threads: int) -> Plan:
     """The plan with so many threads for the jobs that name none."""
     jobs = [
-        job if job.resources.threads else replace(job, resources=replace(job.resources, threads=threads))
+        job
+        if job.resources.threads
+        else replace(job, resources=replace(job.resources, threads=threads))
         for job in plan.jobs
     ]
     return replace(plan, jobs=tuple(jobs))
@@ -108,8 +125,8 @@ def print_plan(plan: Plan) -> None:
 
 
 def _print_commands(plan: Plan) -> None:
-    """Prepare the folders of the jobs that are not finished, and print a shell command for each in an order in which
-    they can be done. Raises StgaError where a worker is running in a folder."""
+    """Prepare the folders of the jobs that are not finished, and print a shell command for each in
+    an order in which they can be done. Raises StgaError where a worker is running in a folder."""
     from ..batch.folder import hold_folder, prepare
     from ..batch.plan import job_command
     from ..batch.run import Batch
@@ -126,7 +143,8 @@ def _print_commands(plan: Plan) -> None:
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
     """Carry out what is not finished, with the live table and the report.
 
-    Raises StgaError where a job failed, KeyboardInterrupt after Ctrl-C when the running jobs have stopped.
+    Raises StgaError where a job failed, KeyboardInterrupt after Ctrl-C when the running jobs have
+    stopped.
     """
     from ..batch.engines import make_engine
     from ..batch.folder import hold_folder
@@ -146,4 +164,6 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     failures = batch.failures
     if failures:
         first = failures[0]
-        raise StgaError(f"{len(failures)} of {len(plan.jobs)} jobs failed; {first.job.name}: {first.error}")
+        raise StgaError(
+            f"{len(failures)} of {len(plan.jobs)} jobs failed; {first.job.name}: {first.error}"
+        )

@@ -24,7 +24,8 @@ LAYOUT, LAYOUT_WITH_TIME_LEFT = (
 
 
 def carry_out(request: Request, with_bar: bool = True) -> Result:
-    """Carry out the request, with a progress bar if it takes long, and print what it says. Raises as `perform` does."""
+    """Carry out the request, with a progress bar if it takes long, and print what it says. Raises
+    as `perform` does."""
     from ..jobs.perform import perform
 
     with ProgressBar() as bar:
@@ -35,7 +36,8 @@ def carry_out(request: Request, with_bar: bool = True) -> Result:
 
 
 def carry_out_selection(request: Select | SelectForTake, path: Path | None) -> None:
-    """Carry out the request, and write timestep -> triangles into an .npz file where there is a path."""
+    """Carry out the request, and write timestep -> triangles into an .npz file where there is a
+    path."""
     found = carry_out(request, with_bar=False)
     assert isinstance(found, Selected)
     if path is not None:
@@ -44,7 +46,8 @@ def carry_out_selection(request: Select | SelectForTake, path: Path | None) -> N
 
 
 class ProgressBar:
-    """A bar over the share of the work on stderr, with its stage and figures; what is said or logged goes above it."""
+    """A bar over the share of the work on stderr, with its stage and figures; what is said or
+    logged goes above it."""
 
     def __enter__(self) -> "ProgressBar":
         self._bar: tqdm[Any] | None = None
@@ -54,7 +57,8 @@ class ProgressBar:
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
-            self._bar.leave = self._bar.n > 0  # a bar of work that failed before it began would stand above the reason
+            # a bar of work that failed before it began would stand above the reason
+            self._bar.leave = self._bar.n > 0
         self._opened.close()
 
     def report(self, progress: Progress) -> bool:
@@ -73,7 +77,9 @@ class ProgressBar:
         from tqdm import tqdm
         from tqdm.contrib.logging import logging_redirect_tqdm
 
-        bar = self._opened.enter_context(tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True))
+        bar = self._opened.enter_context(
+            tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
+        )
         self._opened.enter_context(logging_redirect_tqdm())
         return bar
 

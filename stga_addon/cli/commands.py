@@ -1,4 +1,5 @@
-"""The commands: for each the dataclasses whose fields are its options, and what it does with them."""
+"""The commands: for each the dataclasses whose fields are its options, and what it does with
+them."""
 
 import json
 import os
@@ -47,7 +48,8 @@ class Command:
     """A command.
 
     about      what it does; the first sentence is its line in the list of commands
-    run        carries it out, with the head of the open .blend file where it stands in for what is not named
+    run        carries it out, with the head of the open .blend file where it stands in for what is
+               not named
     options    dataclasses whose fields are its options; a tuple: and which of them
     may_lack   fields without a default that need not be given
     uses_head  whether the open file's capture and avatar stand in for those that are not named
@@ -105,20 +107,29 @@ class TrainOptions:
 
 
 def _train(options: Namespace, head: OpenHead | None) -> None:
-    given = {**given_options(options, Train), "selection": None if head is None else head.selection()}
+    given = {
+        **given_options(options, Train),
+        "selection": None if head is None else head.selection(),
+    }
     if options.resume:
         _refuse_changes(options, read_run(options.run))
         carry_out(Resume(**given))
         return
     if has_run(options.run):
-        raise StgaError(f"{options.run}: already holds a run; give --resume to continue it, or another --out")
+        raise StgaError(
+            f"{options.run}: already holds a run; give --resume to continue it, or another --out"
+        )
     carry_out(Train(settings=_settings(options), **given))
 
 
 def _settings(options: Namespace) -> TrainingSettings:
-    """The settings of a new run. Raises StgaError for options that do not go together, or would have no effect."""
+    """The settings of a new run. Raises StgaError for options that do not go together, or would
+    have no effect."""
     given = given_options(options, TrainingSettings)
-    paper, other_method = given.get("schedule") == "paper", given.get("strategy") == "gaussian-avatars"
+    paper, other_method = (
+        given.get("schedule") == "paper",
+        given.get("strategy") == "gaussian-avatars",
+    )
     for named, is_replaced, by in (
         ("--schedule paper", paper and other_method, "--strategy gaussian-avatars"),
         ("--preset", "preset" in given and paper, "--schedule paper"),
@@ -132,21 +143,30 @@ def _settings(options: Namespace) -> TrainingSettings:
         given.setdefault("effects", {})
     settings, selection = make_settings(**given), given_options(options, SelectionOptions)
     if selection and settings.strategy != "selective":
-        raise StgaError("--threshold: has no effect without --strategy selective, or --schedule paper")
+        raise StgaError(
+            "--threshold: has no effect without --strategy selective, or --schedule paper"
+        )
     return replace(settings, selection=replace(settings.selection, **selection))
 
 
 def _refuse_changes(options: Namespace, run: Run) -> None:
     """Raise StgaError for an option that differs from what the run to be resumed began with."""
-    for kind, began_with in ((TrainingSettings, run.settings), (SelectionOptions, run.settings.selection)):
+    for kind, began_with in (
+        (TrainingSettings, run.settings),
+        (SelectionOptions, run.settings.selection),
+    ):
         for spec in option_fields(kind):
             value, given = getattr(began_with, spec.name), getattr(options, spec.name, None)
             if given not in (None, value) and spec.name != "effects":
-                raise StgaError(f"{flag_of(spec)}: this run began with {value}, which cannot change; use another --out")
+                raise StgaError(
+                    f"{flag_of(spec)}: this run began with {value}, which cannot change; use another --out"
+                )
     decided = {decision.effect: "on" if decision.on else "off" for decision in run.effect_plan}
     for name, choice in options.effects or ():
         if name not in decided or choice not in ("auto", decided[name]):
-            raise StgaError(f"--effect {name}={choice}: differs from what was decided for this run; use another --out")
+            raise StgaError(
+                f"--effect {name}={choice}: differs from what was decided for this run; use another --out"
+            )
 
 
 @dataclass(frozen=True)
@@ -165,18 +185,23 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
     if options.no_blend:
         return
     if find_spec("bpy") is None:
-        print("warning: no .blend file: this Python has no bpy (install bpy, or run the command in Blender)")
+        print(
+            "warning: no .blend file: this Python has no bpy (install bpy, or run the command in Blender)"
+        )
         return
     from ..training.run.folder import with_refined_tracking
 
     print(f"blender: {write_blend(out, lambda capture: with_refined_tracking(capture, run))}")
 
 
-def write_blend(out: Path, refine: Callable[[Capture], Capture], finish: Callable[[Any], object] = bool) -> Path:
-    """Write the .blend file of what `stga avatar` left in `out`; needs bpy, whose open file it replaces.
+def write_blend(
+    out: Path, refine: Callable[[Capture], Capture], finish: Callable[[Any], object] = bool
+) -> Path:
+    """Write the .blend file of what `stga avatar` left in `out`; needs bpy, whose open file it
+    replaces.
 
-    refine: gives the capture's heads as training refined them; finish: called with the head before saving.
-    Raises StgaError.
+    refine: gives the capture's heads as training refined them; finish: called with the head before
+    saving. Raises StgaError.
     """
     from ..export.playback import playback_fps
     from ..scene.avatar_scene import set_up_head, show_on_head, show_world
@@ -206,7 +231,9 @@ class ContinueOptions:
 @dataclass(frozen=True)
 class SelectOptions:
     select_only: Path | None = option(
-        "only write which triangles it would train: timestep of the take -> triangles", None, metavar="NPZ"
+        "only write which triangles it would train: timestep of the take -> triangles",
+        None,
+        metavar="NPZ",
     )
 
 
@@ -241,10 +268,18 @@ def _resume(kind: Any, given: dict[str, Any], select_only: Path | None) -> None:
     flags += ["--select-only"] if select_only else []
     useless = next((flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None)
     if useless is not None:
-        raise StgaError(f"{useless}: cannot be combined with --resume, which continues the run in RUN as it began")
+        raise StgaError(
+            f"{useless}: cannot be combined with --resume, which continues the run in RUN as it began"
+        )
     if read_run(given["parent"]).continuation is None:
-        raise StgaError(f"{given['parent']}: does not continue another run; resume it with `stga train --resume`")
-    carry_out(Resume(given["parent"], **{name: given[name] for name in ("flame", "device") if name in given}))
+        raise StgaError(
+            f"{given['parent']}: does not continue another run; resume it with `stga train --resume`"
+        )
+    carry_out(
+        Resume(
+            given["parent"], **{name: given[name] for name in ("flame", "device") if name in given}
+        )
+    )
 
 
 # Captures
@@ -256,11 +291,16 @@ class SelectOutput:
 
 
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
-    """Carry out the request, and write timestep -> triangles into an .npz file where there is a path."""
+    """Carry out the request, and write timestep -> triangles into an .npz file where there is a
+    path."""
     found = carry_out(request, with_bar=False)
     assert isinstance(found, Selected)
     if path is not None:
-        write_npz(path, {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}, compressed=True)
+        write_npz(
+            path,
+            {f"{timestep:05d}": faces for timestep, faces in found.selection.items()},
+            compressed=True,
+        )
 
 
 @dataclass(frozen=True)
@@ -274,7 +314,11 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         from ..jobs.finished_run import describe_light
 
         avatar = read_avatar(avatar_path(path))
-        light = describe_light(avatar.light) if avatar.light else ("light: unknown; `stga relight RUN` estimates it",)
+        light = (
+            describe_light(avatar.light)
+            if avatar.light
+            else ("light: unknown; `stga relight RUN` estimates it",)
+        )
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
@@ -300,7 +344,9 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
 @dataclass(frozen=True)
 class RenderOutput:
     out: Path | None = option("folder for PNGs", None, metavar="DIR", group="output")
-    video: Path | None = option("every timestep from one camera, as MP4", None, metavar="FILE.mp4", group="output")
+    video: Path | None = option(
+        "every timestep from one camera, as MP4", None, metavar="FILE.mp4", group="output"
+    )
 
 
 def _render(options: Namespace, head: OpenHead | None) -> None:
@@ -317,7 +363,9 @@ def _export(options: Namespace, head: OpenHead | None) -> None:
     given = given_options(options, Export)
     if head is not None:
         given.setdefault("fps", head.fps)
-        if options.motion is None and (FORMATS[options.file_format].source != "frame" or options.timestep is not None):
+        if options.motion is None and (
+            FORMATS[options.file_format].source != "frame" or options.timestep is not None
+        ):
             given["played"] = head.played()
     carry_out(Export(**given))
 
@@ -329,7 +377,9 @@ def _export(options: Namespace, head: OpenHead | None) -> None:
 class PerformOptions:
     folder: Path = option("folder that holds request.json", flag="FOLDER")
     resume: bool = option("continue what this request began in its output folder, if it did", False)
-    threads: int | None = like(EngineOptions, "threads", help="threads to compute on (default: all processors)")
+    threads: int | None = like(
+        EngineOptions, "threads", help="threads to compute on (default: all processors)"
+    )
 
 
 def _perform(options: Namespace, head: OpenHead | None) -> None:

@@ -1,4 +1,5 @@
-"""Entry point of the command line: `python -m stga_addon …` and `blender --background … --command stga …`."""
+"""Entry point of the command line: `python -m stga_addon …` and `blender --background … --command
+stga …`."""
 
 import argparse
 import gc
@@ -27,15 +28,20 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(arguments: list[str] | None = None, head: OpenHead | None = None) -> int:
-    """Run one command; returns the exit code: 0, 2 after a mistake that one sentence on stderr explains, 130 after
-    Ctrl-C.
+    """Run one command; returns the exit code: 0, 2 after a mistake that one sentence on stderr
+    explains, 130 after Ctrl-C.
 
-    `head`: that of the file that Blender has open; by default the one in the folder that STGA_HEAD names.
+    `head`: that of the file that Blender has open; by default the one in the folder that STGA_HEAD
+    names.
     """
     with safe_streams() as stdout:
         code = _run(arguments, head)
         sys.stdout.flush()
-        if stdout is not None and stdout.error is not None and not isinstance(stdout.error, BrokenPipeError):
+        if (
+            stdout is not None
+            and stdout.error is not None
+            and not isinstance(stdout.error, BrokenPipeError)
+        ):
             return _fail(f"standard output cannot be written ({stdout.error.strerror})")
         return code
 
@@ -67,7 +73,8 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
 
 
 def _forget(error: BaseException) -> None:
-    """Drop what an interruption left unfinished, without what destructors of objects that were half made say."""
+    """Drop what an interruption left unfinished, without what destructors of objects that were half
+    made say."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     error.__traceback__ = error.__context__ = None
     gc.collect()  # frames that refer to themselves
@@ -87,11 +94,16 @@ def make_parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
     for name, command in all_commands().items():
         about = " ".join(command.about.split()).replace("%", "%%")
         first = about.partition(". ")[0].rstrip(".")
-        command.add_arguments(commands.add_parser(name, help=first[0].lower() + first[1:], description=about), head)
+        command.add_arguments(
+            commands.add_parser(name, help=first[0].lower() + first[1:], description=about), head
+        )
     return top
 
 
 def all_commands() -> dict[str, Command]:
     """The commands of this installation."""
     found = DEVELOPMENT if find_spec("..development", __package__) is not None else {}
-    return {**COMMANDS, **{name: import_module(module, __package__).COMMAND for name, module in found.items()}}
+    return {
+        **COMMANDS,
+        **{name: import_module(module, __package__).COMMAND for name, module in found.items()},
+    }

@@ -1,4 +1,5 @@
-"""Standard streams that never raise: closed ones, closed pipes, full devices and ASCII-only encodings."""
+"""Standard streams that never raise: closed ones, closed pipes, full devices and ASCII-only
+encodings."""
 
 import io
 import os
@@ -9,7 +10,8 @@ from typing import Any
 
 
 class Output(io.FileIO):
-    """A descriptor whose first write error is kept in `error` instead of raised; what follows is dropped.
+    """A descriptor whose first write error is kept in `error` instead of raised; what follows is
+    dropped.
 
     So a training whose terminal or pipe goes away still finishes.
     """
@@ -29,8 +31,9 @@ class Output(io.FileIO):
 def safe_streams() -> Iterator[Output | None]:
     """Let stdout and stderr of the process be written without errors; yields the one behind stdout.
 
-    Characters that the encoding lacks are written as escapes. Streams that were replaced already (by tests, by
-    Blender's console) are left alone, and None is yielded. What the process was started with comes back at the end.
+    Characters that the encoding lacks are written as escapes. Streams that were replaced already
+    (by tests, by Blender's console) are left alone, and None is yielded. What the process was
+    started with comes back at the end.
     """
     _reserve_descriptors()
     before = sys.stdout, sys.stderr
@@ -45,7 +48,8 @@ def safe_streams() -> Iterator[Output | None]:
 
 
 def _reserve_descriptors() -> None:
-    """Open closed descriptors 0 to 2 on the null device, so that no file of ours gets one and is written by C code."""
+    """Open closed descriptors 0 to 2 on the null device, so that no file of ours gets one and is
+    written by C code."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)

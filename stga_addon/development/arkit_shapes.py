@@ -1,7 +1,8 @@
 """Makes `driving/arkit_shapes.npz`: what ARKit's shapes do to 478 points of ICT-FaceKit's face.
 
 python -m stga_addon.development.arkit_shapes ict_facekit_light.npz. The input holds the light
-model's neutral (V, 3) in centimeters, tris (F, 3), expr (57, V, 3) with expr_names, ident (20, V, 3).
+model's neutral (V, 3) in centimeters, tris (F, 3), expr (57, V, 3) with expr_names, ident (20, V,
+3).
 """
 
 import sys
@@ -18,14 +19,17 @@ from ..tracking.head_model import linear_model
 
 METERS_PER_UNIT = 0.01
 BOTH_SIDES = ("browInnerUp", "cheekPuff")
-"""Shapes that ICT-FaceKit splits in left and right. Its cheekRaiser, beside cheekSquint, is none of ARKit's."""
+"""Shapes that ICT-FaceKit splits in left and right. Its cheekRaiser, beside cheekSquint, is none of
+ARKit's."""
 
 
 def main(source: Path) -> None:
     """Write the file for the ICT-FaceKit arrays in `source`."""
     arrays = read_npz(source)
     neutral, faces = METERS_PER_UNIT * arrays["neutral"].astype(np.float64), arrays["tris"]
-    model = linear_model(source, {"mean": neutral, "faces": faces, "expression": np.zeros((*neutral.shape, 1))})
+    model = linear_model(
+        source, {"mean": neutral, "faces": faces, "expression": np.zeros((*neutral.shape, 1))}
+    )
     places, reliable = calibrate(model, FaceNetworks(), str(source))
 
     def at_points(values: np.ndarray) -> np.ndarray:
@@ -42,10 +46,14 @@ def main(source: Path) -> None:
         SHAPES_FILE,
         {
             "points": places.on(neutral, faces).astype(np.float32),
-            "normals": (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
+            "normals": (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(
+                np.float32
+            ),
             "reliable": reliable,
             "shapes": np.stack(shapes).astype(np.float16),
-            "identity": np.stack([at_points(values) for values in arrays["ident"]]).astype(np.float16),
+            "identity": np.stack([at_points(values) for values in arrays["ident"]]).astype(
+                np.float16
+            ),
         },
         compressed=True,
     )

@@ -68,17 +68,24 @@ def main(source: Path) -> None:
             "J_regressor": _regressor(template, kept).astype(np.float32),
             "weights": skinning_weights(template, kept).astype(np.float32),
             "kintree_table": np.array([[-1, 0, 1, 1, 1], range(len(JOINTS))]),
-            **{f"masks/{name}": np.flatnonzero(of[kept]) for name, of in _masks(neutral, moved).items()},
+            **{
+                f"masks/{name}": np.flatnonzero(of[kept])
+                for name, of in _masks(neutral, moved).items()
+            },
         },
         compressed=True,
     )
 
 
 def arkit_displacements(arrays: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], np.ndarray]:
-    """ARKit's names of ICT-FaceKit's expressions, and their displacements (E, V, 3) in centimeters."""
+    """ARKit's names of ICT-FaceKit's expressions, and their displacements (E, V, 3) in
+    centimeters."""
     row = {str(name): number for number, name in enumerate(arrays["expression_names"])}
     names = tuple(name for name in ARKIT_SHAPES if name not in OPTIONAL)
-    shapes = [sum(arrays["expression"][row[part]].astype(np.float64) for part in ict_names(name)) for name in names]
+    shapes = [
+        sum(arrays["expression"][row[part]].astype(np.float64) for part in ict_names(name))
+        for name in names
+    ]
     return names, np.stack(shapes)
 
 
@@ -104,7 +111,10 @@ def _masks(neutral: np.ndarray, moved: dict[str, np.ndarray]) -> dict[str, np.nd
     ids = np.arange(len(neutral))
     x, y, z = neutral.T
     nose = _within(FACE, ids) & (abs(x) < 2.1) & (y > -1.2) & (y < 3.2) & (z > 9.2 + abs(x) / 4)
-    eyeballs = {"left_eyeball": _within(LEFT_EYEBALL, ids), "right_eyeball": _within(RIGHT_EYEBALL, ids)}
+    eyeballs = {
+        "left_eyeball": _within(LEFT_EYEBALL, ids),
+        "right_eyeball": _within(RIGHT_EYEBALL, ids),
+    }
     return {**_regions(moved), **eyeballs, "nose": nose, "teeth": _within(TEETH, ids)}
 
 
@@ -114,10 +124,14 @@ def _detail(moved: dict[str, np.ndarray]) -> np.ndarray:
     detail = np.ones(count)
     for part, factor in DETAIL.items():
         detail[slice(*part)] = factor
-    return np.asarray(np.where(np.any(list(_regions(moved).values()), axis=0), FEATURE_DETAIL, detail))
+    return np.asarray(
+        np.where(np.any(list(_regions(moved).values()), axis=0), FEATURE_DETAIL, detail)
+    )
 
 
-def _thinned(vertices: np.ndarray, triangles: np.ndarray, detail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _thinned(
+    vertices: np.ndarray, triangles: np.ndarray, detail: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Ids (N,) of the vertices that are kept, and the triangles (F, 3) between them."""
     kept, faces, count = [], [], 0
     for part, wanted in KEPT_TRIANGLES.items():
@@ -130,7 +144,9 @@ def _thinned(vertices: np.ndarray, triangles: np.ndarray, detail: np.ndarray) ->
     return np.concatenate(kept), np.concatenate(faces)
 
 
-def collapsed(vertices: np.ndarray, triangles: np.ndarray, detail: np.ndarray, wanted: int) -> np.ndarray:
+def collapsed(
+    vertices: np.ndarray, triangles: np.ndarray, detail: np.ndarray, wanted: int
+) -> np.ndarray:
     """About `wanted` of the triangles (F, 3), between some of their own vertices.
 
     Edges are collapsed into one of their ends by the smallest quadric error (Garland and Heckbert
@@ -191,7 +207,9 @@ def _quadrics(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
     def add(corners: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> None:
         unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        plane = np.concatenate([unit, -(unit * vertices[corners[:, 0]]).sum(1, keepdims=True)], axis=1)
+        plane = np.concatenate(
+            [unit, -(unit * vertices[corners[:, 0]]).sum(1, keepdims=True)], axis=1
+        )
         products = weights[:, None, None] * plane[:, :, None] * plane[:, None, :]
         for column in corners.T:
             np.add.at(quadrics, column, products)
@@ -228,7 +246,8 @@ def skinning_weights(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
 
 def _regressor(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """(5, N): eyes turn about the middle of their eyeballs, root and neck about averages of skin."""
+    """(5, N): eyes turn about the middle of their eyeballs, root and neck about averages of
+    skin."""
     regressor = np.zeros((len(JOINTS), len(kept)))
     for joint, part in (("left_eye", LEFT_EYEBALL), ("right_eye", RIGHT_EYEBALL)):
         ids = np.flatnonzero(_within(part, kept))

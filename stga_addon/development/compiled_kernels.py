@@ -1,4 +1,5 @@
-"""Compiled kernels for the complete edition (`raster.cpu.bundled`), by a Python of the target where there is one."""
+"""Compiled kernels for the complete edition (`raster.cpu.bundled`), by a Python of the target where
+there is one."""
 
 import hashlib
 import subprocess
@@ -27,11 +28,13 @@ print("COMPILED", flush=True)
 
 
 def compile_kernels(target: Target, wheels: Path, blender: Sequence[str] = ()) -> list[Path]:
-    """Numba's cache files of all kernels for any processor of the target's kind; none where no Python of the target is
+    """Numba's cache files of all kernels for any processor of the target's kind; none where no
+    Python of the target is
     here: then they are compiled when they are first used.
 
-    wheels: folder of the target's wheels. blender: the command that starts a Blender of the target; without it, this
-    Python is used if it is one. Kept in build/kernels until a kernel changes. Raises StgaError where compiling fails.
+    wheels: folder of the target's wheels. blender: the command that starts a Blender of the target;
+    without it, this Python is used if it is one. Kept in build/kernels until a kernel changes.
+    Raises StgaError where compiling fails.
     """
     if target.platform != this_platform() or target.platform not in PROCESSORS:
         return []
@@ -39,7 +42,12 @@ def compile_kernels(target: Target, wheels: Path, blender: Sequence[str] = ()) -
     if not _files(folder):
         if blender:
             with _unpacked(wheels) as site:
-                _compile(target, [*blender, "--background", "--factory-startup", "--python-expr"], [site], folder)
+                _compile(
+                    target,
+                    [*blender, "--background", "--factory-startup", "--python-expr"],
+                    [site],
+                    folder,
+                )
         elif _is_target(target, wheels):
             _compile(target, [sys.executable, "-c"], [], folder)
     return _files(folder)
@@ -59,7 +67,9 @@ def _compile(target: Target, command: Sequence[str], sites: Sequence[Path], fold
     script = SCRIPT.format(environment=environment, paths=[str(path) for path in (ROOT, *sites)])
     done = subprocess.run([*command, script], capture_output=True, text=True, check=False)
     if "COMPILED" not in done.stdout:
-        reason = (done.stderr or done.stdout).strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+        reason = (done.stderr or done.stdout).strip().splitlines()[-1:] or [
+            f"exit status {done.returncode}"
+        ]
         raise StgaError(f"{target.name}: the kernels could not be compiled ({reason[0]})")
 
 
@@ -83,7 +93,9 @@ def _is_target(target: Target, wheels: Path) -> bool:
         own = version("numba")
     except PackageNotFoundError:
         return False
-    return target.python == "{}.{}".format(*sys.version_info[:2]) and any(wheels.glob(f"numba-{own}-*"))
+    return target.python == "{}.{}".format(*sys.version_info[:2]) and any(
+        wheels.glob(f"numba-{own}-*")
+    )
 
 
 @contextmanager

@@ -18,7 +18,8 @@ class Edition:
     """What an edition's zip holds.
 
     suffix        of the file's name, after the version
-    target        of the wheels that the edition bundles for training; None: only those that every edition has
+    target        of the wheels that the edition bundles for training; None: only those that every
+                  edition has
     """
 
     suffix: str = ""
@@ -35,7 +36,9 @@ def complete(target: Target) -> Edition:
 
 def edition_manifest(manifest: Mapping[str, Any], edition: Edition, wheels: Sequence[str]) -> str:
     """Text of the edition's manifest: that of the checkout, with the edition's wheels and range."""
-    values = {name: value for name, value in manifest.items() if name not in ("build", "permissions")}
+    values = {
+        name: value for name, value in manifest.items() if name not in ("build", "permissions")
+    }
     values["wheels"] = [f"./wheels/{name}" for name in wheels]
     if edition.target is not None:
         values["platforms"] = [edition.target.platform]
@@ -43,7 +46,11 @@ def edition_manifest(manifest: Mapping[str, Any], edition: Edition, wheels: Sequ
         values["blender_version_min"] = first
         values |= {"blender_version_max": end} if end else {}
     lines = [f"{name} = {_toml(value)}" for name, value in values.items()]
-    lines += ["", "[permissions]", *(f"{name} = {_toml(text)}" for name, text in manifest["permissions"].items())]
+    lines += [
+        "",
+        "[permissions]",
+        *(f"{name} = {_toml(text)}" for name, text in manifest["permissions"].items()),
+    ]
     return "\n".join(lines) + "\n"
 
 

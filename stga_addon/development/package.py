@@ -1,4 +1,5 @@
-"""Build of the extension's zip from a checkout: `python -m stga_addon.development.package --out dist`."""
+"""Build of the extension's zip from a checkout: `python -m stga_addon.development.package --out
+dist`."""
 
 import argparse
 import hashlib
@@ -23,7 +24,8 @@ from .wheels import TARGETS, Target, collect_wheels, this_platform
 
 ROOT = Path(__file__).resolve().parents[2]
 MANIFEST = "blender_manifest.toml"
-# Pure Python: one wheel serves every platform and Blender version. The manifest names the same files.
+# Pure Python: one wheel serves every platform and Blender version. The manifest names the same
+# files.
 WHEELS = {
     "filelock-4.2.11-py3-none-any.whl": "020e229e4bb9d410fc799c07ddf45fa217cba970278f40b30751d94f309b69e2",
     "trimesh-5.2.0-py3-none-any.whl": "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29",
@@ -32,28 +34,44 @@ WHEELS = {
 KERNELS_FOLDER = "stga_addon/raster/cpu/compiled"
 """In the zip; `raster.cpu.bundled.BUNDLE`."""
 ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
-"""Modification time of every entry, the earliest that a zip can hold: equal sources give an equal zip."""
+"""Modification time of every entry, the earliest that a zip can hold: equal sources give an equal
+zip."""
 
 
 def build_zip(
-    out: Path, root: Path = ROOT, edition: Edition = SMALL, demo: Path | None = None, kernels: Sequence[Path] = ()
+    out: Path,
+    root: Path = ROOT,
+    edition: Edition = SMALL,
+    demo: Path | None = None,
+    kernels: Sequence[Path] = (),
 ) -> Path:
-    """Write `<id>-<version><suffix>.zip` into the folder `out`, atomically; equal sources give equal bytes.
+    """Write `<id>-<version><suffix>.zip` into the folder `out`, atomically; equal sources give
+    equal bytes.
 
     demo: a capture to put into the zip. kernels: files of compiled kernels (`raster.cpu.bundled`).
-    Downloads the wheels into `root/wheels` where they are missing. Raises StgaError where `root` is not a checkout or
-    a wheel cannot be downloaded.
+    Downloads the wheels into `root/wheels` where they are missing. Raises StgaError where `root` is
+    not a checkout or a wheel cannot be downloaded.
     """
     manifest = read_manifest(root)
     wheels = edition_wheels(root / "wheels", edition)
     files = {file.relative_to(root).as_posix(): file for file in extension_files(root, manifest)}
     files |= {f"wheels/{wheel.name}": wheel for wheel in wheels}
     if demo is not None:
-        files |= {f"{DEMO_FOLDER}/{file.relative_to(demo).as_posix()}": file for file in _walk(demo, demo, [])}
+        files |= {
+            f"{DEMO_FOLDER}/{file.relative_to(demo).as_posix()}": file
+            for file in _walk(demo, demo, [])
+        }
     files |= {f"{KERNELS_FOLDER}/{file.name}": file for file in kernels}
     path = out / f"{manifest['id']}-{manifest['version']}{edition.suffix}.zip"
-    with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        _add(archive, MANIFEST, edition_manifest(manifest, edition, [wheel.name for wheel in wheels]).encode())
+    with (
+        replacing(path) as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+    ):
+        _add(
+            archive,
+            MANIFEST,
+            edition_manifest(manifest, edition, [wheel.name for wheel in wheels]).encode(),
+        )
         for name, file in sorted(files.items()):
             _add(archive, name, file.read_bytes())
     return path
@@ -61,18 +79,22 @@ def build_zip(
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     entry = zipfile.ZipInfo(name, ENTRY_TIME)
-    entry.compress_type = zipfile.ZIP_STORED if name.endswith((".whl", ".png", ".webp")) else zipfile.ZIP_DEFLATED
+    entry.compress_type = (
+        zipfile.ZIP_STORED if name.endswith((".whl", ".png", ".webp")) else zipfile.ZIP_DEFLATED
+    )
     entry.external_attr = 0o644 << 16
     archive.writestr(entry, data)
 
 
 def wheel_folder(target: Target) -> Path:
-    """Where the wheels of a complete edition lie: not in `wheels`, all of which Blender's own build takes."""
+    """Where the wheels of a complete edition lie: not in `wheels`, all of which Blender's own build
+    takes."""
     return ROOT / "build/wheels" / target.name
 
 
 def edition_wheels(folder: Path, edition: Edition) -> list[Path]:
-    """The wheels of an edition in `folder`, downloaded where they are missing. Raises StgaError where pip fails."""
+    """The wheels of an edition in `folder`, downloaded where they are missing. Raises StgaError
+    where pip fails."""
     if edition.target is not None:
         return collect_wheels(wheel_folder(edition.target), edition.target)
     fetch_wheels(folder)
@@ -84,7 +106,9 @@ def read_manifest(root: Path) -> dict[str, Any]:
     try:
         return tomllib.loads((root / MANIFEST).read_text(encoding="utf-8"))
     except OSError as error:
-        raise StgaError(f"{root / MANIFEST}: cannot be read ({error.strerror}); expected a checkout") from error
+        raise StgaError(
+            f"{root / MANIFEST}: cannot be read ({error.strerror}); expected a checkout"
+        ) from error
 
 
 def extension_files(root: Path, manifest: dict[str, Any]) -> list[Path]:
@@ -94,15 +118,32 @@ def extension_files(root: Path, manifest: dict[str, Any]) -> list[Path]:
 
 
 def fetch_wheels(folder: Path) -> None:
-    """Download WHEELS with pip into `folder` where they are missing. Raises StgaError where pip fails."""
+    """Download WHEELS with pip into `folder` where they are missing. Raises StgaError where pip
+    fails."""
     missing = [name for name in WHEELS if not _is_intact(folder / name)]
     if not missing:
         return
     with tempfile.TemporaryDirectory() as scratch:
         wanted = Path(scratch) / "wheels.txt"
         wanted.write_text("".join(_requirement(name) for name in missing), encoding="utf-8")
-        options = ["--no-deps", "--only-binary=:all:", "--require-hashes", "-r", str(wanted), "-d", str(folder)]
-        command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", *options]
+        options = [
+            "--no-deps",
+            "--only-binary=:all:",
+            "--require-hashes",
+            "-r",
+            str(wanted),
+            "-d",
+            str(folder),
+        ]
+        command = [
+            sys.executable,
+            "-m",
+            "pip",
+            "download",
+            "--quiet",
+            "--disable-pip-version-check",
+            *options,
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
@@ -129,7 +170,8 @@ def _walk(folder: Path, root: Path, patterns: Sequence[str]) -> Iterator[Path]:
 
 
 def _is_excluded(entry: Path, root: Path, patterns: Sequence[str]) -> bool:
-    """Implements the .gitignore rules that the manifest uses: a leading / anchors, a trailing / means a folder."""
+    """Implements the .gitignore rules that the manifest uses: a leading / anchors, a trailing /
+    means a folder."""
     for pattern in patterns:
         if pattern.endswith("/") and not entry.is_dir():
             continue
@@ -144,21 +186,28 @@ def target_of(blender: Sequence[str]) -> Target:
 
     blender: the command that starts it. Raises StgaError where it does not answer.
     """
-    asking = "import bpy, sys; print('PYTHON', *sys.version_info[:2], *bpy.app.version[:2], flush=True)"
+    asking = (
+        "import bpy, sys; print('PYTHON', *sys.version_info[:2], *bpy.app.version[:2], flush=True)"
+    )
     command = [*blender, "--background", "--factory-startup", "--python-expr", asking]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
         raise StgaError(f"{blender[0]}: cannot be started ({error.strerror})") from error
-    answer = next((line.split()[1:] for line in done.stdout.splitlines() if line.startswith("PYTHON ")), None)
+    answer = next(
+        (line.split()[1:] for line in done.stdout.splitlines() if line.startswith("PYTHON ")), None
+    )
     if answer is None:
-        raise StgaError(f"{shlex.join(blender)}: did not say which Python it has (exit status {done.returncode})")
+        raise StgaError(
+            f"{shlex.join(blender)}: did not say which Python it has (exit status {done.returncode})"
+        )
     python, (major, minor) = ".".join(answer[:2]), map(int, answer[2:])
     return Target(this_platform(), python, (f"{major}.{minor}.0", f"{major}.{minor + 1}.0"))
 
 
 def build_editions(options: argparse.Namespace) -> Iterator[Path]:
-    """Build the edition that was asked for, the complete one for each of its targets. Raises StgaError."""
+    """Build the edition that was asked for, the complete one for each of its targets. Raises
+    StgaError."""
     if options.edition != "complete":
         yield build_zip(options.out)
         return
@@ -172,18 +221,30 @@ def build_editions(options: argparse.Namespace) -> Iterator[Path]:
         unpack_capture(demo)
         kernels = compile_kernels(target, wheel_folder(target), shlex.split(options.blender))
         if not kernels:
-            print(f"{target.name}: no Python of it is here; kernels are compiled when they are first used")
+            print(
+                f"{target.name}: no Python of it is here; kernels are compiled when they are first used"
+            )
         yield build_zip(options.out, edition=complete(target), demo=demo, kernels=kernels)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m stga_addon.development.package", description=__doc__)
-    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder that receives the zip")
-    parser.add_argument("--edition", choices=("small", "complete"), default="small")
-    parser.add_argument("--blender", default="", help="complete: for the Python of this Blender, and no other")
-    parser.add_argument("--all", action="store_true", help="complete: for every platform, not only this one")
+    parser = argparse.ArgumentParser(
+        prog="python -m stga_addon.development.package", description=__doc__
+    )
     parser.add_argument(
-        "--allow-cuda", action="store_true", help="complete: PyTorch's CUDA build where its CPU build cannot be had"
+        "--out", type=Path, default=ROOT / "dist", help="folder that receives the zip"
+    )
+    parser.add_argument("--edition", choices=("small", "complete"), default="small")
+    parser.add_argument(
+        "--blender", default="", help="complete: for the Python of this Blender, and no other"
+    )
+    parser.add_argument(
+        "--all", action="store_true", help="complete: for every platform, not only this one"
+    )
+    parser.add_argument(
+        "--allow-cuda",
+        action="store_true",
+        help="complete: PyTorch's CUDA build where its CPU build cannot be had",
     )
     options = parser.parse_args(arguments)
 

@@ -1,6 +1,8 @@
-"""A repository for Blender from built zips: `python -m stga_addon.development.repository dist --out dist/repository`.
+"""A repository for Blender from built zips: `python -m stga_addon.development.repository dist --out
+dist/repository`.
 
-A static folder that any web server can hold: the zips, index.json as Blender reads it, and a page for people.
+A static folder that any web server can hold: the zips, index.json as Blender reads it, and a page
+for people.
 """
 
 import argparse
@@ -37,10 +39,13 @@ def write_repository(zips: Sequence[Path], out: Path, blender: Sequence[str]) ->
     """Write the repository of the zips into the folder `out`; returns its index.json.
 
     An earlier repository there is replaced once the new one is complete.
-    blender: the command that starts a Blender. Raises StgaError where there is no zip or Blender fails.
+    blender: the command that starts a Blender. Raises StgaError where there is no zip or Blender
+    fails.
     """
     if not zips:
-        raise StgaError("no zips for the repository; build one with `make extension` or `make extension-complete`")
+        raise StgaError(
+            "no zips for the repository; build one with `make extension` or `make extension-complete`"
+        )
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent) as scratch:
         made = Path(scratch) / "made"
@@ -56,9 +61,13 @@ def write_repository(zips: Sequence[Path], out: Path, blender: Sequence[str]) ->
             reason = (done.stderr or done.stdout).strip().splitlines()[-1:] or ["no reason given"]
             raise StgaError(f"{shlex.join(blender)}: could not make the index ({reason[0]})")
         entries = json.loads((made / INDEX).read_text(encoding="utf-8"))["data"]
-        missing = {path.name for path in zips} - {Path(entry["archive_url"]).name for entry in entries}
+        missing = {path.name for path in zips} - {
+            Path(entry["archive_url"]).name for entry in entries
+        }
         if missing:
-            raise StgaError(f"{shlex.join(blender)}: left {', '.join(sorted(missing))} out of the index")
+            raise StgaError(
+                f"{shlex.join(blender)}: left {', '.join(sorted(missing))} out of the index"
+            )
         (made / PAGE).write_text(TEXT.format(rows="\n".join(map(_row, entries))), encoding="utf-8")
         if out.exists():
             out.replace(Path(scratch) / "earlier")
@@ -73,11 +82,15 @@ def _row(entry: dict[str, Any]) -> str:
     size = f"{entry['archive_size'] / 1e6:.1f} MB"
     cells = (entry["version"], ", ".join(entry.get("platforms", ["any"])), blender, size)
     link = f'<a href="{html.escape(name)}">{html.escape(name)}</a>'
-    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in (link, *map(html.escape, cells))) + "</tr>"
+    return (
+        "<tr>" + "".join(f"<td>{cell}</td>" for cell in (link, *map(html.escape, cells))) + "</tr>"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m stga_addon.development.repository", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m stga_addon.development.repository", description=__doc__
+    )
     parser.add_argument(
         "zips",
         type=Path,
@@ -86,10 +99,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of the repository")
     parser.add_argument("--blender", default="blender", help="command that starts a Blender")
     options = parser.parse_args(arguments)
-    built = sorted(path for path in options.zips.glob("*.zip") if not path.stem.endswith("-platform"))
+    built = sorted(
+        path for path in options.zips.glob("*.zip") if not path.stem.endswith("-platform")
+    )
     # One edition: Blender takes two zips of one version, platform and range for a mistake.
     zips = [path for path in built if "-py" in path.stem] or built
-    return exit_code(lambda: print(write_repository(zips, options.out, shlex.split(options.blender))))
+    return exit_code(
+        lambda: print(write_repository(zips, options.out, shlex.split(options.blender)))
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""Wheels of the complete edition: which ones a target needs, their download, and the check of what came.
+"""Wheels of the complete edition: which ones a target needs, their download, and the check of what
+came.
 
-pip evaluates environment markers for the system it runs on, so dependencies are followed here, with the markers of the
-target, and pip only picks and downloads one wheel per package.
+pip evaluates environment markers for the system it runs on, so dependencies are followed here, with
+the markers of the target, and pip only picks and downloads one wheel per package.
 """
 
 import platform
@@ -22,8 +23,9 @@ from ..errors import StgaError
 from ..worker.training_python import GPU_REQUIREMENT, REQUIREMENTS
 
 TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-"""PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which PyPI has for Linux,
-takes gigabytes. Everything else comes from PyPI, or the mirror that pip is configured for."""
+"""PyTorch's CPU build serves GPUs as well, since the kernels are WebGPU's; the CUDA build, which
+PyPI has for Linux, takes gigabytes. Everything else comes from PyPI, or the mirror that pip is
+configured for."""
 PLATFORM_TAGS = {
     "linux-x64": (
         *(f"manylinux_2_{minor}_x86_64" for minor in range(28, 4, -1)),
@@ -31,11 +33,16 @@ PLATFORM_TAGS = {
     ),
     "windows-x64": ("win_amd64",),
     "macos-arm64": (
-        *(f"macosx_{major}_0_{kind}" for major in range(14, 10, -1) for kind in ("arm64", "universal2")),
+        *(
+            f"macosx_{major}_0_{kind}"
+            for major in range(14, 10, -1)
+            for kind in ("arm64", "universal2")
+        ),
         *(f"macosx_10_{minor}_universal2" for minor in range(15, 8, -1)),
     ),
 }
-"""Blender's name of a platform -> tags of wheels that run there: glibc 2.28 and macOS 14 or newer."""
+"""Blender's name of a platform -> tags of wheels that run there: glibc 2.28 and macOS 14 or
+newer."""
 MARKERS = {
     "linux-x64": {
         "sys_platform": "linux", "platform_system": "Linux", "platform_machine": "x86_64", "os_name": "posix",
@@ -61,13 +68,14 @@ PINS = {
     # The last that run with numpy 1.24, which Blender 4.2 and 4.3 bring.
     "3.11": ("scipy==1.15.3", "matplotlib==3.10.8", "contourpy==1.3.2"),
 }  # fmt: skip
-"""Versions that the complete edition bundles, on every Python and on one; what these need follows."""
+"""Versions that the complete edition bundles, on every Python and on one; what these need
+follows."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A platform by Blender's name, a Python as "3.11", the Blender versions (first, first no longer) with it, and
-    whether torch may be the CUDA build, where its CPU build cannot be had."""
+    """A platform by Blender's name, a Python as "3.11", the Blender versions (first, first no
+    longer) with it, and whether torch may be the CUDA build, where its CPU build cannot be had."""
 
     platform: str
     python: str
@@ -80,7 +88,11 @@ class Target:
 
     @property
     def markers(self) -> dict[str, str]:
-        more = {"python_version": self.python, "python_full_version": f"{self.python}.0", "extra": ""}
+        more = {
+            "python_version": self.python,
+            "python_full_version": f"{self.python}.0",
+            "extra": "",
+        }
         return {
             **MARKERS[self.platform],
             **more,
@@ -98,21 +110,31 @@ class Target:
 
 
 TARGETS = tuple(
-    Target(platform, python, blender) for platform in PLATFORM_TAGS for python, blender in BLENDER_RANGES.items()
+    Target(platform, python, blender)
+    for platform in PLATFORM_TAGS
+    for python, blender in BLENDER_RANGES.items()
 )
 
 
 def this_platform() -> str:
-    """Blender's name of the platform that this process runs on. Raises StgaError for one without a complete edition."""
-    found = {("Linux", "x86_64"): "linux-x64", ("Windows", "AMD64"): "windows-x64", ("Darwin", "arm64"): "macos-arm64"}
+    """Blender's name of the platform that this process runs on. Raises StgaError for one without a
+    complete edition."""
+    found = {
+        ("Linux", "x86_64"): "linux-x64",
+        ("Windows", "AMD64"): "windows-x64",
+        ("Darwin", "arm64"): "macos-arm64",
+    }
     here = platform.system(), platform.machine()
     if here not in found:
-        raise StgaError(f"{' '.join(here)}: has no complete edition; expected one of {', '.join(PLATFORM_TAGS)}")
+        raise StgaError(
+            f"{' '.join(here)}: has no complete edition; expected one of {', '.join(PLATFORM_TAGS)}"
+        )
     return found[here]
 
 
 def collect_wheels(folder: Path, target: Target) -> list[Path]:
-    """The wheels that training needs on the target, downloaded into `folder` where they are missing; sorted by name.
+    """The wheels that training needs on the target, downloaded into `folder` where they are
+    missing; sorted by name.
 
     Raises StgaError where one cannot be had.
     """
@@ -126,7 +148,9 @@ def collect_wheels(folder: Path, target: Target) -> list[Path]:
             continue
         followed.add(str(requirement))
         if name not in wheels:
-            wheels[name] = _present(folder, requirement, target) or _download(folder, requirement, target)
+            wheels[name] = _present(folder, requirement, target) or _download(
+                folder, requirement, target
+            )
         wanted += needs(wheels[name], target, requirement.extras)
     chosen = sorted(wheels.values())
     check_wheels(chosen, target)
@@ -134,12 +158,15 @@ def collect_wheels(folder: Path, target: Target) -> list[Path]:
 
 
 def check_wheels(wheels: Sequence[Path], target: Target) -> None:
-    """Raise StgaError unless every wheel runs on the target and all that they need, and training needs, is there."""
+    """Raise StgaError unless every wheel runs on the target and all that they need, and training
+    needs, is there."""
     tags, versions = target.tags(), {}
     for wheel in wheels:
         name, version, _, own = parse_wheel_filename(wheel.name)
         if not own & tags:
-            raise StgaError(f"{wheel.name}: does not run on {target.platform} with Python {target.python}")
+            raise StgaError(
+                f"{wheel.name}: does not run on {target.platform} with Python {target.python}"
+            )
         versions[str(name)] = version
     wanted = [(text, "training") for text in REQUIREMENTS.values()]
     wanted += [(text, wheel.name) for wheel in wheels for text in needs(wheel, target)]
@@ -151,11 +178,14 @@ def check_wheels(wheels: Sequence[Path], target: Target) -> None:
         if name not in versions:
             raise StgaError(f"{target.name}: {owner} needs {name}, which is not among the wheels")
         if not requirement.specifier.contains(versions[name], prereleases=True):
-            raise StgaError(f"{target.name}: {owner} needs {text}, the wheels hold {versions[name]}")
+            raise StgaError(
+                f"{target.name}: {owner} needs {text}, the wheels hold {versions[name]}"
+            )
 
 
 def needs(wheel: Path, target: Target, extras: Iterable[str] = ()) -> list[str]:
-    """Requirements of a wheel on the target, without their markers. Raises StgaError where it is no wheel."""
+    """Requirements of a wheel on the target, without their markers. Raises StgaError where it is no
+    wheel."""
     try:
         with zipfile.ZipFile(wheel) as archive:
             name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
@@ -175,11 +205,20 @@ def needs(wheel: Path, target: Target, extras: Iterable[str] = ()) -> list[str]:
 def _present(folder: Path, requirement: Requirement, target: Target) -> Path | None:
     """The wheel that is already in the folder; its version is the pinned one, or any that fits."""
     pins = {Requirement(text).name: Requirement(text).specifier for text in pins_of(target)}
-    specifier, tags = requirement.specifier & pins.get(requirement.name, requirement.specifier), target.tags()
+    specifier, tags = (
+        requirement.specifier & pins.get(requirement.name, requirement.specifier),
+        target.tags(),
+    )
     for wheel in sorted(folder.glob("*.whl"), reverse=True):
         name, version, _, own = parse_wheel_filename(wheel.name)
-        fits = name == canonicalize_name(requirement.name) and specifier.contains(version, prereleases=True)
-        if fits and own & tags and (target.cuda or name != "torch" or not _needs_cuda(wheel, target)):
+        fits = name == canonicalize_name(requirement.name) and specifier.contains(
+            version, prereleases=True
+        )
+        if (
+            fits
+            and own & tags
+            and (target.cuda or name != "torch" or not _needs_cuda(wheel, target))
+        ):
             return wheel
     return None
 
@@ -193,7 +232,8 @@ def pins_of(target: Target) -> list[str]:
 
 
 def _download(folder: Path, requirement: Requirement, target: Target) -> Path:
-    """Download one wheel as it is; on Linux PyTorch's CPU build, unless the target may have another."""
+    """Download one wheel as it is; on Linux PyTorch's CPU build, unless the target may have
+    another."""
     folder.mkdir(parents=True, exist_ok=True)
     bare = f"{requirement.name}{requirement.specifier}"
     if requirement.name != "torch" or target.platform != "linux-x64":
@@ -226,13 +266,29 @@ def _pip_download(folder: Path, wanted: str, target: Target, more: Sequence[str]
             "cp",
             *tags,
         ]
-        command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", *options]
+        command = [
+            sys.executable,
+            "-m",
+            "pip",
+            "download",
+            "--quiet",
+            "--disable-pip-version-check",
+            *options,
+        ]
         done = subprocess.run(
-            [*command, "-c", str(pins), "-d", scratch, *more, wanted], capture_output=True, text=True, check=False
+            [*command, "-c", str(pins), "-d", scratch, *more, wanted],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         found = sorted(Path(scratch).glob("*.whl"))
         if done.returncode or len(found) != 1:
             # The first error: the last one of several is about how to ask for help.
-            reason = next((line for line in done.stderr.splitlines() if line.startswith("ERROR: ")), "pip failed")
-            raise StgaError(f"{target.name}: pip could not download {wanted} ({reason.removeprefix('ERROR: ')})")
+            reason = next(
+                (line for line in done.stderr.splitlines() if line.startswith("ERROR: ")),
+                "pip failed",
+            )
+            raise StgaError(
+                f"{target.name}: pip could not download {wanted} ({reason.removeprefix('ERROR: ')})"
+            )
         return found[0].replace(folder / found[0].name)

@@ -20,14 +20,16 @@ CAMERA_FIELD_OF_VIEW_DEG = 63.0
 def watched_performance(path: Path, report: Report) -> Performance:
     """The performance of the face in a video; frames without a face leave gaps.
 
-    The head's rotation is relative to that of the first frame with a face, since the camera may look from anywhere.
-    Raises StgaError where the video cannot be read, states no frame rate, or shows no face; Cancelled where the report
-    asks to stop.
+    The head's rotation is relative to that of the first frame with a face, since the camera may
+    look from anywhere. Raises StgaError where the video cannot be read, states no frame rate, or
+    shows no face; Cancelled where the report asks to stop.
     """
     video = read_video(path)
     if not video.fps > 0:
         raise StgaError(f"{path}: states no frame rate")
-    frames = VideoFrames(video, dict(zip(video.timesteps, range(len(video.timesteps)), strict=True)))
+    frames = VideoFrames(
+        video, dict(zip(video.timesteps, range(len(video.timesteps)), strict=True))
+    )
     networks = FaceNetworks()
     times, rows, rotations = [], [], []
     for number, timestep in enumerate(frames.timesteps):
@@ -39,7 +41,11 @@ def watched_performance(path: Path, report: Report) -> Performance:
         if found is not None:
             times.append(timestep / video.fps)
             # The network's names have `_neutral` and lack tongueOut.
-            scores = {COLUMN[known]: s for name, s in found.weights.items() if (known := arkit_name(name)) is not None}
+            scores = {
+                COLUMN[known]: s
+                for name, s in found.weights.items()
+                if (known := arkit_name(name)) is not None
+            }
             rows.append([scores.get(column, 0.0) for column in range(COUNT)])
             rotations.append(head_rotation(found.points, (image.shape[0], image.shape[1])))
     if not rows:

@@ -1,4 +1,5 @@
-"""The map from ARKit's 52 weights to the parameters of one FLAME head: fitted, or exact for the bundled head."""
+"""The map from ARKit's 52 weights to the parameters of one FLAME head: fitted, or exact for the
+bundled head."""
 
 import hashlib
 from collections import OrderedDict
@@ -24,9 +25,11 @@ PRODUCT_SHAPES = tuple(name for name in ARKIT_SHAPES if name.startswith(("jaw", 
 PRODUCTS = np.array([COLUMN[name] for name in PRODUCT_SHAPES])
 FEATURES = COUNT + len(PRODUCTS)
 GAZE_RAD = 0.61
-"""Rotation of an eye at weight 1 of an eyeLook shape: the largest in recorded takes of Live Link Face."""
+"""Rotation of an eye at weight 1 of an eyeLook shape: the largest in recorded takes of Live Link
+Face."""
 RIDGE_M = 5e-5
-"""Root mean square displacement of the face that a unit of an expression coefficient must be worth."""
+"""Root mean square displacement of the face that a unit of an expression coefficient must be
+worth."""
 JAW_STEPS = 4
 MAX_JAW_RAD = 0.8
 """A jaw turns less; further, the fit has left what it is linear in."""
@@ -68,14 +71,17 @@ class HeadMap:
         """(T, E + 9) expression coefficients, jaw and eyes of weights (T, 52)."""
         effective = effective_weights(weights)
         return np.concatenate(
-            [features(weights) @ self.expressions, effective @ self.jaw, effective @ self.eyes], axis=1
+            [features(weights) @ self.expressions, effective @ self.jaw, effective @ self.eyes],
+            axis=1,
         )
 
     def frames(self, performance: Performance) -> list[FlameFrame]:
         """One frame per row of the performance; the head's rotation turns the neck."""
         values, zero = self.parameters(performance.weights), np.zeros(3)
         count = self.expressions.shape[1]
-        turns = np.zeros((len(values), 3)) if performance.head is None else head_turns(performance.head)
+        turns = (
+            np.zeros((len(values), 3)) if performance.head is None else head_turns(performance.head)
+        )
         return [
             FlameFrame(row[:count], zero, turn, row[count : count + 3], zero, row[count + 3 :])
             for row, turn in zip(values, turns, strict=True)
@@ -83,13 +89,17 @@ class HeadMap:
 
 
 def features(weights: np.ndarray) -> np.ndarray:
-    """(T, FEATURES) of weights (T, 52): the `effective_weights`, then jawOpen times each of PRODUCT_SHAPES."""
+    """(T, FEATURES) of weights (T, 52): the `effective_weights`, then jawOpen times each of
+    PRODUCT_SHAPES."""
     effective = effective_weights(weights)
-    return np.concatenate([effective, effective[:, JAW_OPEN, None] * effective[:, PRODUCTS]], axis=1)
+    return np.concatenate(
+        [effective, effective[:, JAW_OPEN, None] * effective[:, PRODUCTS]], axis=1
+    )
 
 
 def head_turns(angles: np.ndarray) -> np.ndarray:
-    """Axis-angle (T, 3) of yaw, pitch and roll (T, 3): about y, then the turned x, then the turned z."""
+    """Axis-angle (T, 3) of yaw, pitch and roll (T, 3): about y, then the turned x, then the turned
+    z."""
     yaw, pitch, roll = np.asarray(angles, np.float64).T
     zero = np.zeros_like(yaw)
     about = [(zero, yaw, zero), (pitch, zero, zero), (zero, zero, roll)]
@@ -119,7 +129,9 @@ def head_map(sequence: FlameSequence, name: str) -> HeadMap:
 def person_of(model: FlameModel, neutral: np.ndarray) -> FlameSequence:
     """A sequence without timesteps of the person whose neutral mesh (V, 3) this is."""
     no_frames: dict[int, FlameFrame] = {}
-    return FlameSequence(model, np.zeros(model.n_identity), neutral - model.v_template, (), no_frames.__getitem__)
+    return FlameSequence(
+        model, np.zeros(model.n_identity), neutral - model.v_template, (), no_frames.__getitem__
+    )
 
 
 def _fitted(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
@@ -132,8 +144,13 @@ def _fitted(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> Head
 def _named(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
     """The map of a model without identity components whose expressions are ARKit's shapes."""
     columns = [COLUMN[name] for name in person.expression_names]
-    targets, expressions = np.zeros((COUNT, used.sum(), 3)), np.zeros((FEATURES, person.n_expression))
-    targets[columns] = [points.on(shape, person.faces) for shape in np.moveaxis(person.shapedirs, 2, 0)]
+    targets, expressions = (
+        np.zeros((COUNT, used.sum(), 3)),
+        np.zeros((FEATURES, person.n_expression)),
+    )
+    targets[columns] = [
+        points.on(shape, person.faces) for shape in np.moveaxis(person.shapedirs, 2, 0)
+    ]
     expressions[columns, range(person.n_expression)] = 1
     reach = np.isin(np.arange(COUNT), columns).astype(np.float64)
     return HeadMap(points, used, targets, expressions, np.zeros((COUNT, 3)), _gaze(), reach)
@@ -160,7 +177,8 @@ class _Fit:
         return rigid
 
     def coefficients(self, jaw: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """(S, E) ridge solutions for points (S, N, 3) with the jaw (3,) turned; points are linear in coefficients."""
+        """(S, E) ridge solutions for points (S, N, 3) with the jaw (3,) turned; points are linear
+        in coefficients."""
         start, slopes = self.posed.linearized(np.zeros(self.count), self.rigid(jaw))
         matrix = slopes[..., : self.count].reshape(-1, self.count)
         residual = (wanted - start).reshape(len(wanted), -1)
@@ -168,7 +186,8 @@ class _Fit:
         return np.asarray(np.linalg.solve(normal, matrix.T @ residual.T).T)
 
     def expressions(self) -> np.ndarray:
-        """(FEATURES, E) that best give the coefficients of single shapes and of random combinations."""
+        """(FEATURES, E) that best give the coefficients of single shapes and of random
+        combinations."""
         rows, solutions = [], []
         for number, pose in enumerate(JAW_POSES):
             weights = _combinations(pose, np.random.default_rng(number))
@@ -177,17 +196,22 @@ class _Fit:
             wanted = self.neutral + np.tensordot(effective_weights(weights), self.targets, 1)
             rows.append(features(weights))
             solutions.append(self.coefficients(jaw @ self.jaw, wanted))
-        return np.asarray(np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0])
+        return np.asarray(
+            np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0]
+        )
 
     def _jaw(self) -> np.ndarray:
-        """(52, 3) axis-angle of the shapes that turn the jaw, each fitted together with expressions."""
+        """(52, 3) axis-angle of the shapes that turn the jaw, each fitted together with
+        expressions."""
         found = np.zeros((COUNT, 3))
         at = self.count + 3 * JOINTS.index("jaw")
         columns = [*range(self.count), at, at + 1, at + 2]
         for name in JAW_SHAPES:
             wanted, values = self.neutral + self.targets[COLUMN[name]], np.zeros(len(columns))
             for _ in range(JAW_STEPS):
-                start, slopes = self.posed.linearized(values[: self.count], self.rigid(values[self.count :]))
+                start, slopes = self.posed.linearized(
+                    values[: self.count], self.rigid(values[self.count :])
+                )
                 matrix = slopes[..., columns].reshape(-1, len(columns))
                 prior = np.diag([self.ridge] * self.count + [self.ridge * 1e-3] * 3)
                 step = matrix.T @ (wanted - start).ravel() - prior @ values
@@ -222,24 +246,33 @@ def _gaze() -> np.ndarray:
 
 
 def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
-    """(52,) of each shape alone, mouthClose at an open jaw; gaze is whole where the head has eyeballs."""
+    """(52,) of each shape alone, mouthClose at an open jaw; gaze is whole where the head has
+    eyeballs."""
     weights = np.eye(COUNT)
     weights[MOUTH_CLOSE, JAW_OPEN] = 1
     values = found.parameters(weights)
     moved = np.stack(
-        [fit.posed.positions(row[: fit.count], fit.rigid(row[fit.count : fit.count + 3])) for row in values]
+        [
+            fit.posed.positions(row[: fit.count], fit.rigid(row[fit.count : fit.count + 3]))
+            for row in values
+        ]
     )
     done = moved - fit.neutral
     done[MOUTH_CLOSE] = moved[MOUTH_CLOSE] - moved[JAW_OPEN]
-    size, missed = (np.sqrt((each**2).sum(axis=(1, 2))) for each in (found.targets, found.targets - done))
+    size, missed = (
+        np.sqrt((each**2).sum(axis=(1, 2))) for each in (found.targets, found.targets - done)
+    )
     reach = np.clip(1 - missed / np.maximum(size, 1e-12), 0, 1) * (size > 0)
-    eyeballs = (person.weights[:, [JOINTS.index("left_eye"), JOINTS.index("right_eye")]] > 0.5).any()
+    eyeballs = (
+        person.weights[:, [JOINTS.index("left_eye"), JOINTS.index("right_eye")]] > 0.5
+    ).any()
     looks = np.array([name.startswith("eyeLook") for name in ARKIT_SHAPES])
     return np.where(looks & eyeballs, 1.0, reach)
 
 
 def page_controls(sequence: FlameSequence | None) -> ShapeControls | None:
-    """The controls of a FLAME head; None for a head without FLAME, or whose face ARKit's shapes do not fit."""
+    """The controls of a FLAME head; None for a head without FLAME, or whose face ARKit's shapes do
+    not fit."""
     if sequence is None:
         return None
     try:
@@ -249,4 +282,6 @@ def page_controls(sequence: FlameSequence | None) -> ShapeControls | None:
     products = np.zeros((COUNT, found.expressions.shape[1]))
     products[PRODUCTS] = found.expressions[COUNT:]
     linear = np.concatenate([found.expressions[:COUNT], found.jaw, found.eyes], axis=1)
-    return ShapeControls(ARKIT_SHAPES, linear, products, ARKIT_SHAPES[JAW_OPEN], ARKIT_SHAPES[MOUTH_CLOSE])
+    return ShapeControls(
+        ARKIT_SHAPES, linear, products, ARKIT_SHAPES[JAW_OPEN], ARKIT_SHAPES[MOUTH_CLOSE]
+    )

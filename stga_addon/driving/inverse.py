@@ -21,35 +21,44 @@ NEWTON_STEPS, STEP_SHARES = 12, (1.0, 0.5, 0.2, 0.05, 0.0)
 CHUNK = 256
 """Rows whose matrices are held at once."""
 RIDGE = 1e-9
-"""Share of the mean squared displacement that keeps weights apart which this head cannot tell apart."""
+"""Share of the mean squared displacement that keeps weights apart which this head cannot tell
+apart."""
 TIMECODE_BASE = 60
 EXTRA_COLUMNS = ("HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw", "LeftEyePitch", "LeftEyeRoll", "RightEyeYaw",
                  "RightEyePitch", "RightEyeRoll")  # fmt: skip
 
 
 def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Performance:
-    """The motion of a FLAME head as ARKit weights: the least-squares fit of 0 to 1 to what its face does.
+    """The motion of a FLAME head as ARKit weights: the least-squares fit of 0 to 1 to what its face
+    does.
 
-    The neck's rotation becomes the head's; other head motion has no place in a performance. `name` is what errors call
-    the head.
+    The neck's rotation becomes the head's; other head motion has no place in a performance. `name`
+    is what errors call the head.
     """
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
     weights = arkit_weights(frames, head_map(sequence, name), sequence)
     first = sequence.timesteps[0]
     times = (np.array(sequence.timesteps) - first) / fps
-    return Performance(times, weights, head_angles(np.stack([frame.neck_pose for frame in frames])), fps)
+    return Performance(
+        times, weights, head_angles(np.stack([frame.neck_pose for frame in frames])), fps
+    )
 
 
-def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameSequence) -> np.ndarray:
-    """(T, 52) weights of 0 to 1 whose parameters (`HeadMap.parameters`) move the face most like the frames.
+def arkit_weights(
+    frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameSequence
+) -> np.ndarray:
+    """(T, 52) weights of 0 to 1 whose parameters (`HeadMap.parameters`) move the face most like the
+    frames.
 
-    Expressions with ARKit's names are the weights. Else the jaw's and the gaze's shapes follow from the rotations; what
-    they do to the skin is taken off, and the others follow from the expression coefficients by coordinate descent on
-    the non-negative least squares.
+    Expressions with ARKit's names are the weights. Else the jaw's and the gaze's shapes follow from
+    the rotations; what they do to the skin is taken off, and the others follow from the expression
+    coefficients by coordinate descent on the non-negative least squares.
     """
     weights = np.zeros((len(frames), COUNT))
     if names := sequence.model.expression_names:
-        weights[:, [COLUMN[name] for name in names]] = np.clip([frame.expr for frame in frames], 0, 1)
+        weights[:, [COLUMN[name] for name in names]] = np.clip(
+            [frame.expr for frame in frames], 0, 1
+        )
         return weights
     jaw_columns = [COLUMN[name] for name in JAW_SHAPES]
     jaw = np.stack([frame.jaw_pose for frame in frames])
@@ -67,7 +76,9 @@ def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameS
     wanted = np.stack([frame.expr for frame in frames]) - known
     # The length of coefficients times the metric is how far they move the face's points.
     person = with_identity(sequence).model
-    _, slopes = PosedPoints(person, found.points).linearized(np.zeros(person.n_expression), np.zeros(RIGID_SIZE))
+    _, slopes = PosedPoints(person, found.points).linearized(
+        np.zeros(person.n_expression), np.zeros(RIGID_SIZE)
+    )
     moves = slopes[..., : person.n_expression].reshape(-1, person.n_expression)
     values, vectors = np.linalg.eigh(moves.T @ moves)
     metric = vectors * np.sqrt(np.maximum(values, 0))
@@ -83,9 +94,13 @@ def arkit_weights(frames: Sequence[FlameFrame], found: HeadMap, sequence: FlameS
 
 
 def _descended(
-    gram: np.ndarray, right: np.ndarray, powers: np.ndarray | None = None, limits: np.ndarray | float = 1.0
+    gram: np.ndarray,
+    right: np.ndarray,
+    powers: np.ndarray | None = None,
+    limits: np.ndarray | float = 1.0,
 ) -> np.ndarray:
-    """(T, K) minimizers from 0 to `limits` of ½ wᵀGw − rᵀw by cyclic coordinate descent, all rows at once.
+    """(T, K) minimizers from 0 to `limits` of ½ wᵀGw − rᵀw by cyclic coordinate descent, all rows
+    at once.
 
     gram (P, K, K) with G = Σ powers[:, p] gram[p], powers (T, P); right (T, K).
     """
@@ -99,7 +114,9 @@ def _descended(
             curvature = row[:, column] + ridge
             slope = right[:, column] - (row * weights).sum(axis=1) - ridge * weights[:, column]
             old = weights[:, column].copy()
-            weights[:, column] = np.clip(old + slope / np.maximum(curvature, 1e-30), 0, limits[:, column])
+            weights[:, column] = np.clip(
+                old + slope / np.maximum(curvature, 1e-30), 0, limits[:, column]
+            )
             largest = max(largest, float(np.abs(weights[:, column] - old).max(initial=0)))
         if largest < CONVERGED:
             break
@@ -110,8 +127,11 @@ def _descended(
     return weights
 
 
-def _polished(matrices: np.ndarray, right: np.ndarray, weights: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Minimizers from 0 to `limits` of ½ wᵀGw − rᵀw near weights (T, K), by projected Newton steps (Bertsekas 1982)."""
+def _polished(
+    matrices: np.ndarray, right: np.ndarray, weights: np.ndarray, limits: np.ndarray
+) -> np.ndarray:
+    """Minimizers from 0 to `limits` of ½ wᵀGw − rᵀw near weights (T, K), by projected Newton steps
+    (Bertsekas 1982)."""
 
     def value(w: np.ndarray) -> np.ndarray:
         return np.asarray((w * (0.5 * np.einsum("tjk,tk->tj", matrices, w) - right)).sum(axis=1))
@@ -143,11 +163,15 @@ def write_performance(path: Path, performance: Performance) -> None:
     header = ["Timecode", "BlendShapeCount", *names, *EXTRA_COLUMNS]
     head = np.zeros((len(performance.times), 3)) if performance.head is None else performance.head
     lines = [",".join(header)]
-    for time, weights, turn in zip(performance.times.tolist(), performance.weights, head, strict=True):
+    for time, weights, turn in zip(
+        performance.times.tolist(), performance.weights, head, strict=True
+    ):
         cells = [*weights.tolist(), *turn.tolist(), *[0.0] * (len(EXTRA_COLUMNS) - 3)]
         count, sub = divmod(round(time * TIMECODE_BASE * 1000), 1000)
         whole, frame = divmod(count, TIMECODE_BASE)
         code = f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{frame:02d}.{sub:03d}"
-        lines.append(",".join([code, str(COUNT + len(EXTRA_COLUMNS)), *(f"{cell:.6f}" for cell in cells)]))
+        lines.append(
+            ",".join([code, str(COUNT + len(EXTRA_COLUMNS)), *(f"{cell:.6f}" for cell in cells)])
+        )
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,4 +1,5 @@
-"""The one place where a file becomes the motion of a head: FLAME parameters, captures and ARKit performances."""
+"""The one place where a file becomes the motion of a head: FLAME parameters, captures and ARKit
+performances."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,8 @@ from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_p
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
 QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000
-"""Share of the frames that count as quiet: those most alike, or of least weight; and how many are compared."""
+"""Share of the frames that count as quiet: those most alike, or of least weight; and how many are
+compared."""
 NEUTRALS = {
     "none": "as recorded",
     "quiet": "both recordings are at rest in the fifth of their frames that are most alike",
@@ -43,13 +45,15 @@ NEUTRALS = {
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
 OUTER_QUANTILE = 0.01
-"""Of the trained frames, cut off at both ends of the range: single mistracked frames widen nothing."""
+"""Of the trained frames, cut off at both ends of the range: single mistracked frames widen
+nothing."""
 
 
 @dataclass(frozen=True)
 class TrainedRange:
-    """Middle and half width, per part of the face (`PART_FIELDS`), of the parameters that an avatar was trained on;
-    quiet and first: the trained person's own quiet face, and that of the first frame."""
+    """Middle and half width, per part of the face (`PART_FIELDS`), of the parameters that an avatar
+    was trained on; quiet and first: the trained person's own quiet face, and that of the first
+    frame."""
 
     middle: dict[str, np.ndarray]
     width: dict[str, np.ndarray]
@@ -57,7 +61,8 @@ class TrainedRange:
     first: dict[str, np.ndarray]
 
     def neutral(self, choice: str) -> dict[str, np.ndarray]:
-        """The face on which a motion is put that is relative to another neutral, one of `NEUTRALS` but "none"."""
+        """The face on which a motion is put that is relative to another neutral, one of `NEUTRALS`
+        but "none"."""
         return self.first if choice == "first" else self.quiet
 
 
@@ -72,12 +77,16 @@ def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
 
 
 def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
-    """Part -> the median of its parameters over the frames that are most alike: a face keeps returning to rest.
+    """Part -> the median of its parameters over the frames that are most alike: a face keeps
+    returning to rest.
 
     Needs no order in time, which recordings of single expressions lack.
     """
     frames = evenly_spread(frames, MAX_COMPARED_FRAMES)
-    parts = {part: np.stack([getattr(frame, name) for frame in frames]) for part, name in PART_FIELDS.items()}
+    parts = {
+        part: np.stack([getattr(frame, name) for frame in frames])
+        for part, name in PART_FIELDS.items()
+    }
     face = np.concatenate([parts["face"], parts["jaw"]], axis=1)
     squares = (face**2).sum(axis=1)
     apart = squares[:, None] + squares - 2 * face @ face.T
@@ -90,7 +99,9 @@ def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
 def quiet_weights(performance: Performance) -> np.ndarray:
     """(52,) median of the weights over the rows in which their sum is least."""
     order = np.argsort(performance.weights.sum(axis=1), kind="stable")
-    return np.asarray(np.median(performance.weights[order[: max(1, round(QUIET_SHARE * len(order)))]], axis=0))
+    return np.asarray(
+        np.median(performance.weights[order[: max(1, round(QUIET_SHARE * len(order)))]], axis=0)
+    )
 
 
 def chosen_neutral(where: str, choice: str) -> str:
@@ -105,20 +116,25 @@ def exchanged_neutral(
     theirs: dict[str, np.ndarray] | None = None,
     own: dict[str, np.ndarray] | None = None,
 ) -> list[FlameFrame]:
-    """The frames with this head's neutral in place of the other person's, part by part; None: a neutral of zeros.
+    """The frames with this head's neutral in place of the other person's, part by part; None: a
+    neutral of zeros.
 
-    Parameters of the parts are subtracted and added, rotations as axis-angle: jaw and eyes turn by small angles.
+    Parameters of the parts are subtracted and added, rotations as axis-angle: jaw and eyes turn by
+    small angles.
     """
     change = {
         name: (0.0 if own is None else own[part]) - (0.0 if theirs is None else theirs[part])
         for part, name in PART_FIELDS.items()
     }
-    return [replace(f, **{name: getattr(f, name) + value for name, value in change.items()}) for f in frames]
+    return [
+        replace(f, **{name: getattr(f, name) + value for name, value in change.items()})
+        for f in frames
+    ]
 
 
 def outside(frames: Sequence[FlameFrame], trained: TrainedRange) -> dict[str, np.ndarray]:
-    """Part -> (T,) how far outside the trained range each frame is: 0 inside, 1 where it is twice as far from the
-    middle as the range reaches, for the parameter that is farthest."""
+    """Part -> (T,) how far outside the trained range each frame is: 0 inside, 1 where it is twice
+    as far from the middle as the range reaches, for the parameter that is farthest."""
     found = {}
     for part, name in PART_FIELDS.items():
         values = np.stack([getattr(frame, name) for frame in frames])
@@ -127,11 +143,14 @@ def outside(frames: Sequence[FlameFrame], trained: TrainedRange) -> dict[str, np
     return found
 
 
-def led_back(frames: Sequence[FlameFrame], trained: TrainedRange, strength: float = 1.0) -> list[FlameFrame]:
-    """The frames with parameters beyond the trained range led back to it; strength 0: unchanged, 1: fully.
+def led_back(
+    frames: Sequence[FlameFrame], trained: TrainedRange, strength: float = 1.0
+) -> list[FlameFrame]:
+    """The frames with parameters beyond the trained range led back to it; strength 0: unchanged, 1:
+    fully.
 
-    Inside the range nothing changes; beyond it, a distance of d half widths becomes 1 − exp(−d) quarters of one, so
-    that motion goes on softly. Between 0 and 1 the result lies between both.
+    Inside the range nothing changes; beyond it, a distance of d half widths becomes 1 − exp(−d)
+    quarters of one, so that motion goes on softly. Between 0 and 1 the result lies between both.
     """
     changed = []
     for frame in frames:
@@ -150,7 +169,8 @@ MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
 
 
 def parsed_gain(text: str) -> tuple[str, float]:
-    """Name and factor of `jawOpen=0.8`, a key and value of `MotionOptions.gains`. Raises StgaError for other text."""
+    """Name and factor of `jawOpen=0.8`, a key and value of `MotionOptions.gains`. Raises StgaError
+    for other text."""
     name, _, number = text.partition("=")
     if name not in (*PARTS, "head", *ARKIT_SHAPES):
         raise StgaError(f"'{name}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
@@ -165,9 +185,11 @@ def parsed_gain(text: str) -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """What is done to a motion on its way to a head; smoothing, mirror, gains and exchange to performances alone.
+    """What is done to a motion on its way to a head; smoothing, mirror, gains and exchange to
+    performances alone.
 
-    strength   of expression, jaw, eyes and neck about the neutral face; of the head's motion about its first pose
+    strength   of expression, jaw, eyes and neck about the neutral face; of the head's motion about
+               its first pose
     neutral    whose resting face the motion is put on the head's own from (`NEUTRALS`)
     smoothing  standard deviation in seconds
     gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
@@ -208,7 +230,8 @@ class Motion:
 
     fps      timesteps per second; None where unknown
     lost     rows that the file lacks between its first and last
-    outside  part -> (T,) how far each frame was outside the trained range (`transfer.outside`); empty without a range
+    outside  part -> (T,) how far each frame was outside the trained range (`transfer.outside`);
+             empty without a range
     """
 
     sequence: FlameSequence
@@ -226,11 +249,15 @@ def open_motion(
     trained: TrainedRange | None = None,
     fps: float | None = None,
 ) -> Motion:
-    """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles `faces` (F, 3).
+    """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles
+    `faces` (F, 3).
 
-    path   FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a performance (`read_performance`)
-    flame  the model file; None: the one in the capture's folder, or the bundled head for a performance
-    fps    rate that a performance is resampled to; None: its own. Timesteps of FLAME motions stay as they are
+    path   FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a performance
+           (`read_performance`)
+    flame  the model file; None: the one in the capture's folder, or the bundled head for a
+           performance
+    fps    rate that a performance is resampled to; None: its own. Timesteps of FLAME motions stay
+           as they are
     Raises StgaError where the file is no motion, or its model has other triangles.
     """
     options = options or MotionOptions()
@@ -242,14 +269,27 @@ def open_motion(
                 f"{path}: needs the FLAME model file (.pkl or .npz) of the head that it moves; give it with --flame"
             )
         _check_faces(path, model, faces)
-        return performed(read_performance(path), person_of(model, neutral), str(flame or path), options, trained, fps)
+        return performed(
+            read_performance(path),
+            person_of(model, neutral),
+            str(flame or path),
+            options,
+            trained,
+            fps,
+        )
     capture = open_capture(path, flame)
     if capture.flame is None:
-        raise StgaError(f"{path}: was not tracked with FLAME, so it has no parameters of expression and pose")
+        raise StgaError(
+            f"{path}: was not tracked with FLAME, so it has no parameters of expression and pose"
+        )
     _check_faces(path, capture.flame.model, faces)
     sequence = transferred_motion(capture.flame, neutral)
-    frames, beyond = adapted([sequence.frame(timestep) for timestep in sequence.timesteps], options, trained)
-    return Motion(_with_frames(sequence, sequence.timesteps, frames), playback_fps(capture), 0, beyond)
+    frames, beyond = adapted(
+        [sequence.frame(timestep) for timestep in sequence.timesteps], options, trained
+    )
+    return Motion(
+        _with_frames(sequence, sequence.timesteps, frames), playback_fps(capture), 0, beyond
+    )
 
 
 def performed(
@@ -260,8 +300,10 @@ def performed(
     trained: TrainedRange | None = None,
     fps: float | None = None,
 ) -> Motion:
-    """A performance on a person's head: one timestep per 1/fps seconds, from 0 on. `name` is what errors call it."""
-    prepared = prepared_performance(performance, replace(options, strength=1.0), fps)  # `frames_of` applies it
+    """A performance on a person's head: one timestep per 1/fps seconds, from 0 on. `name` is what
+    errors call it."""
+    # `frames_of` applies it
+    prepared = prepared_performance(performance, replace(options, strength=1.0), fps)
     frames, beyond = frames_of(head_map(person, name), prepared, options, trained)
     timesteps = tuple(range(len(frames)))
     return Motion(_with_frames(person, timesteps, frames), prepared.fps, performance.lost, beyond)
@@ -270,33 +312,45 @@ def performed(
 def adapted(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None = None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of another person's FLAME motion with the options' neutral, strength and range; and part -> (T,) how far
-    they were outside the trained range before they were led back (`transfer.outside`)."""
+    """Frames of another person's FLAME motion with the options' neutral, strength and range; and
+    part -> (T,) how far they were outside the trained range before they were led back
+    (`transfer.outside`)."""
     theirs = {"quiet": frames, "first": frames[:1]}.get(options.neutral)
     if theirs is not None:
         frames = exchanged_neutral(frames, quiet_neutral(theirs))
     return _finished(frames, options, trained)
 
 
-def prepared_performance(performance: Performance, options: MotionOptions, fps: float | None = None) -> Performance:
-    """The performance at an even rate, relative to its neutral face, smoothed, amplified, mirrored, at the strength."""
+def prepared_performance(
+    performance: Performance, options: MotionOptions, fps: float | None = None
+) -> Performance:
+    """The performance at an even rate, relative to its neutral face, smoothed, amplified, mirrored,
+    at the strength."""
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
         raise StgaError(
             f"a performance cannot be resampled to {fps:g} frames per second, expected {MIN_FPS:g} to {MAX_FPS:g}"
         )
     rate = fps or performance.fps
     if performance.times[-1] * rate > MAX_ROWS:
-        raise StgaError(f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is too long")
+        raise StgaError(
+            f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is too long"
+        )
     rest = None
     if options.neutral in ("quiet", "first"):
-        weights = quiet_weights(performance) if options.neutral == "quiet" else performance.weights[0]
+        weights = (
+            quiet_weights(performance) if options.neutral == "quiet" else performance.weights[0]
+        )
         rest = replace(performance, weights=weights[None], head=None)
-    return at_strength(smoothed(corrected(resampled(performance, fps), options, rest), options.smoothing), options)
+    return at_strength(
+        smoothed(corrected(resampled(performance, fps), options, rest), options.smoothing), options
+    )
 
 
-def corrected(performance: Performance, options: MotionOptions, rest: Performance | None = None) -> Performance:
-    """The performance row by row: with the sender's exchanged pairs put right, relative to the face of `rest` (None: as
-    it is), amplified and mirrored."""
+def corrected(
+    performance: Performance, options: MotionOptions, rest: Performance | None = None
+) -> Performance:
+    """The performance row by row: with the sender's exchanged pairs put right, relative to the face
+    of `rest` (None: as it is), amplified and mirrored."""
     changed = exchanged_sides(performance, options.exchange)
     if rest is not None:
         changed = relative_to(changed, exchanged_sides(rest, options.exchange))
@@ -305,23 +359,28 @@ def corrected(performance: Performance, options: MotionOptions, rest: Performanc
 
 
 def at_strength(performance: Performance, options: MotionOptions) -> Performance:
-    """Weights and head rotation times the strength, for what has no FLAME parameters, which `frames_of` strengthens."""
+    """Weights and head rotation times the strength, for what has no FLAME parameters, which
+    `frames_of` strengthens."""
     return amplified(performance, dict.fromkeys((*PARTS, "head"), options.strength))
 
 
 def frames_of(
-    found: HeadMap, performance: Performance, options: MotionOptions, trained: TrainedRange | None = None
+    found: HeadMap,
+    performance: Performance,
+    options: MotionOptions,
+    trained: TrainedRange | None = None,
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of a performance, as `corrected`, at the strength on the head of a map; and part -> (T,) how far they were
-    outside the trained range before they were led back (`transfer.outside`)."""
+    """Frames of a performance, as `corrected`, at the strength on the head of a map; and part ->
+    (T,) how far they were outside the trained range before they were led back
+    (`transfer.outside`)."""
     return _finished(found.frames(performance), options, trained)
 
 
 def _finished(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """The frames on the head's own neutral, where they are relative to the performer's; at the strength, led back, and
-    how far they were outside the trained range before that."""
+    """The frames on the head's own neutral, where they are relative to the performer's; at the
+    strength, led back, and how far they were outside the trained range before that."""
     if options.neutral != "none" and trained is not None:
         frames = exchanged_neutral(frames, None, trained.neutral(options.neutral))
     if options.strength != 1.0:
@@ -329,14 +388,20 @@ def _finished(
     if trained is None or options.stay_trained is None:
         return frames, {}
     beyond = outside(frames, trained)
-    return (led_back(frames, trained, options.stay_trained) if options.stay_trained else frames), beyond
+    return (
+        led_back(frames, trained, options.stay_trained) if options.stay_trained else frames
+    ), beyond
 
 
-def _with_frames(person: FlameSequence, timesteps: tuple[int, ...], frames: list[FlameFrame]) -> FlameSequence:
+def _with_frames(
+    person: FlameSequence, timesteps: tuple[int, ...], frames: list[FlameFrame]
+) -> FlameSequence:
     known = dict(zip(timesteps, frames, strict=True))
     return replace(person, timesteps=timesteps, frame=known.__getitem__)
 
 
 def _check_faces(path: Path, model: FlameModel, faces: np.ndarray) -> None:
     if not np.array_equal(model.faces, faces):
-        raise StgaError(f"{path}: its mesh has other triangles than the one this avatar was trained on")
+        raise StgaError(
+            f"{path}: its mesh has other triangles than the one this avatar was trained on"
+        )

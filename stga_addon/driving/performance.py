@@ -35,8 +35,8 @@ _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
 def arkit_name(name: str) -> str | None:
     """ARKit's spelling of a shape's name, or None where it is none of the 52.
 
-    Any capitals and separators, a prefix up to the last dot, and `_L` or `_R` for Left and Right are accepted:
-    `blendShapes.JawOpen`, `mouth_smile_left`, `mouthSmile_L`.
+    Any capitals and separators, a prefix up to the last dot, and `_L` or `_R` for Left and Right
+    are accepted: `blendShapes.JawOpen`, `mouth_smile_left`, `mouthSmile_L`.
     """
     plain = name.rsplit(".", 1)[-1].strip()
     side = re.fullmatch(r"(.*)[_\- ]([LR])", plain, re.IGNORECASE | re.DOTALL)
@@ -62,7 +62,8 @@ def mirrored_name(name: str) -> str:
 def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
     """Column of the 52 -> index in `names` (the first of each).
 
-    Raises StgaError, which begins with `where`, naming the shapes that are missing; those of `OPTIONAL` may be.
+    Raises StgaError, which begins with `where`, naming the shapes that are missing; those of
+    `OPTIONAL` may be.
     """
     listed = list(names)
     found: dict[int, int] = {}
@@ -74,15 +75,20 @@ def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
     if not missing:
         return found
     if len(missing) > COUNT // 2:
-        raise StgaError(f"{where}: names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut")
+        raise StgaError(
+            f"{where}: names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut"
+        )
     more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
     raise StgaError(f"{where}: lacks {', '.join(missing[:MAX_NAMED])}{more}{_unknown(listed)}")
 
 
 def _unknown(names: list[str]) -> str:
-    """What stands there instead of the missing names, if anything does: mistyped names, most likely."""
+    """What stands there instead of the missing names, if anything does: mistyped names, most
+    likely."""
     prefixes = ("eye", "jaw", "mouth", "brow", "cheek", "nose", "tongue")
-    rotations = re.compile(r"(left|right)?(eye|head)(yaw|pitch|roll)|(left|right)eye(yaw|pitch|roll)")
+    rotations = re.compile(
+        r"(left|right)?(eye|head)(yaw|pitch|roll)|(left|right)eye(yaw|pitch|roll)"
+    )
     strange = [
         name
         for name in names
@@ -95,7 +101,8 @@ def _unknown(names: list[str]) -> str:
 
 MIRROR = np.array([COLUMN[mirrored_name(name)] for name in ARKIT_SHAPES])
 EXCHANGEABLE = ("jaw", "mouth")
-"""Pairs of shapes, such as mouthLeft and mouthRight, which receivers report as exchanged by some senders."""
+"""Pairs of shapes, such as mouthLeft and mouthRight, which receivers report as exchanged by some
+senders."""
 GAP = 1.5
 """Rows farther apart than this many frames have lost some between them."""
 SMOOTHING_REACH = 3.0
@@ -131,7 +138,9 @@ def resampled(performance: Performance, fps: float | None = None) -> Performance
     times = np.arange(count) / rate
 
     def interpolated(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(times, performance.times, column) for column in values.T], axis=1)
+        return np.stack(
+            [np.interp(times, performance.times, column) for column in values.T], axis=1
+        )
 
     head = None if performance.head is None else interpolated(performance.head)
     return Performance(times, interpolated(performance.weights), head, rate)
@@ -153,7 +162,8 @@ def exchanged_sides(performance: Performance, pairs: tuple[str, ...]) -> Perform
 
 
 def smoothed(performance: Performance, seconds: float) -> Performance:
-    """Convolved in time by a Gaussian of standard deviation `seconds`; rows must be evenly spaced (`resampled`)."""
+    """Convolved in time by a Gaussian of standard deviation `seconds`; rows must be evenly spaced
+    (`resampled`)."""
     deviation = seconds * performance.fps
     reach = int(np.ceil(SMOOTHING_REACH * deviation))
     if reach < 1:
@@ -170,15 +180,16 @@ def smoothed(performance: Performance, seconds: float) -> Performance:
 
 
 def amplified(performance: Performance, gains: Mapping[str, float]) -> Performance:
-    """Weights times the gain of their part (`names.PARTS`, or "head") or of their own name; 1 where none is given."""
+    """Weights times the gain of their part (`names.PARTS`, or "head") or of their own name; 1 where
+    none is given."""
     factors = np.array([gains.get(name, gains.get(part_of(name), 1.0)) for name in ARKIT_SHAPES])
     head = None if performance.head is None else performance.head * gains.get("head", 1.0)
     return replace(performance, weights=performance.weights * factors, head=head)
 
 
 def relative_to(performance: Performance, rest: Performance) -> Performance:
-    """The performance without the face and head rotation of `rest` (its first row), so that these are 0 and a weight of
-    1 stays 1."""
+    """The performance without the face and head rotation of `rest` (its first row), so that these
+    are 0 and a weight of 1 stays 1."""
     neutral = rest.weights[0]
     head = performance.head
     if head is not None and rest.head is not None:
@@ -189,7 +200,9 @@ def relative_to(performance: Performance, rest: Performance) -> Performance:
 
 def parts_kept(performance: Performance, parts: tuple[str, ...]) -> Performance:
     """The performance with the weights of other parts at zero."""
-    return amplified(performance, {part: 1.0 if part in parts else 0.0 for part in (*PARTS, "head")})
+    return amplified(
+        performance, {part: 1.0 if part in parts else 0.0 for part in (*PARTS, "head")}
+    )
 
 
 @dataclass(frozen=True)
@@ -197,7 +210,8 @@ class FacePacket:
     """One frame of a live source.
 
     names    ARKit shapes that it holds
-    weights  (52,) in the order of `ARKIT_SHAPES`, 0 for shapes that it lacks; None: the source sees no face
+    weights  (52,) in the order of `ARKIT_SHAPES`, 0 for shapes that it lacks; None: the source sees
+             no face
     head     yaw, pitch, roll in radians as in `Performance.head`; None where it holds none
     subject  the source's name for itself or its face
     time     seconds of the source's own clock; None where it sends none

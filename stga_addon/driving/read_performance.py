@@ -1,4 +1,5 @@
-"""Reading of face performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap and named weights in JSON."""
+"""Reading of face performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap and named
+weights in JSON."""
 
 import csv
 import math
@@ -19,28 +20,38 @@ USUAL_BASE = 60
 """Of a take of less than a second, whose frame numbers do not tell."""
 DAY_S = 86_400.0
 DROP_RATIO = 1000 / 1001
-"""Timecodes with a semicolon leave out frame numbers, because their frames come this much slower."""
+"""Timecodes with a semicolon leave out frame numbers, because their frames come this much
+slower."""
 
 
 def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     """(T,) seconds from the first of T timecodes `HH:MM:SS:FF.sub`, which may pass midnight.
 
-    The rate that FF counts in is found from the numbers themselves: rows may come at half of it. Raises StgaError,
-    which begins with `where` and names the row, for text that is no timecode.
+    The rate that FF counts in is found from the numbers themselves: rows may come at half of it.
+    Raises StgaError, which begins with `where` and names the row, for text that is no timecode.
     """
     fields = []
     for row, text in enumerate(texts):
         found = PATTERN.fullmatch(text.strip())
         if found is None:
-            raise StgaError(f"{where}: row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub")
+            raise StgaError(
+                f"{where}: row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
+            )
         hours, minutes, whole = (int(found[group]) for group in (1, 2, 3))
-        fields.append((hours, minutes, whole, int(found[5]), float(f"0.{found[6] or 0}"), found[4] == ";"))
+        fields.append(
+            (hours, minutes, whole, int(found[5]), float(f"0.{found[6] or 0}"), found[4] == ";")
+        )
     hours, minutes, whole, frames, parts, dropping = np.array(fields, np.float64).T
     second = 3600 * hours + 60 * minutes + whole
     base = _base(second, frames + parts)
     if dropping.any():
         total_minutes = 60 * hours + minutes
-        counted = second * base + frames + parts - round(base / 15) * (total_minutes - np.floor(total_minutes / 10))
+        counted = (
+            second * base
+            + frames
+            + parts
+            - round(base / 15) * (total_minutes - np.floor(total_minutes / 10))
+        )
         elapsed = counted / (base * DROP_RATIO)
     else:
         elapsed = second + (frames + parts) / base
@@ -69,7 +80,8 @@ _VALUE = re.compile(r"([A-Za-z_]+)[-&](-?\d+(?:\.\d+)?)", re.ASCII)
 
 
 def parse_packet(data: bytes) -> FacePacket | None:
-    """The frame of `mouthSmile_R-0|…|=head#rx,ry,rz,x,y,z|rightEye#x,y,z|leftEye#x,y,z|`, or None for other bytes.
+    """The frame of `mouthSmile_R-0|…|=head#rx,ry,rz,x,y,z|rightEye#x,y,z|leftEye#x,y,z|`, or None
+    for other bytes.
 
     Version 2 separates names and values by `&`. Source: the protocol's description by its author.
     """
@@ -110,19 +122,29 @@ DEFAULT_FPS = 60.0
 """Of files that hold neither times nor a rate: ARKit's own."""
 MIN_FPS, MAX_FPS = 1.0, 1000.0
 HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
-COUNT_COLUMN, TIMECODE_COLUMNS, SECONDS_COLUMNS = "blendshapecount", ("timecode",), ("time", "timestamp", "seconds")
+COUNT_COLUMN, TIMECODE_COLUMNS, SECONDS_COLUMNS = (
+    "blendshapecount",
+    ("timecode",),
+    ("time", "timestamp", "seconds"),
+)
 TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
 """Endings of files that Live Link Face writes beside a take's own."""
-FRAME_KEYS, NAME_KEYS = ("frames", "weightMat", "weights"), ("facsNames", "names", "blendShapeNames", "blendshapes")
+FRAME_KEYS, NAME_KEYS = (
+    ("frames", "weightMat", "weights"),
+    ("facsNames", "names", "blendShapeNames", "blendshapes"),
+)
 WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
 CATEGORY_KEYS = (("categoryName", "category_name", "name"), ("score", "value", "weight"))
 
 
 def is_performance(path: Path) -> bool:
-    """Whether a path has the form of a performance: one of `SUFFIXES`, or a Live Link Face take's folder."""
+    """Whether a path has the form of a performance: one of `SUFFIXES`, or a Live Link Face take's
+    folder."""
     if path.is_dir():
         return (
-            not (path / "flame_param").is_dir() and bool(_take_files(path)) and not any(path.glob("transforms*.json"))
+            not (path / "flame_param").is_dir()
+            and bool(_take_files(path))
+            and not any(path.glob("transforms*.json"))
         )
     return path.suffix.lower() in SUFFIXES
 
@@ -130,9 +152,10 @@ def is_performance(path: Path) -> bool:
 def read_performance(path: Path) -> Performance:
     """Read a performance by its content.
 
-    CSV of Live Link Face (or the take's folder) and of Audio2Face; JSON of Audio2Face and LAM-Audio2Expression, of
-    MediaPipe's blend shapes, or of any named weights per frame; iFacialMocap's packets as lines of text. Columns are
-    found by name. Raises StgaError naming the file, the row, and the shapes that are missing.
+    CSV of Live Link Face (or the take's folder) and of Audio2Face; JSON of Audio2Face and
+    LAM-Audio2Expression, of MediaPipe's blend shapes, or of any named weights per frame;
+    iFacialMocap's packets as lines of text. Columns are found by name. Raises StgaError naming the
+    file, the row, and the shapes that are missing.
     """
     if path.is_dir():
         path = _take_file(path)
@@ -143,11 +166,15 @@ def read_performance(path: Path) -> Performance:
         return _read_csv(path)
     if suffix == ".txt":
         return _read_packets(path)
-    raise StgaError(f"{path}: is no performance; expected {', '.join(SUFFIXES)} or the folder of a take")
+    raise StgaError(
+        f"{path}: is no performance; expected {', '.join(SUFFIXES)} or the folder of a take"
+    )
 
 
 def _take_files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ".csv" and path.is_file())
+    return sorted(
+        path for path in folder.iterdir() if path.suffix.lower() == ".csv" and path.is_file()
+    )
 
 
 def _take_file(folder: Path) -> Path:
@@ -172,34 +199,53 @@ def _text(path: Path) -> str:
 
 def _read_csv(path: Path) -> Performance:
     try:
-        rows = [row for row in csv.reader(_text(path).splitlines()) if any(cell.strip() for cell in row)]
+        rows = [
+            row for row in csv.reader(_text(path).splitlines()) if any(cell.strip() for cell in row)
+        ]
     except csv.Error as error:
         raise StgaError(f"{path}: is not valid CSV ({error})") from error
     if not rows:
         raise StgaError(f"{path}: is empty, expected a row of column names")
     header, body = [cell.strip() for cell in rows[0]], rows[1:]
     columns = columns_of(str(path), header)
-    plain = {name.rsplit(".", 1)[-1].lower(): index for index, name in reversed(list(enumerate(header)))}
+    plain = {
+        name.rsplit(".", 1)[-1].lower(): index for index, name in reversed(list(enumerate(header)))
+    }
     count = plain.get(COUNT_COLUMN)  # 0 in rows without a face, or they end after it
-    body = [row for row in body if count is None or (len(row) > count + 1 and row[count].strip() not in ("", "0"))]
+    body = [
+        row
+        for row in body
+        if count is None or (len(row) > count + 1 and row[count].strip() not in ("", "0"))
+    ]
     if not body:
         raise StgaError(f"{path}: has no row with a face")
     weights = np.zeros((len(body), COUNT))
     for column, index in columns.items():
-        weights[:, column] = [_number(path, row, number, index, header) for number, row in enumerate(body)]
+        weights[:, column] = [
+            _number(path, row, number, index, header) for number, row in enumerate(body)
+        ]
     head = None
     if all(name in plain for name in HEAD_COLUMNS):
-        cells = [[_number(path, row, n, plain[name], header) for name in HEAD_COLUMNS] for n, row in enumerate(body)]
+        cells = [
+            [_number(path, row, n, plain[name], header) for name in HEAD_COLUMNS]
+            for n, row in enumerate(body)
+        ]
         head = np.array(cells) if np.any(cells) else None
     return _performance(path, _csv_times(path, body, plain, header), weights, head)
 
 
-def _csv_times(path: Path, body: list[list[str]], plain: dict[str, int], header: list[str]) -> np.ndarray | None:
+def _csv_times(
+    path: Path, body: list[list[str]], plain: dict[str, int], header: list[str]
+) -> np.ndarray | None:
     code = next((plain[name] for name in TIMECODE_COLUMNS if name in plain), None)
     codes = [] if code is None else [row[code] if code < len(row) else "" for row in body]
     if any(":" in text for text in codes):
         return seconds_of(str(path), codes)
-    at = code if code is not None else next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
+    at = (
+        code
+        if code is not None
+        else next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
+    )
     if at is None:
         return None
     return np.array([_number(path, row, number, at, header) for number, row in enumerate(body)])
@@ -220,7 +266,9 @@ def _read_packets(path: Path) -> Performance:
     packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
     if not known:
-        raise StgaError(f"{path}: has no line of iFacialMocap, such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|")
+        raise StgaError(
+            f"{path}: has no line of iFacialMocap, such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
+        )
     columns_of(str(path), known[0].names)
     weights = np.stack([packet.weights for packet in known if packet.weights is not None])
     heads = [packet.head for packet in known]
@@ -268,8 +316,12 @@ def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) 
     if isinstance(frame, dict):
         found = next((frame[key] for key in WEIGHT_KEYS if key in frame), frame)
     if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
-        names_of, values_of = ([[e[k] for k in keys if k in e] for e in found] for keys in CATEGORY_KEYS)
-        found = {str((n or [None])[0]): (v or [0])[0] for n, v in zip(names_of, values_of, strict=True)}
+        names_of, values_of = (
+            [[e[k] for k in keys if k in e] for e in found] for keys in CATEGORY_KEYS
+        )
+        found = {
+            str((n or [None])[0]): (v or [0])[0] for n, v in zip(names_of, values_of, strict=True)
+        }
     if isinstance(found, list):
         if names is None or len(names) != len(found):
             known = "none" if names is None else str(len(names))
@@ -277,7 +329,11 @@ def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) 
         found = {str(name): value for name, value in zip(names, found, strict=True)}
     if not isinstance(found, dict):
         raise StgaError(f"{where}: is {shorten(frame)}, expected named weights")
-    weights = {str(name): value for name, value in found.items() if arkit_name(str(name)) or _is_number(value)}
+    weights = {
+        str(name): value
+        for name, value in found.items()
+        if arkit_name(str(name)) or _is_number(value)
+    }
     for name, value in weights.items():
         if not _is_number(value):
             raise StgaError(f"{where}: {shorten(name)} is {shorten(value)}, expected a number")
@@ -289,20 +345,34 @@ def _is_number(value: Any) -> bool:
 
 
 def _performance(
-    path: Path, times: np.ndarray | None, weights: np.ndarray, head: np.ndarray | None, fps: float | None = None
+    path: Path,
+    times: np.ndarray | None,
+    weights: np.ndarray,
+    head: np.ndarray | None,
+    fps: float | None = None,
 ) -> Performance:
     """The checked performance in the order of its times; of rows with the same time the first."""
     if len(weights) > MAX_ROWS:
         raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")
     if not (np.abs(weights) <= MAX_WEIGHT).all():
-        raise StgaError(f"{path}: holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1")
+        raise StgaError(
+            f"{path}: holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
+        )
     if head is not None and not (np.abs(head) <= 4 * math.pi).all():
-        raise StgaError(f"{path}: head rotation is beyond two turns, or not finite; expected radians")
+        raise StgaError(
+            f"{path}: head rotation is beyond two turns, or not finite; expected radians"
+        )
     if times is None:
         rate = DEFAULT_FPS if fps is None else fps
-        times = np.arange(len(weights)) / rate if MIN_FPS <= rate <= MAX_FPS else np.full(len(weights), np.nan)
+        times = (
+            np.arange(len(weights)) / rate
+            if MIN_FPS <= rate <= MAX_FPS
+            else np.full(len(weights), np.nan)
+        )
     if not np.isfinite(times).all():
-        raise StgaError(f"{path}: its times or its rate are not usable; expected {MIN_FPS:g} to {MAX_FPS:g} a second")
+        raise StgaError(
+            f"{path}: its times or its rate are not usable; expected {MIN_FPS:g} to {MAX_FPS:g} a second"
+        )
     times, first = np.unique(times - times.min(), return_index=True)
     steps = np.diff(times)
     rate = fps or (1 / float(np.median(steps)) if len(steps) else DEFAULT_FPS)

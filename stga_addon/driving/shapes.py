@@ -1,11 +1,14 @@
-"""What ARKit's shapes do to points of a face, measured on ICT-FaceKit, and where these points lie on a FLAME head.
+"""What ARKit's shapes do to points of a face, measured on ICT-FaceKit, and where these points lie
+on a FLAME head.
 
-`arkit_shapes.npz` holds samples of the ICT-FaceKit light model (MIT License, Copyright (c) 2020 USC Institute for
-Creative Technologies), made by `development/arkit_shapes.py`.
+`arkit_shapes.npz` holds samples of the ICT-FaceKit light model (MIT License, Copyright (c) 2020 USC
+Institute for Creative Technologies), made by `development/arkit_shapes.py`.
 
-ICT-FaceKit's points are moved onto the head: first by an affine map and ICT-FaceKit's own identities, iterating nearest
-points (point to plane, as Chen and Medioni 1992), then by a smooth warp (radial basis functions) with less and less
-smoothing. No detector and no table of landmarks is needed; a head must look along +z with y up.
+ICT-FaceKit's points are moved onto the head: first by an affine map and ICT-FaceKit's own
+identities, iterating nearest
+points (point to plane, as Chen and Medioni 1992), then by a smooth warp (radial basis functions)
+with less and less smoothing. No detector and no table of landmarks is needed; a head must look
+along +z with y up.
 """
 
 from dataclasses import dataclass
@@ -30,7 +33,8 @@ MOUTH_CLOSE, JAW_OPEN = COLUMN["mouthClose"], COLUMN["jawOpen"]
 
 @dataclass(frozen=True)
 class FaceShapes:
-    """ICT-FaceKit at MediaPipe's 478 landmarks, in meters, y up, looking along +z; the person's left is +x.
+    """ICT-FaceKit at MediaPipe's 478 landmarks, in meters, y up, looking along +z; the person's
+    left is +x.
 
     points, normals  (478, 3) of the neutral face
     reliable  (478,) bool: found on the surface by the detector
@@ -51,14 +55,19 @@ def face_shapes() -> FaceShapes:
     arrays = read_npz(SHAPES_FILE)
     shapes = np.zeros((COUNT, *arrays["points"].shape))
     shapes[[COLUMN[name] for name in ARKIT_SHAPES if name not in OPTIONAL]] = arrays["shapes"]
-    points, normals, identity = (arrays[name].astype(np.float64) for name in ("points", "normals", "identity"))
+    points, normals, identity = (
+        arrays[name].astype(np.float64) for name in ("points", "normals", "identity")
+    )
     return FaceShapes(points, normals, arrays["reliable"], shapes, identity)
 
 
 def effective_weights(weights: np.ndarray) -> np.ndarray:
-    """Weights (..., 52) with mouthClose at most jawOpen: it closes the lips of an open jaw, and does nothing else."""
+    """Weights (..., 52) with mouthClose at most jawOpen: it closes the lips of an open jaw, and
+    does nothing else."""
     limited = weights.copy()
-    limited[..., MOUTH_CLOSE] = np.minimum(weights[..., MOUTH_CLOSE], np.maximum(weights[..., JAW_OPEN], 0))
+    limited[..., MOUTH_CLOSE] = np.minimum(
+        weights[..., MOUTH_CLOSE], np.maximum(weights[..., JAW_OPEN], 0)
+    )
     return limited
 
 
@@ -85,7 +94,8 @@ MAX_SURFACE_DISTANCE_M = 0.003
 def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray]:
     """The 478 points on the neutral head, and (478,) bool which lie reliably on its skin.
 
-    `name` is what errors call the head. Raises StgaError where its eyes are not where a head has them.
+    `name` is what errors call the head. Raises StgaError where its eyes are not where a head has
+    them.
     """
     source, surface = face_shapes(), _Surface(model.v_template, model.faces)
     pupils = _pupils(model, name)
@@ -102,11 +112,16 @@ class _Surface:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.corners = vertices[faces]
         self.centers = self.corners.mean(axis=1)
-        normals = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
+        normals = np.cross(
+            self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0]
+        )
         self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
-    def nearest(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Triangle (N,), barycentric and position (N, 3), and distance (N,) of the nearest points that face alike."""
+    def nearest(
+        self, points: np.ndarray, normals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Triangle (N,), barycentric and position (N, 3), and distance (N,) of the nearest points
+        that face alike."""
         squared = (self.centers**2).sum(1) - 2 * points @ self.centers.T
         squared += np.where(normals @ self.normals.T < MIN_COSINE, FAR_M, 0.0)
         count = min(CANDIDATES, len(self.centers))
@@ -117,11 +132,17 @@ class _Surface:
         turned = np.einsum("nkc,nc->nk", self.normals[near], normals) < MIN_COSINE
         best = (distance + FAR_M * turned).argmin(axis=1)
         rows = np.arange(len(points))
-        return near[rows, best], barycentric[rows, best], positions[rows, best], distance[rows, best]
+        return (
+            near[rows, best],
+            barycentric[rows, best],
+            positions[rows, best],
+            distance[rows, best],
+        )
 
 
 def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (N, K, 3) of the points of triangles (N, K, 3, 3) nearest to points (N, 3)."""
+    """Barycentric coordinates (N, K, 3) of the points of triangles (N, K, 3, 3) nearest to points
+    (N, 3)."""
     a, b, c = np.moveaxis(corners, 2, 0)
     from_a, from_b = points[:, None] - a, points[:, None] - b
 
@@ -147,9 +168,13 @@ def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
             np.stack([zero, 1 - on_bc, on_bc], -1),
         ]
     )
-    distance = np.linalg.norm(np.einsum("onkb,nkbc->onkc", options, corners) - points[:, None], axis=-1)
+    distance = np.linalg.norm(
+        np.einsum("onkb,nkbc->onkc", options, corners) - points[:, None], axis=-1
+    )
     distance[0] = np.where(inside, distance[0], np.inf)
-    return np.asarray(np.take_along_axis(options, distance.argmin(axis=0)[None, ..., None], axis=0)[0])
+    return np.asarray(
+        np.take_along_axis(options, distance.argmin(axis=0)[None, ..., None], axis=0)[0]
+    )
 
 
 def _pupils(model: FlameModel, name: str) -> np.ndarray:
@@ -171,7 +196,9 @@ def _pupils(model: FlameModel, name: str) -> np.ndarray:
     return np.array(pupils)
 
 
-def _aligned(surface: _Surface, pupils: np.ndarray, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _aligned(
+    surface: _Surface, pupils: np.ndarray, skin: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (478, 3) after the affine map and the identities."""
     source = face_shapes()
     own = source.points[list(PUPILS)]
@@ -179,22 +206,38 @@ def _aligned(surface: _Surface, pupils: np.ndarray, skin: np.ndarray) -> tuple[n
     points = source.points @ linear + pupils.mean(axis=0) - own.mean(axis=0) @ linear
     normals = source.normals
     count = len(source.identity)
-    basis = np.einsum("ac,nb->nacb", np.eye(3), np.pad(source.points, ((0, 0), (0, 1)), constant_values=1.0))
-    basis = np.concatenate([basis.reshape(-1, 3, 12), source.identity.transpose(1, 2, 0) * linear[0, 0]], axis=2)
+    basis = np.einsum(
+        "ac,nb->nacb", np.eye(3), np.pad(source.points, ((0, 0), (0, 1)), constant_values=1.0)
+    )
+    basis = np.concatenate(
+        [basis.reshape(-1, 3, 12), source.identity.transpose(1, 2, 0) * linear[0, 0]], axis=2
+    )
     entries = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # of the affine map without its translation
     anchors = PUPIL_WEIGHT * basis[list(PUPILS)].reshape(6, -1)
     prior = np.zeros((9 + count, 12 + count))
     prior[np.arange(9), entries] = AFFINE_WEIGHT
-    prior[9 + np.arange(count), 12 + np.arange(count)] = IDENTITY_DEVIATION_M * np.sqrt(skin.sum() / count)
+    prior[9 + np.arange(count), 12 + np.arange(count)] = IDENTITY_DEVIATION_M * np.sqrt(
+        skin.sum() / count
+    )
     for _ in range(ITERATIONS):
         face, _, target, distance = surface.nearest(points[skin], normals[skin])
         kept = distance < max(MEDIANS * float(np.median(distance)), MAX_MATCH_M)
         moved, normal, target = basis[skin][kept], surface.normals[face[kept]], target[kept]
         rows = np.concatenate(
-            [np.einsum("na,nak->nk", normal, moved), TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count), anchors, prior]
+            [
+                np.einsum("na,nak->nk", normal, moved),
+                TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count),
+                anchors,
+                prior,
+            ]
         )
         expected = AFFINE_WEIGHT * np.trace(linear) / 3 * np.eye(3).ravel()
-        wanted = [(normal * target).sum(1), TANGENTIAL_WEIGHT * target.ravel(), PUPIL_WEIGHT * pupils.ravel(), expected]
+        wanted = [
+            (normal * target).sum(1),
+            TANGENTIAL_WEIGHT * target.ravel(),
+            PUPIL_WEIGHT * pupils.ravel(),
+            expected,
+        ]
         found = np.linalg.lstsq(rows, np.concatenate([*wanted, np.zeros(count)]), rcond=None)[0]
         linear = found[entries].reshape(3, 3)
         points = basis @ found

@@ -1,4 +1,5 @@
-"""The table of export formats, what their writers are given, and export of an avatar in one of them."""
+"""The table of export formats, what their writers are given, and export of an avatar in one of
+them."""
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -57,11 +58,13 @@ class Format:
 
     label, description  in menus
     suffixes  of the file, the usual one first; none: a folder
-    source    "frame": the avatar on one posed mesh; "range": on several; "motion": the avatar and its FLAME parameters
+    source    "frame": the avatar on one posed mesh; "range": on several; "motion": the avatar and
+              its FLAME parameters
     write     writes `content` to a path: returns the files, None where that is the path alone
     size      bytes that `frames` of an avatar take, about; of a "range"
     has_rate  whether it records how many frames play in a second
-    is_page   whether it shows what `Playback` holds besides the rate, and takes the FLAME motion where there is one
+    is_page   whether it shows what `Playback` holds besides the rate, and takes the FLAME motion
+              where there is one
     """
 
     label: str
@@ -113,7 +116,11 @@ FORMATS = {
         (".html", ".stga"),
         "range",
         lambda path, content: write_web(
-            path, content.avatar, content.playback, (mesh for _, mesh in content.meshes), content.sequence
+            path,
+            content.avatar,
+            content.playback,
+            (mesh for _, mesh in content.meshes),
+            content.sequence,
         ),
         lambda avatar, frames: web_bytes(avatar),
         has_rate=True,
@@ -131,7 +138,9 @@ FORMATS = {
         "The current frame compressed, a tenth of a PLY's size",
         (".spz",),
         "frame",
-        lambda path, content: write_spz(path, content.first_frame(path), content.avatar.antialiased),
+        lambda path, content: write_spz(
+            path, content.first_frame(path), content.avatar.antialiased
+        ),
     ),
 }
 
@@ -147,14 +156,15 @@ def export_avatar(
 ) -> list[Path]:
     """Write an avatar in one of FORMATS, all of its files or none; returns the files written.
 
-    path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its number; an earlier
-             sequence there is replaced as a whole) and "gaussian-avatars" (point_cloud.ply and flame_param.npz)
+    path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its
+             number; an earlier sequence there is replaced as a whole) and "gaussian-avatars"
+             (point_cloud.ply and flame_param.npz)
     meshes   taken one at a time; a "frame" takes the first
     sequence the FLAME motion, for "gaussian-avatars"; for "web", where its rig is to go along
     fps      meshes per second
     playback what else a "web" page shows, and its meshes per second
-    Raises StgaError where the suffix is another, the format needs what is not given or has no such frame rate, or a
-    file cannot be written.
+    Raises StgaError where the suffix is another, the format needs what is not given or has no such
+    frame rate, or a file cannot be written.
     """
     check_suffix(path, format)
     playback = playback or Playback(fps=fps)
@@ -171,7 +181,8 @@ def check_suffix(path: Path, format: str) -> None:
 
 
 def check_free_space(path: Path, size: int) -> None:
-    """Raise StgaError where the disk that `path` is to be written to has less than `size` bytes free."""
+    """Raise StgaError where the disk that `path` is to be written to has less than `size` bytes
+    free."""
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     free = shutil.disk_usage(folder).free
     if size > free:

@@ -21,14 +21,17 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 def write_gltf(path: Path, world: Splats) -> None:
     """Write world-space splats as a .glb file with one mesh of points, atomically.
 
-    Meters, y up as in the splats; rotations xyzw, standard deviations linear, opacity 0 to 1, every coefficient of the
-    spherical harmonics an attribute. COLOR_0 is what a viewer without the extension shows.
+    Meters, y up as in the splats; rotations xyzw, standard deviations linear, opacity 0 to 1, every
+    coefficient of the spherical harmonics an attribute. COLOR_0 is what a viewer without the
+    extension shows.
     Source: Khronos, KHR_gaussian_splatting.
     """
     attributes = _attributes(world)
     views, accessors, offset = [], list[dict[str, Any]](), 0
     for name, array in attributes.items():
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _VERTICES})
+        views.append(
+            {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _VERTICES}
+        )
         accessor: dict[str, Any] = {"bufferView": len(views) - 1, "count": len(array)}
         accessor["componentType"] = _COMPONENTS[array.dtype.name]
         accessor["type"] = _TYPES[array.shape[1] if array.ndim > 1 else 1]
@@ -83,5 +86,7 @@ def _attributes(world: Splats) -> dict[str, np.ndarray]:
     }
     for degree in range(world.sh_degree + 1):
         for index in range(2 * degree + 1):
-            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"] = world.sh[:, degree**2 + index]
+            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"] = world.sh[
+                :, degree**2 + index
+            ]
     return {name: np.ascontiguousarray(array) for name, array in attributes.items()}

@@ -1,4 +1,5 @@
-"""How an exported avatar plays: frames per second, cameras, selection, and whether its rig goes along."""
+"""How an exported avatar plays: frames per second, cameras, selection, and whether its rig goes
+along."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,10 +21,13 @@ MAX_VIEWS = 32
 
 @dataclass(frozen=True)
 class ShapeControls:
-    """Sliders of a page that move expressions, jaw and eyes of its FLAME rig together, such as ARKit's shapes.
+    """Sliders of a page that move expressions, jaw and eyes of its FLAME rig together, such as
+    ARKit's shapes.
 
-    linear    (C, E + 9): expression coefficients, then axis-angles of jaw, left and right eye, per weight of control
-    products  (C, E): expression coefficients per product of a weight and that of the control `opens`
+    linear    (C, E + 9): expression coefficients, then axis-angles of jaw, left and right eye, per
+              weight of control
+    products  (C, E): expression coefficients per product of a weight and that of the control
+              `opens`
     limited   the control whose weight counts up to that of `opens` only
     """
 
@@ -43,7 +47,8 @@ class Playback:
     views      name -> camera in the avatar's space; the first is where a viewer begins
     up         (3,) direction that points up in the avatar's space
     selection  (F,) bool per pose: the triangles that it trained; None where that is not known
-    motion_only  leave out blend shapes, skeleton and sliders of the FLAME file; the posed meshes stay
+    motion_only  leave out blend shapes, skeleton and sliders of the FLAME file; the posed meshes
+                 stay
     controls   sliders beside those of the rig; only of FLAME heads, and not with `motion_only`
     """
 
@@ -56,11 +61,14 @@ class Playback:
     controls: ShapeControls | None = None
 
 
-def playback_fps(capture: Capture | None, given: float | None = None, numbered: bool = False) -> float:
-    """Poses per second at which a capture plays: the given ones, else those of its recording, else `DEFAULT_FPS`.
+def playback_fps(
+    capture: Capture | None, given: float | None = None, numbered: bool = False
+) -> float:
+    """Poses per second at which a capture plays: the given ones, else those of its recording, else
+    `DEFAULT_FPS`.
 
-    numbered: poses are shown at the numbers of their timesteps, as in Blender and USD. Otherwise one follows the other,
-    so that every third frame of a recording plays at a third of its rate.
+    numbered: poses are shown at the numbers of their timesteps, as in Blender and USD. Otherwise
+    one follows the other, so that every third frame of a recording plays at a third of its rate.
     """
     if given is not None:
         return given
@@ -71,6 +79,9 @@ def playback_fps(capture: Capture | None, given: float | None = None, numbered: 
 
 
 def check_rate(path: Path, fps: float) -> None:
-    """Raise StgaError where `fps` is not from MIN_FPS to MAX_FPS, which the file at `path` could not hold."""
+    """Raise StgaError where `fps` is not from MIN_FPS to MAX_FPS, which the file at `path` could
+    not hold."""
     if not MIN_FPS <= fps <= MAX_FPS:
-        raise StgaError(f"{path}: the frame rate (--fps) must be from {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}")
+        raise StgaError(
+            f"{path}: the frame rate (--fps) must be from {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}"
+        )

@@ -1,4 +1,5 @@
-"""3D Gaussians as PLY files, and GaussianAvatars' pair of files: splats bound to triangles, and the FLAME motion."""
+"""3D Gaussians as PLY files, and GaussianAvatars' pair of files: splats bound to triangles, and the
+FLAME motion."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -48,18 +49,20 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 def write_ply(path: Path, world: Splats) -> None:
     """Write world-space splats in 3D Gaussian Splatting's PLY layout, binary, atomically.
 
-    All float32 and before activation; normals zero; f_rest channel by channel, zero-padded to degree 3.
+    All float32 and before activation; normals zero; f_rest channel by channel, zero-padded to
+    degree 3.
     """
     with replacing(path) as partial:
         save_columns(partial, PROPERTIES, splat_columns(world))
 
 
 def write_ply_sequence(folder: Path, frames: Iterable[tuple[int, Splats]]) -> list[Path]:
-    """Write numbered world-space splats as 00012.ply, … into `folder`, all or none; returns the files.
+    """Write numbered world-space splats as 00012.ply, … into `folder`, all or none; returns the
+    files.
 
-    They replace an earlier sequence, whose other files are removed once they are written; all else in the folder stays.
-    Raises StgaError where a file cannot be written or removed, and, before, where the folder holds files with such
-    names that this function did not write.
+    They replace an earlier sequence, whose other files are removed once they are written; all else
+    in the folder stays. Raises StgaError where a file cannot be written or removed, and, before,
+    where the folder holds files with such names that this function did not write.
     """
     files = NumberedFiles(folder, FRAME_NAME)
     written = []
@@ -126,11 +129,14 @@ def splat_columns(splats: Splats) -> np.ndarray:
 
 
 def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """(N, len(names)) float32 of the named properties. Raises StgaError where one is missing or not finite."""
+    """(N, len(names)) float32 of the named properties. Raises StgaError where one is missing or not
+    finite."""
     columns = np.empty((len(vertices), len(names)), np.float32)
     for i, name in enumerate(names):
         if name not in (vertices.dtype.names or ()):
-            raise StgaError(f"{path}: has no property {name!r}, which a 3D Gaussian Splatting PLY must have")
+            raise StgaError(
+                f"{path}: has no property {name!r}, which a 3D Gaussian Splatting PLY must have"
+            )
         columns[:, i] = vertices[name]
     if not np.isfinite(columns).all():
         bad = names[int(np.argmin(np.isfinite(columns).all(axis=0)))]
@@ -139,7 +145,8 @@ def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.
 
 
 def save_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
-    """Write (N, len(names)) float32 as the vertices of a binary little-endian PLY, not atomically. Raises OSError."""
+    """Write (N, len(names)) float32 as the vertices of a binary little-endian PLY, not atomically.
+    Raises OSError."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns)}"]
     lines += [f"property float {name}" for name in names]
     with path.open("wb") as out:
@@ -150,8 +157,8 @@ def save_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
 def read_vertices(path: Path) -> np.ndarray:
     """Structured array (N,) of a PLY file's vertices, binary or ASCII, one field a property.
 
-    Raises StgaError where the file is missing, malformed or shorter than its header says. Nothing is allocated
-    before the file is known to hold it.
+    Raises StgaError where the file is missing, malformed or shorter than its header says. Nothing
+    is allocated before the file is known to hold it.
     """
     size = file_size(path)
     try:
@@ -159,19 +166,27 @@ def read_vertices(path: Path) -> np.ndarray:
             is_ascii, offset, skipped, count, dtype = _read_header(path, file)
             names = dtype.names or ()
             # An ASCII number takes at least two bytes with its separator.
-            need = 2 * (count * len(names) + skipped) - 1 if is_ascii else count * dtype.itemsize + skipped
+            need = (
+                2 * (count * len(names) + skipped) - 1
+                if is_ascii
+                else count * dtype.itemsize + skipped
+            )
             if size < offset + need:
                 raise StgaError(f"{path}: is truncated: {size} bytes cannot hold {count} vertices")
             file.seek(offset if is_ascii else offset + skipped)
             if not is_ascii or not count:
                 return np.fromfile(file, dtype, count)
-            table = np.loadtxt(file, np.float64, skiprows=skipped, max_rows=count, ndmin=2, comments=None)
+            table = np.loadtxt(
+                file, np.float64, skiprows=skipped, max_rows=count, ndmin=2, comments=None
+            )
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
         raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
     if table.shape != (count, len(names)):
-        raise StgaError(f"{path}: has vertices of shape {table.shape}, its header announces {(count, len(names))}")
+        raise StgaError(
+            f"{path}: has vertices of shape {table.shape}, its header announces {(count, len(names))}"
+        )
     vertices = np.empty(count, dtype)
     for i, name in enumerate(names):
         vertices[name] = table[:, i]
@@ -179,7 +194,8 @@ def read_vertices(path: Path) -> np.ndarray:
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dtype]:
-    """Whether ASCII; where the data starts; bytes (rows if ASCII) before the vertices; their number and type."""
+    """Whether ASCII; where the data starts; bytes (rows if ASCII) before the vertices; their number
+    and type."""
     start = file.read(MAX_HEADER_BYTES)
     end = start.find(b"\nend_header")
     newline = start.find(b"\n", end + 1)
@@ -211,7 +227,9 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dt
         if number < 0 or not order or not properties:
             break
         if "list" in properties.values():
-            raise StgaError(f"{path}: PLY element {name!r} has a list property before the vertices end, not supported")
+            raise StgaError(
+                f"{path}: PLY element {name!r} has a list property before the vertices end, not supported"
+            )
         dtype = np.dtype(list(properties.items()))
         if name == "vertex":
             return is_ascii, newline + 1, skipped, number, dtype
@@ -224,16 +242,21 @@ MOTION_NAME = "flame_param.npz"
 BINDING = "binding_0"
 
 
-def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence | None) -> list[Path]:
-    """Write point_cloud.ply and flame_param.npz of GaussianAvatars' layout into `folder`, both or neither.
+def write_gaussian_avatars(
+    folder: Path, avatar: Avatar, sequence: FlameSequence | None
+) -> list[Path]:
+    """Write point_cloud.ply and flame_param.npz of GaussianAvatars' layout into `folder`, both or
+    neither.
 
-    Splats go out in the "gaussian_avatars" convention, all float32 and before activation, with the triangle as the
-    float property binding_0. The motion holds every timestep of `sequence`, its static offset, and the dynamic
-    offset that the viewer requires. Returns the two files. Raises StgaError without a sequence, or where its mesh is
-    not the avatar's.
+    Splats go out in the "gaussian_avatars" convention, all float32 and before activation, with the
+    triangle as the float property binding_0. The motion holds every timestep of `sequence`, its
+    static offset, and the dynamic offset that the viewer requires. Returns the two files. Raises
+    StgaError without a sequence, or where its mesh is not the avatar's.
     """
     if sequence is None:
-        raise StgaError(f"{folder}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture")
+        raise StgaError(
+            f"{folder}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture"
+        )
     if not np.array_equal(sequence.model.faces, avatar.faces):
         raise StgaError(
             f"{folder}: the avatar's mesh ({len(avatar.faces)} triangles) is not the FLAME model's "
@@ -250,10 +273,12 @@ def write_gaussian_avatars(folder: Path, avatar: Avatar, sequence: FlameSequence
 
 
 def in_convention(avatar: Avatar, convention: str) -> Splats:
-    """The avatar's splats in the frames of another convention, at the same places on the neutral mesh.
+    """The avatar's splats in the frames of another convention, at the same places on the neutral
+    mesh.
 
-    Both conventions have their origin at the centroid, which is left out for precision. On deformed triangles the
-    conventions scale differently, and so do the splats. What follows strain is that of the neutral mesh.
+    Both conventions have their origin at the centroid, which is left out for precision. On deformed
+    triangles the conventions scale differently, and so do the splats. What follows strain is that
+    of the neutral mesh.
     """
     splats = avatar.splats
     if splats.strain_color.shape[1]:
@@ -264,7 +289,8 @@ def in_convention(avatar: Avatar, convention: str) -> Splats:
     here, there = (
         replace(frames, origin=np.zeros_like(frames.origin))
         for frames in (
-            face_frames(avatar.neutral, avatar.faces, avatar.neutral, name) for name in (avatar.convention, convention)
+            face_frames(avatar.neutral, avatar.faces, avatar.neutral, name)
+            for name in (avatar.convention, convention)
         )
     )
     return to_local(to_world(splats, here), there, splats.face)

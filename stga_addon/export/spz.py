@@ -11,7 +11,8 @@ from ..avatar.splats import Splats
 from ..files import replacing
 
 MAGIC, VERSION = b"NGSP", 3
-"""Version 3 is the last one packed by gzip; version 4 needs Zstandard, which Blender's Python lacks."""
+"""Version 3 is the last one packed by gzip; version 4 needs Zstandard, which Blender's Python
+lacks."""
 ANTIALIASED = 1
 MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""
@@ -22,9 +23,10 @@ COLOR_SCALE = 0.15
 def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     """Write world-space splats as .spz of version 3, atomically.
 
-    Axes as in the splats: x right, y up, z back. Quantized: positions as MAX_FRACTION_BITS says, standard deviations
-    from 45 µm in steps of 6 %, rotations 10 bits a component, opacity and color 8 bits; coefficients above degree 0
-    are cut at ±1. antialiased as in `Avatar`. Source: Niantic's README and `load-spz.cc`.
+    Axes as in the splats: x right, y up, z back. Quantized: positions as MAX_FRACTION_BITS says,
+    standard deviations from 45 µm in steps of 6 %, rotations 10 bits a component, opacity and color
+    8 bits; coefficients above degree 0 are cut at ±1. antialiased as in `Avatar`. Source: Niantic's
+    README and `load-spz.cc`.
     """
     # As many bits of a coordinate behind the point as the largest one leaves.
     largest = max(float(np.abs(world.xyz).max(initial=0)), 1.0)
@@ -34,7 +36,8 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     flags = ANTIALIASED if antialiased else 0
     header = MAGIC + struct.pack("<IIBBBB", VERSION, len(world), world.sh_degree, bits, flags, 0)
     columns = (
-        whole.view(np.uint8).reshape(-1, 3, 4)[..., :3],  # two's complement, least significant byte first
+        # two's complement, least significant byte first
+        whole.view(np.uint8).reshape(-1, 3, 4)[..., :3],
         _byte(world.opacities() * 255),
         _byte((world.sh[:, 0] * COLOR_SCALE + 0.5) * 255),
         _byte((world.log_scale + 10) * 16),
@@ -51,7 +54,8 @@ def _byte(values: np.ndarray) -> np.ndarray:
 
 
 def _smallest_three(rotation: np.ndarray) -> np.ndarray:
-    """(N,) uint32 of unit quaternions xyzw (N, 4): the index of the largest component, then the others.
+    """(N,) uint32 of unit quaternions xyzw (N, 4): the index of the largest component, then the
+    others.
 
     Each of them has a sign bit and nine bits of magnitude, in units of sqrt(½) / 511.
     """

@@ -18,16 +18,20 @@ EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
 
 
-def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool = False) -> None:
+def write_usd(
+    path: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool = False
+) -> None:
     """Write numbered world-space splats as the time samples of one prim, atomically.
 
     path          .usdc, or .usdz, a package of the same
     frames        at least one pair of a time code and splats, time codes ascending
     fps           time codes per second
-    moving_color  whether the spherical harmonics differ between frames: written for each of them, in half precision
-    Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. Splats and opacities stay
-    the same. A frame is in the file before the next is taken, so memory does not grow with their number.
-    Raises StgaError where USD is not installed, or a file cannot be written.
+    moving_color  whether the spherical harmonics differ between frames: written for each of them,
+                  in half precision
+    Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. Splats and
+    opacities stay the same. A frame is in the file before the next is taken, so memory does not
+    grow with their number. Raises StgaError where USD is not installed, or a file cannot be
+    written.
     """
     try:
         import pxr as usd
@@ -37,7 +41,9 @@ def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, movi
         import pxr.UsdGeom
         import pxr.Vt
     except ImportError as error:
-        raise StgaError(f"{path}: USD files need the package usd-core, which this Python lacks") from error
+        raise StgaError(
+            f"{path}: USD files need the package usd-core, which this Python lacks"
+        ) from error
     with replacing(path) as partial:
         try:
             if path.suffix.lower() == ".usdz":
@@ -50,19 +56,26 @@ def write_usd(path: Path, frames: Iterable[tuple[int, Splats]], fps: float, movi
 
 
 def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
-    """Size of the binary file: positions, rotations and scales per frame, opacities and constant colors once."""
+    """Size of the binary file: positions, rotations and scales per frame, opacities and constant
+    colors once."""
     coefficients = 3 * splats.sh.shape[1]
     once, each = (4, 40 + 2 * coefficients) if moving_color else (4 + 4 * coefficients, 40)
     return len(splats) * (once + each * frames)
 
 
 def _write_package(
-    usd: Any, file: Path, name: str, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool
+    usd: Any,
+    file: Path,
+    name: str,
+    frames: Iterable[tuple[int, Splats]],
+    fps: float,
+    moving_color: bool,
 ) -> None:
     layer = file.with_name(f".layer{file.name}")
     try:
         _write_layer(usd, layer, frames, fps, moving_color)
-        writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter  # there before USD 26
+        # there before USD 26
+        writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter
         with writer.CreateNew(str(file)) as archive:
             archive.AddFile(str(layer), name)
         if not zipfile.is_zipfile(file):  # the writer reports no error where the disk is full
@@ -71,7 +84,9 @@ def _write_package(
         layer.unlink(missing_ok=True)
 
 
-def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool) -> None:
+def _write_layer(
+    usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps: float, moving_color: bool
+) -> None:
     layer = usd.Sdf.Layer.New(usd.Sdf.FileFormat.FindById("usdc"), str(file))
     stage = usd.Usd.Stage.Open(layer)
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -89,7 +104,8 @@ def _write_layer(usd: Any, file: Path, frames: Iterable[tuple[int, Splats]], fps
 
 
 def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
-    """The prim with what does not change. By names, not by USD's class of it, which older versions lack."""
+    """The prim with what does not change. By names, not by USD's class of it, which older versions
+    lack."""
     types, uniform = usd.Sdf.ValueTypeNames, usd.Sdf.VariabilityUniform
     root = stage.DefinePrim("/Avatar", "Xform")
     stage.SetDefaultPrim(root)
@@ -100,10 +116,14 @@ def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
         ("radiance:sphericalHarmonicsDegree", types.Int, first.sh_degree),
     ):
         prim.CreateAttribute(name, kind, False, uniform).Set(value)
-    prim.CreateAttribute("opacities", types.FloatArray, False).Set(usd.Vt.FloatArray.FromNumpy(first.opacities()))
+    prim.CreateAttribute("opacities", types.FloatArray, False).Set(
+        usd.Vt.FloatArray.FromNumpy(first.opacities())
+    )
     if not moving_color:
         coefficients = usd.Vt.Vec3fArray.FromNumpy(_rows(first.sh))
-        prim.CreateAttribute("radiance:sphericalHarmonicsCoefficients", types.Float3Array, False).Set(coefficients)
+        prim.CreateAttribute(
+            "radiance:sphericalHarmonicsCoefficients", types.Float3Array, False
+        ).Set(coefficients)
     return prim
 
 
@@ -117,7 +137,11 @@ def _write_sample(usd: Any, prim: Any, time: int, world: Splats, moving_color: b
         ("positions", types.Point3fArray, vt.Vec3fArray.FromNumpy(_rows(world.xyz))),
         ("scales", types.Float3Array, vt.Vec3fArray.FromNumpy(_rows(scales))),
         # FromNumpy takes xyzw
-        ("orientations", types.QuatfArray, vt.QuatfArray.FromNumpy(_rows(world.unit_rotations()[:, [1, 2, 3, 0]]))),
+        (
+            "orientations",
+            types.QuatfArray,
+            vt.QuatfArray.FromNumpy(_rows(world.unit_rotations()[:, [1, 2, 3, 0]])),
+        ),
     ]
     if moving_color:
         half = vt.Vec3hArray.FromNumpy(_rows(world.sh).astype(np.float16))

@@ -8,7 +8,8 @@ from .model import FlameModel
 from .quaternions import from_axis_angle, to_matrices
 
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
-"""The last numbers of a frame's parameters: axis-angles of five joints, and the translation. Expression comes first."""
+"""The last numbers of a frame's parameters: axis-angles of five joints, and the translation.
+Expression comes first."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
 SMALL_ANGLE = 1e-4
 """Radians, below which a quotient by the squared angle is its limit."""
@@ -66,11 +67,14 @@ def cross_matrices(vectors: np.ndarray) -> np.ndarray:
     """(N, 3, 3): the matrices of x ↦ vector × x, of vectors (N, 3)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
-    return np.stack([np.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2)
+    return np.stack(
+        [np.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2
+    )
 
 
 def left_jacobian(angles: np.ndarray) -> np.ndarray:
-    """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of it amounts to."""
+    """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of
+    it amounts to."""
     angle = float(np.linalg.norm(angles))
     cross = cross_matrices(angles[None])[0]
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
@@ -81,7 +85,8 @@ def left_jacobian(angles: np.ndarray) -> np.ndarray:
 def shaped_vertices(
     model: FlameModel, shape: np.ndarray, expr: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """Template with identity (I,), expression (E,) and vertex offset (V, 3) added, before posing: (V, 3) meters."""
+    """Template with identity (I,), expression (E,) and vertex offset (V, 3) added, before posing:
+    (V, 3) meters."""
     shaped = model.v_template + model.shapedirs @ np.concatenate([shape, expr])
     return np.asarray(shaped if offset is None else shaped + offset)
 
@@ -94,9 +99,11 @@ def joint_positions(model: FlameModel, shaped: np.ndarray) -> np.ndarray:
 def flame_forward(
     model: FlameModel, shape: np.ndarray, frame: FlameFrame, static_offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """Vertices (V, 3) in meters of one frame: blend shapes, pose correctives, linear blend skinning, translation.
+    """Vertices (V, 3) in meters of one frame: blend shapes, pose correctives, linear blend
+    skinning, translation.
 
-    shape (I,); static_offset (V, 3) or None. FLAME (Li et al. 2017) with the vertex offsets of VHAP.
+    shape (I,); static_offset (V, 3) or None. FLAME (Li et al. 2017) with the vertex offsets of
+    VHAP.
     """
     offsets = [offset for offset in (static_offset, frame.dynamic_offset) if offset is not None]
     shaped = shaped_vertices(model, shape, frame.expr, np.sum(offsets, axis=0) if offsets else None)
@@ -105,16 +112,23 @@ def flame_forward(
     return np.asarray(vertices + frame.translation)
 
 
-def parameters_gradient(model: FlameModel, frame: FlameFrame, vertex_gradient: np.ndarray) -> np.ndarray:
-    """(E + 18,) gradient of a scalar with respect to the frame's `parameters`, from that with respect to its vertices
-    (V, 3): the reverse of `flame_forward`, of a model whose template has the identity and the static offset.
+def parameters_gradient(
+    model: FlameModel, frame: FlameFrame, vertex_gradient: np.ndarray
+) -> np.ndarray:
+    """(E + 18,) gradient of a scalar with respect to the frame's `parameters`, from that with
+    respect to its vertices (V, 3): the reverse of `flame_forward`, of a model whose template has
+    the identity and the static offset.
     """
     shaped = model.v_template + model.shapedirs[:, :, model.n_identity :] @ frame.expr
-    posed = _posed(model, shaped if frame.dynamic_offset is None else shaped + frame.dynamic_offset, frame)
+    posed = _posed(
+        model, shaped if frame.dynamic_offset is None else shaped + frame.dynamic_offset, frame
+    )
     force = model.weights.T @ vertex_gradient  # (5, 3), by where each joint moves what it carries
     by_corrected = np.einsum("vab,va->vb", posed.skin, vertex_gradient)
     outer = (vertex_gradient[:, :, None] * posed.corrected[:, None]).reshape(-1, 9)
-    by_world = (model.weights.T @ outer).reshape(-1, 3, 3) - force[:, :, None] * posed.joints[:, None]
+    by_world = (model.weights.T @ outer).reshape(-1, 3, 3) - force[:, :, None] * posed.joints[
+        :, None
+    ]
     by_place, by_joint = force.copy(), -np.einsum("jab,ja->jb", posed.world, force)
     by_local = np.zeros_like(by_world)
     for joint in reversed(range(len(model.parents))):
@@ -132,7 +146,9 @@ def parameters_gradient(model: FlameModel, frame: FlameFrame, vertex_gradient: n
     by_local[1:] += np.tensordot(by_corrected, model.posedirs, 2).reshape(-1, 3, 3)
     twist = by_local @ posed.local.swapaxes(1, 2)
     torque = np.stack([twist[:, k - 1, k - 2] - twist[:, k - 2, k - 1] for k in range(3)], 1)
-    by_pose = [left_jacobian(own).T @ by_turn for own, by_turn in zip(frame.pose, torque, strict=True)]
+    by_pose = [
+        left_jacobian(own).T @ by_turn for own, by_turn in zip(frame.pose, torque, strict=True)
+    ]
     by_shaped = by_corrected + model.j_regressor.T @ by_joint
     by_expression = np.tensordot(by_shaped, model.shapedirs[:, :, model.n_identity :], 2)
     return np.concatenate([by_expression, *by_pose, vertex_gradient.sum(0)])
@@ -140,8 +156,9 @@ def parameters_gradient(model: FlameModel, frame: FlameFrame, vertex_gradient: n
 
 @dataclass(frozen=True)
 class _Posed:
-    """Of a frame: joints (5, 3) and vertices with pose correctives (V, 3), both unposed; rotations (5, 3, 3) of the
-    joints in their parents and in the world; `moved` (5, 3): a joint takes x to R x + moved; R blended (V, 3, 3)."""
+    """Of a frame: joints (5, 3) and vertices with pose correctives (V, 3), both unposed; rotations
+    (5, 3, 3) of the joints in their parents and in the world; `moved` (5, 3): a joint takes x to R
+    x + moved; R blended (V, 3, 3)."""
 
     joints: np.ndarray
     corrected: np.ndarray
@@ -160,4 +177,6 @@ def _posed(model: FlameModel, shaped: np.ndarray, frame: FlameFrame) -> _Posed:
             world[joint] = world[parent] @ local[joint]
             places[joint] = places[parent] + world[parent] @ (joints[joint] - joints[parent])
     moved = places - np.einsum("jab,jb->ja", world, joints)
-    return _Posed(joints, corrected, local, world, moved, np.einsum("vj,jab->vab", model.weights, world))
+    return _Posed(
+        joints, corrected, local, world, moved, np.einsum("vj,jab->vab", model.weights, world)
+    )

@@ -1,4 +1,5 @@
-"""FLAME head models: template, blend shapes, a skeleton of five joints, and regions of triangles."""
+"""FLAME head models: template, blend shapes, a skeleton of five joints, and regions of
+triangles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,17 +13,19 @@ from .unpickle import read_pickled_arrays
 
 JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
 POSE_FEATURES = 9 * (len(JOINTS) - 1)
-FULL_COMPONENTS, FULL_IDENTITY = 400, 300  # FLAME 2020 and 2023: 300 identity then 100 expression components
+# FLAME 2020 and 2023: 300 identity then 100 expression components
+FULL_COMPONENTS, FULL_IDENTITY = 400, 300
 MASK_FILE = "FLAME_masks.pkl"
 MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
 MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
 BUNDLED_HEAD = Path(__file__).with_name("head.npz")
-"""The head model of this package: ICT-FaceKit (MIT License, Copyright (c) 2020 USC Institute for Creative Technologies)
-in FLAME's form, made by `development/bundled_head.py`."""
+"""The head model of this package: ICT-FaceKit (MIT License, Copyright (c) 2020 USC Institute for
+Creative Technologies) in FLAME's form, made by `development/bundled_head.py`."""
 EXPRESSION_NAMES = "expression_names"
 """Key of the names in model files, and in motions of the bundled head."""
 SHAPE_STEP_M = 1e-5
-"""Step of `shape_steps` (K, V, 3), displacements in whole numbers, which a file may have in place of shapedirs."""
+"""Step of `shape_steps` (K, V, 3), displacements in whole numbers, which a file may have in place
+of shapedirs."""
 # Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
 KEY_MASKS = {
     "left_eye": ("left_eye_region", "left_eyeball"),
@@ -33,22 +36,26 @@ KEY_MASKS = {
 EYEBALL_WEIGHT = 0.9
 """Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
 MIN_TORSO_WEIGHT = 0.7
-"""Skinning weight of the root joint at the torso's vertices; the published FLAME's last ring has 0.9."""
+"""Skinning weight of the root joint at the torso's vertices; the published FLAME's last ring has
+0.9."""
 
 
 @dataclass(frozen=True)
 class FlameModel:
-    """FLAME's parameters as float64 arrays; V vertices, F triangles, K shape components, joints as in `JOINTS`.
+    """FLAME's parameters as float64 arrays; V vertices, F triangles, K shape components, joints as
+    in `JOINTS`.
 
     v_template   (V, 3) meters
     shapedirs    (V, 3, K): the first `n_identity` are identity, the others expression
-    posedirs     (V, 3, 36): correctives, linear in the entries of the rotations of joints 1 to 4 minus identity
+    posedirs     (V, 3, 36): correctives, linear in the entries of the rotations of joints 1 to 4
+                 minus identity
     j_regressor  (5, V): shaped vertices to joint positions
     parents      (5,) int, -1 for the root
     weights      (V, 5) skinning weights
     faces        (F, 3) int32
     masks        region name -> vertex ids
-    expression_names  ARKit's name of each expression, whose coefficient is then a weight from 0 to 1; else ()
+    expression_names  ARKit's name of each expression, whose coefficient is then a weight from 0 to
+                      1; else ()
     """
 
     v_template: np.ndarray
@@ -72,9 +79,11 @@ def read_flame(path: Path) -> FlameModel:
     """Read a FLAME model from the published .pkl or from an .npz with the same keys.
 
     Vertex masks come from an npz model's own `masks/<region>` entries, else from FLAME_masks.pkl
-    beside the model where there is one. Any sizes that agree with each other are accepted. An npz may name its
-    expressions (`expression_names`), have `shape_steps` in place of shapedirs, and no posedirs. Raises StgaError naming
-    the file and key that is missing, of the wrong shape or not finite, and any class in a pickle that is not an array.
+    beside the model where there is one. Any sizes that agree with each other are accepted. An npz
+    may name its
+    expressions (`expression_names`), have `shape_steps` in place of shapedirs, and no posedirs.
+    Raises StgaError naming the file and key that is missing, of the wrong shape or not finite, and
+    any class in a pickle that is not an array.
     """
     path = Path(path)
     in_npz = path.suffix.lower() == ".npz"
@@ -116,7 +125,9 @@ def _expression_names(path: Path, arrays: Mapping[str, np.ndarray], count: int) 
         return ()
     names = arrays[EXPRESSION_NAMES]
     if names.dtype.kind != "U" or names.shape != (count,) or len(set(names.tolist())) != count:
-        raise StgaError(f"{path}: expression_names: expected {count} different names, one per expression")
+        raise StgaError(
+            f"{path}: expression_names: expected {count} different names, one per expression"
+        )
     return tuple(names.tolist())
 
 
@@ -129,7 +140,9 @@ def _check_shape(path: Path, key: str, array: np.ndarray, expected: tuple[int | 
         raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
 
 
-def _floats(path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tuple[int | None, ...]) -> np.ndarray:
+def _floats(
+    path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tuple[int | None, ...]
+) -> np.ndarray:
     array = arrays[key]
     _check_shape(path, key, array, expected)
     if array.dtype.kind not in "iuf":
@@ -154,16 +167,22 @@ def _identity_count(path: Path, arrays: Mapping[str, np.ndarray], components: in
         return components * 3 // 4
     count = _integers(path, "n_identity", arrays["n_identity"])
     if count.size != 1 or not 0 <= int(count.reshape(())) <= components:
-        raise StgaError(f"{path}: n_identity is {count.tolist()}, expected one number from 0 to {components}")
+        raise StgaError(
+            f"{path}: n_identity is {count.tolist()}, expected one number from 0 to {components}"
+        )
     return int(count.reshape(()))
 
 
 def _parents(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     _check_shape(path, "kintree_table", arrays["kintree_table"], (2, len(JOINTS)))
-    parents: np.ndarray = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(np.int64)
+    parents: np.ndarray = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(
+        np.int64
+    )
     parents[0] = -1  # the published files write the root's parent as 2**32 - 1
     if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
-        raise StgaError(f"{path}: kintree_table names the parents {parents.tolist()}, expected each before its child")
+        raise StgaError(
+            f"{path}: kintree_table names the parents {parents.tolist()}, expected each before its child"
+        )
     return parents
 
 
@@ -171,13 +190,19 @@ def _faces(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> np.nd
     _check_shape(path, "f", arrays["f"], (None, 3))
     faces = _integers(path, "f", arrays["f"]).astype(np.int64)
     if faces.min() < 0 or faces.max() >= vertices:
-        raise StgaError(f"{path}: f names vertices {faces.min()} to {faces.max()}, expected 0 to {vertices - 1}")
+        raise StgaError(
+            f"{path}: f names vertices {faces.min()} to {faces.max()}, expected 0 to {vertices - 1}"
+        )
     return np.ascontiguousarray(faces, np.int32)
 
 
 def _masks(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> dict[str, np.ndarray]:
     source = path
-    found = {key[len(MASK_PREFIX) :]: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
+    found = {
+        key[len(MASK_PREFIX) :]: value
+        for key, value in arrays.items()
+        if key.startswith(MASK_PREFIX)
+    }
     beside = path.with_name(MASK_FILE)
     if not found and beside.is_file():
         source, found = beside, read_pickled_arrays(beside)
@@ -185,7 +210,9 @@ def _masks(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> dict[
     for name, ids in found.items():
         flat = _integers(source, name, ids).astype(np.int64)
         if flat.ndim != 1 or (flat.size and not 0 <= flat.min() <= flat.max() < vertices):
-            raise StgaError(f"{source}: mask {name} is not a list of vertex ids from 0 to {vertices - 1}")
+            raise StgaError(
+                f"{source}: mask {name} is not a list of vertex ids from 0 to {vertices - 1}"
+            )
         masks[name] = np.unique(flat)
     return masks
 
@@ -197,11 +224,14 @@ def faces_within(faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 def torso_faces(model: FlameModel) -> np.ndarray:
     """(F,) bool: triangles at the end of the neck, which the root joint carries."""
-    return np.asarray((model.weights[:, JOINTS.index("root")] > MIN_TORSO_WEIGHT)[model.faces].all(axis=1))
+    return np.asarray(
+        (model.weights[:, JOINTS.index("root")] > MIN_TORSO_WEIGHT)[model.faces].all(axis=1)
+    )
 
 
 def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
-    """left_eye, right_eye, mouth and nose as (F,) bool; a region none of whose masks the model has is left out."""
+    """left_eye, right_eye, mouth and nose as (F,) bool; a region none of whose masks the model has
+    is left out."""
     regions = {}
     for region, names in KEY_MASKS.items():
         present = [model.masks[name] for name in names if name in model.masks]

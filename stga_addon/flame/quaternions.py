@@ -10,7 +10,8 @@ def from_axis_angle(vectors: np.ndarray) -> np.ndarray:
 
 
 def to_matrices(quaternions: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length; of zero ones, the identity."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length; of zero ones, the
+    identity."""
     length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(quaternions / np.maximum(length, 1e-12), -1, 0)
     rows = [
@@ -26,18 +27,21 @@ def to_axis_angle(quaternions: np.ndarray) -> np.ndarray:
     quaternions = np.where(quaternions[..., :1] < 0, -quaternions, quaternions)
     length = np.linalg.norm(quaternions[..., 1:], axis=-1, keepdims=True)
     half = np.arctan2(length, quaternions[..., :1])
-    return np.asarray(2 * quaternions[..., 1:] / np.sinc(half / np.pi))  # length / half, finite at zero
+    # length / half, finite at zero
+    return np.asarray(2 * quaternions[..., 1:] / np.sinc(half / np.pi))
 
 
 def continuous(quaternions: np.ndarray) -> np.ndarray:
-    """(T, 4) with signs changed so that consecutive quaternions are close; q and -q are the same rotation."""
+    """(T, 4) with signs changed so that consecutive quaternions are close; q and -q are the same
+    rotation."""
     flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(1))
     signs = np.cumprod(np.where(flips < 0, -1.0, 1.0))
     return np.concatenate([quaternions[:1], quaternions[1:] * signs[:, None]])
 
 
 def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(..., 4) on the shortest arc from `first` (share 0) to `second` (share 1), and beyond; share (...,).
+    """(..., 4) on the shortest arc from `first` (share 0) to `second` (share 1), and beyond; share
+    (...,).
 
     Spherical linear interpolation (Shoemake 1985).
     """
@@ -55,7 +59,9 @@ def normalized(q: np.ndarray) -> np.ndarray:
     """(..., 4) normalized in float64; a zero quaternion counts as the identity."""
     q = np.asarray(q, np.float64)
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
-    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
+    q = np.where(
+        largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0])
+    )
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
@@ -78,8 +84,8 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def from_matrices(matrices: np.ndarray) -> np.ndarray:
     """Unit quaternion wxyz (..., 4), w ≥ 0, of proper rotation matrices (..., 3, 3).
 
-    Builds the outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations by 180°
-    (trace −1) lose no precision.
+    Builds the outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations
+    by 180° (trace −1) lose no precision.
     """
     m = np.asarray(matrices, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]

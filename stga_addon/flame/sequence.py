@@ -1,4 +1,5 @@
-"""Tracked FLAME sequences: reading of parameter files, meshes; retargeting to another person, speed or strength."""
+"""Tracked FLAME sequences: reading of parameter files, meshes; retargeting to another person, speed
+or strength."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -73,8 +74,8 @@ def sequence_mesh(sequence: FlameSequence, timestep: int) -> np.ndarray:
 def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> np.ndarray:
     """The mesh (V, 3) with the head's motion removed (STGA, selective training).
 
-    zero_pose "head" zeroes rotation, translation and neck, so that jaw and eyes count as expression; "all" zeroes
-    jaw and eyes too. Raises StgaError for any other value.
+    zero_pose "head" zeroes rotation, translation and neck, so that jaw and eyes count as
+    expression; "all" zeroes jaw and eyes too. Raises StgaError for any other value.
     """
     if zero_pose not in ZERO_POSES:
         raise StgaError(f"zero_pose is {zero_pose!r}, expected one of {', '.join(ZERO_POSES)}")
@@ -86,14 +87,17 @@ def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> n
 
 
 def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
-    """The canonical mesh (V, 3): expression, pose and translation zero, with the person's shape and static offset."""
+    """The canonical mesh (V, 3): expression, pose and translation zero, with the person's shape and
+    static offset."""
     return _mesh(sequence, neutral_frame(sequence.model))
 
 
 def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: world points (N, 3) that lie lower than the root joint, at the base of the neck, seen by the torso.
+    """(N,) bool: world points (N, 3) that lie lower than the root joint, at the base of the neck,
+    seen by the torso.
 
-    The joint is that of the model without offsets, which may draw the torso over clothes, and the joint with it.
+    The joint is that of the model without offsets, which may draw the torso over clothes, and the
+    joint with it.
     """
     model, frame = sequence.model, sequence.frame(timestep)
     shaped = shaped_vertices(model, sequence.shape, frame.expr)
@@ -103,18 +107,24 @@ def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np
 
 
 def with_identity(sequence: FlameSequence) -> FlameSequence:
-    """The same motion with shape and static offset baked into the template, so that a mesh needs a quarter of the blend
-    shapes."""
+    """The same motion with shape and static offset baked into the template, so that a mesh needs a
+    quarter of the blend shapes."""
     model = sequence.model
     shapes = model.shapedirs[:, :, model.n_identity :]
-    template = shaped_vertices(model, sequence.shape, np.zeros(shapes.shape[2]), sequence.static_offset)
-    person = replace(model, v_template=template, shapedirs=np.ascontiguousarray(shapes), n_identity=0)
+    template = shaped_vertices(
+        model, sequence.shape, np.zeros(shapes.shape[2]), sequence.static_offset
+    )
+    person = replace(
+        model, v_template=template, shapedirs=np.ascontiguousarray(shapes), n_identity=0
+    )
     return replace(sequence, model=person, shape=np.zeros(0), static_offset=None)
 
 
 def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
     """Largest angle (5,) in degrees by which the frames turn each of `JOINTS`."""
-    return np.asarray(np.degrees(np.linalg.norm([frame.pose for frame in frames], axis=2).max(axis=0)))
+    return np.asarray(
+        np.degrees(np.linalg.norm([frame.pose for frame in frames], axis=2).max(axis=0))
+    )
 
 
 def _mesh(sequence: FlameSequence, frame: FlameFrame) -> np.ndarray:
@@ -122,10 +132,12 @@ def _mesh(sequence: FlameSequence, frame: FlameFrame) -> np.ndarray:
 
 
 def read_frame(path: Path, model: FlameModel) -> FlameFrame:
-    """Read one timestep's `flame_param/*.npz` (VHAP and GaussianAvatars captures), with or without a leading 1.
+    """Read one timestep's `flame_param/*.npz` (VHAP and GaussianAvatars captures), with or without
+    a leading 1.
 
-    Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression coefficients than the model has, and
-    offsets without the teeth's vertices, are filled up with zeros. Raises StgaError naming the file and the field.
+    Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression coefficients than the
+    model has, and offsets without the teeth's vertices, are filled up with zeros. Raises StgaError
+    naming the file and the field.
     """
     arrays = read_npz(path)
     for name in REQUIRED_FIELDS:
@@ -135,17 +147,19 @@ def read_frame(path: Path, model: FlameModel) -> FlameFrame:
 
 
 def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
-    """Shape coefficients (I,) and static offset (V, 3) or None from a parameter file. Errors as in `read_frame`."""
+    """Shape coefficients (I,) and static offset (V, 3) or None from a parameter file. Errors as in
+    `read_frame`."""
     return _identity(path, read_npz(path), model)
 
 
 def read_motion(path: Path, model: FlameModel) -> FlameSequence:
-    """Read a whole motion from one file: arrays with a leading time axis, of which any but one may be missing (zero).
+    """Read a whole motion from one file: arrays with a leading time axis, of which any but one may
+    be missing (zero).
 
-    VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a GaussianAvatars avatar, and
-    plain files of expression and pose, whose fields may have the names in `FIELD_ALIASES` too. `pose` holds the joints
-    of `POSE_LAYOUTS`. Timesteps count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file and
-    the field.
+    VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a
+    GaussianAvatars avatar, and plain files of expression and pose, whose fields may have the names
+    in `FIELD_ALIASES` too. `pose` holds the joints of `POSE_LAYOUTS`. Timesteps count from 0,
+    unless `timesteps` (T,) names them. Raises StgaError naming the file and the field.
     """
     return motion_of(path, read_npz(path), model)
 
@@ -155,14 +169,20 @@ def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -
     arrays = _spelled_out(path, arrays)
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
     if not moving:
-        raise StgaError(f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of")
+        raise StgaError(
+            f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of"
+        )
     name, array = next(iter(moving.items()))
     if array.ndim < 2 or not len(array):
-        raise StgaError(f"{path}: {name} has shape {array.shape}, expected (timesteps, coefficients)")
+        raise StgaError(
+            f"{path}: {name} has shape {array.shape}, expected (timesteps, coefficients)"
+        )
     count = len(array)
     for name, array in moving.items():
         if array.ndim < 2 or len(array) != count:
-            raise StgaError(f"{path}: {name} has shape {array.shape}, expected {count} timesteps first")
+            raise StgaError(
+                f"{path}: {name} has shape {array.shape}, expected {count} timesteps first"
+            )
     if "shape" in arrays and arrays["shape"].ndim == 2:
         arrays["shape"] = arrays["shape"][0]  # one per timestep, all of the same person
     shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
@@ -178,19 +198,25 @@ def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -
 
 
 def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dict[str, np.ndarray]:
-    """The motion as arrays that `motion_of` takes, and as flame_param.npz of a GaussianAvatars avatar holds in float32.
+    """The motion as arrays that `motion_of` takes, and as flame_param.npz of a GaussianAvatars
+    avatar holds in float32.
 
     shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation (T, 3), eyes_pose (T, 6),
-    static_offset (V, 3), dynamic_offset (T, V, 3), zero where the sequence has none; 300 and 100 for I and E with a
-    published FLAME.
+    static_offset (V, 3), dynamic_offset (T, V, 3), zero where the sequence has none; 300 and 100
+    for I and E with a published FLAME.
     """
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
     none = np.zeros_like(sequence.model.v_template)
     offsets = [none if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames]
     return {
-        **{name: np.stack([getattr(frame, name) for frame in frames], dtype=dtype) for name in FRAME_FIELDS},
+        **{
+            name: np.stack([getattr(frame, name) for frame in frames], dtype=dtype)
+            for name in FRAME_FIELDS
+        },
         "shape": sequence.shape.astype(dtype),
-        "static_offset": (none if sequence.static_offset is None else sequence.static_offset).astype(dtype),
+        "static_offset": (
+            none if sequence.static_offset is None else sequence.static_offset
+        ).astype(dtype),
         "dynamic_offset": np.stack(offsets, dtype=dtype),
     }
 
@@ -205,7 +231,9 @@ def _timesteps(path: Path, found: np.ndarray, count: int) -> tuple[int, ...]:
 
 def _spelled_out(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays by VHAP's names, with `pose` split into joints."""
-    named = {FIELD_ALIASES[name]: array for name, array in arrays.items() if name in FIELD_ALIASES} | dict(arrays)
+    named = {
+        FIELD_ALIASES[name]: array for name, array in arrays.items() if name in FIELD_ALIASES
+    } | dict(arrays)
     pose = named.pop("pose", None)
     if pose is None:
         return named
@@ -225,7 +253,9 @@ def _frame(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> F
     return FlameFrame(**values, dynamic_offset=offset)
 
 
-def _identity(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
+def _identity(
+    path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel
+) -> tuple[np.ndarray, np.ndarray | None]:
     if "shape" not in arrays:
         raise StgaError(f"{path}: has no shape, the person's identity coefficients")
     return (
@@ -238,33 +268,45 @@ def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "iuf":
         raise StgaError(f"{path}: {name} holds {array.dtype}, expected numbers")
     if not (np.abs(array.astype(np.float64)) <= MAX_PARAMETER).all():
-        raise StgaError(f"{path}: {name} holds values that are not finite, or beyond {MAX_PARAMETER:g}")
+        raise StgaError(
+            f"{path}: {name} holds values that are not finite, or beyond {MAX_PARAMETER:g}"
+        )
     return array.astype(np.float64)
 
 
 def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) -> np.ndarray:
-    """(size,) float64 from (size,) or (1, size); absent fields are zero, shorter coefficient vectors padded."""
+    """(size,) float64 from (size,) or (1, size); absent fields are zero, shorter coefficient
+    vectors padded."""
     vector = np.zeros(size)
     if name not in arrays:
         return vector
     array = _finite(path, name, arrays[name])
     given = array[0] if array.ndim == 2 and len(array) == 1 else array
-    fits = given.ndim == 1 and (given.size == size or (name in COEFFICIENT_FIELDS and given.size < size))
+    fits = given.ndim == 1 and (
+        given.size == size or (name in COEFFICIENT_FIELDS and given.size < size)
+    )
     if not fits:
-        raise StgaError(f"{path}: {name} has shape {array.shape}, expected ({size},) or (1, {size})")
+        raise StgaError(
+            f"{path}: {name} has shape {array.shape}, expected ({size},) or (1, {size})"
+        )
     vector[: given.size] = given
     return vector
 
 
-def _offset(path: Path, arrays: Mapping[str, np.ndarray], name: str, vertices: int) -> np.ndarray | None:
-    """(V, 3) float64 or None where it is absent or all zero; rows of the teeth are added or dropped to fit."""
+def _offset(
+    path: Path, arrays: Mapping[str, np.ndarray], name: str, vertices: int
+) -> np.ndarray | None:
+    """(V, 3) float64 or None where it is absent or all zero; rows of the teeth are added or dropped
+    to fit."""
     if name not in arrays:
         return None
     array = _finite(path, name, arrays[name])
     rows = array.shape[-2] if array.ndim >= 2 else 0
     accepted = (vertices, vertices - TEETH_VERTICES, vertices + TEETH_VERTICES)
     if array.ndim not in (2, 3) or rows not in accepted or array.size != rows * 3:
-        raise StgaError(f"{path}: {name} has shape {array.shape}, expected ({vertices}, 3) or (1, {vertices}, 3)")
+        raise StgaError(
+            f"{path}: {name} has shape {array.shape}, expected ({vertices}, 3) or (1, {vertices}, 3)"
+        )
     offset = np.zeros((vertices, 3))
     kept = min(rows, vertices)
     offset[:kept] = array.reshape(rows, 3)[:kept]
@@ -287,27 +329,35 @@ TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
 def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
     """The frames at the first timestep and every `step` timesteps after it, up to the last.
 
-    Coefficients and translation are interpolated linearly, rotations on the shortest arc (slerp). Dynamic offsets,
-    which belong to the tracked person, are left out.
+    Coefficients and translation are interpolated linearly, rotations on the shortest arc (slerp).
+    Dynamic offsets, which belong to the tracked person, are left out.
     """
     times = np.asarray(sequence.timesteps, np.float64)
     wanted = np.arange(times[0], times[-1] + TIME_TOLERANCE, step)
-    row = np.clip(np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1, 0, max(len(times) - 2, 0))
+    row = np.clip(
+        np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1, 0, max(len(times) - 2, 0)
+    )
     after = np.minimum(row + 1, len(times) - 1)
     share = (wanted - times[row]) / np.maximum(times[after] - times[row], 1.0)
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    tracked = {name: np.stack([getattr(frame, name) for frame in frames]) for name in (*LINEAR, *ROTATIONS)}
+    tracked = {
+        name: np.stack([getattr(frame, name) for frame in frames]) for name in (*LINEAR, *ROTATIONS)
+    }
     values = {}
     for name in LINEAR:
         start, end = tracked[name][row], tracked[name][after]
         values[name] = start + share[:, None] * (end - start)
     for name in ROTATIONS:
         values[name] = _turned(tracked[name][row], tracked[name][after], share)
-    return [FlameFrame(**{name: column[index] for name, column in values.items()}) for index in range(len(wanted))]
+    return [
+        FlameFrame(**{name: column[index] for name, column in values.items()})
+        for index in range(len(wanted))
+    ]
 
 
 def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFrame]:
-    """The frames with their motion scaled by `strength`: expression, jaw, eyes and neck about the neutral face.
+    """The frames with their motion scaled by `strength`: expression, jaw, eyes and neck about the
+    neutral face.
 
     Rotation and translation of the head are scaled about the first frame's.
     """
@@ -316,7 +366,9 @@ def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFra
     changed = []
     for frame in frames:
         inner = {name: getattr(frame, name)[None] for name in ROTATIONS if name != "rotation"}
-        turns = {name: _turned(np.zeros_like(value), value, here)[0] for name, value in inner.items()}
+        turns = {
+            name: _turned(np.zeros_like(value), value, here)[0] for name, value in inner.items()
+        }
         changed.append(
             replace(
                 frame,
@@ -332,8 +384,9 @@ def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFra
 def transferred_motion(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:
     """The motion on the person whose neutral mesh is `neutral` (V, 3), of the same model.
 
-    FLAME adds shape and static offset to the template before posing, so the difference between neutral mesh and
-    template replaces both. Dynamic offsets, which belong to the tracked person, are left out.
+    FLAME adds shape and static offset to the template before posing, so the difference between
+    neutral mesh and template replaces both. Dynamic offsets, which belong to the tracked person,
+    are left out.
     """
     return replace(
         motion,

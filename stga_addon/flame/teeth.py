@@ -1,9 +1,10 @@
 """Teeth for FLAME's mesh: two rows behind the lips, fitted to the mesh's own mouth.
 
-The mesh with teeth has the index layout of the 5143-vertex meshes that VHAP and GaussianAvatars exchange: number and
-order of the added vertices and triangles, and the corners of each triangle. Offsets name vertices and bindings name
-triangles by index, and a triangle's local frame starts at its first corner. Shape, size, place and rigging of the
-teeth are this project's own construction from the mesh.
+The mesh with teeth has the index layout of the 5143-vertex meshes that VHAP and GaussianAvatars
+exchange: number and order of the added vertices and triangles, and the corners of each triangle.
+Offsets name vertices and bindings name triangles by index, and a triangle's local frame starts at
+its first corner. Shape, size, place and rigging of the teeth are this project's own construction
+from the mesh.
 """
 
 from dataclasses import dataclass, replace
@@ -18,11 +19,12 @@ from .model import BUNDLED_HEAD, JOINTS, FlameModel, read_flame
 TEMPLATE_VERTICES = 5023
 TEETH_VERTICES, TEETH_FACES = 120, 168
 TEETH_PER_ROW = 15
-# Index layout. Order of the eight rows among the added vertices: upper, lower; root, edge; B for back. Each row runs
-# from the person's left to the right.
+# Index layout. Order of the eight rows among the added vertices: upper, lower; root, edge; B for
+# back. Each row runs from the person's left to the right.
 TEETH_ROWS = ("UR", "LR", "UE", "LE", "URB", "UEB", "LRB", "LEB")
-# Index layout. Two triangles a column; a corner is (row, 0 or 1 for the column's near or far end). The diagonal flips
-# in the middle of the mouth (the first half and the second half below) so that left and right mirror each other.
+# Index layout. Two triangles a column; a corner is (row, 0 or 1 for the column's near or far end).
+# The diagonal flips in the middle of the mouth (the first half and the second half below) so that
+# left and right mirror each other.
 TEETH_STRIPS = {
     "upper front": ("UR0 UE1 UE0 UR0 UR1 UE1", "UR0 UR1 UE0 UR1 UE1 UE0"),
     "upper back": ("URB0 UEB0 UEB1 URB0 UEB1 URB1", "URB0 UEB0 URB1 URB1 UEB0 UEB1"),
@@ -47,7 +49,8 @@ MAX_LIP_DISTANCE_M = 0.002
 class _Mouth:
     """The inside of the mouth from the open end of the throat to the lips.
 
-    rings  vertex ids of each ring of neighbours, from the open end outwards; the last is the foremost of the lips
+    rings  vertex ids of each ring of neighbours, from the open end outwards; the last is the
+           foremost of the lips
     lips   (N,) the last ring in order around the mouth
     """
 
@@ -60,7 +63,8 @@ class _Mouth:
 
 
 def flame_model(path: Path | None) -> FlameModel:
-    """The FLAME model file, with teeth where it has FLAME's 5023 vertices; None: the bundled head. Raises StgaError."""
+    """The FLAME model file, with teeth where it has FLAME's 5023 vertices; None: the bundled head.
+    Raises StgaError."""
     if path is None:
         return _bundled_head()
     model = read_flame(path)
@@ -75,9 +79,9 @@ def _bundled_head() -> FlameModel:
 def with_teeth(model: FlameModel) -> FlameModel:
     """The model with upper and lower teeth: 5023 to 5143 vertices, 9976 to 10144 triangles.
 
-    The upper row follows the neck joint, which turns the head, and the lower row the jaw; both follow identity as the
-    inside of the mouth does, neither expression nor pose correctives. Adds the mask "teeth". Raises StgaError for any
-    other topology.
+    The upper row follows the neck joint, which turns the head, and the lower row the jaw; both
+    follow identity as the inside of the mouth does, neither expression nor pose correctives. Adds
+    the mask "teeth". Raises StgaError for any other topology.
     """
     if len(model.v_template) != TEMPLATE_VERTICES:
         raise StgaError(
@@ -97,8 +101,12 @@ def with_teeth(model: FlameModel) -> FlameModel:
         model,
         v_template=np.concatenate([model.v_template, teeth]),
         shapedirs=np.concatenate([model.shapedirs, shapedirs]),
-        posedirs=np.concatenate([model.posedirs, np.zeros((TEETH_VERTICES, *model.posedirs.shape[1:]))]),
-        j_regressor=np.concatenate([model.j_regressor, np.zeros((len(JOINTS), TEETH_VERTICES))], axis=1),
+        posedirs=np.concatenate(
+            [model.posedirs, np.zeros((TEETH_VERTICES, *model.posedirs.shape[1:]))]
+        ),
+        j_regressor=np.concatenate(
+            [model.j_regressor, np.zeros((len(JOINTS), TEETH_VERTICES))], axis=1
+        ),
         weights=np.concatenate([model.weights, weights]),
         faces=np.concatenate([model.faces, teeth_faces(TEMPLATE_VERTICES)]),
         masks={**model.masks, "teeth": added},
@@ -106,10 +114,11 @@ def with_teeth(model: FlameModel) -> FlameModel:
 
 
 def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
-    """Vertex ids (n,) along the upper and the lower lip between the corners of the mouth, opposite each other.
+    """Vertex ids (n,) along the upper and the lower lip between the corners of the mouth, opposite
+    each other.
 
-    They are found on FLAME's mesh with or without teeth, and where expressions have ARKit's names. Raises StgaError for
-    another mesh without an open mouth.
+    They are found on FLAME's mesh with or without teeth, and where expressions have ARKit's names.
+    Raises StgaError for another mesh without an open mouth.
     """
     if "jawOpen" in model.expression_names:
         return _opened_lips(model)
@@ -121,7 +130,8 @@ def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _opened_lips(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs of nearest vertices of the lips, of which jawOpen moves one and leaves the other."""
+    """The pairs of nearest vertices of the lips, of which jawOpen moves one and leaves the
+    other."""
     column = model.n_identity + model.expression_names.index("jawOpen")
     lips = model.masks["lips"]
     opened = np.linalg.norm(model.shapedirs[lips, :, column], axis=1)
@@ -143,13 +153,17 @@ def teeth_faces(first: int) -> np.ndarray:
 
 
 def _mouth(model: FlameModel) -> _Mouth:
-    """Rings of neighbours from the mesh's foremost hole outwards, up to the one that lies foremost on average."""
+    """Rings of neighbours from the mesh's foremost hole outwards, up to the one that lies foremost
+    on average."""
     faces = model.faces[(model.faces < TEMPLATE_VERTICES).all(axis=1)]
     depth = model.v_template[:, 2]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    holes = [hole for hole in _holes(edges) if depth[hole].mean() > depth[faces].mean()]  # the neck's is farther back
+    # the neck's is farther back
+    holes = [hole for hole in _holes(edges) if depth[hole].mean() > depth[faces].mean()]
     if not holes:
-        raise StgaError("teeth: the FLAME model's mesh has a closed mouth, expected one that is open at the throat")
+        raise StgaError(
+            "teeth: the FLAME model's mesh has a closed mouth, expected one that is open at the throat"
+        )
     rings = [max(holes, key=lambda hole: float(depth[hole].mean()))]
     reached = np.zeros(len(model.v_template), bool)
     for _ in range(MAX_MOUTH_RINGS):
@@ -180,7 +194,8 @@ def _holes(edges: np.ndarray) -> list[np.ndarray]:
 
 
 def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """The vertices of a ring in order around it. Raises StgaError where the edges among them are not one ring."""
+    """The vertices of a ring in order around it. Raises StgaError where the edges among them are
+    not one ring."""
     inside = edges[np.isin(edges, ring).all(axis=1)]
     beside: dict[int, set[int]] = {vertex: set() for vertex in ring.tolist()}
     for one, other in inside.tolist():
@@ -192,20 +207,23 @@ def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
         ordered.append(min(following))
         left.discard(ordered[-1])
     if left or len(ring) % 2 or any(len(others) != 2 for others in beside.values()):
-        raise StgaError("teeth: the FLAME model's mesh has no ring of vertices around its lips, expected FLAME's mesh")
+        raise StgaError(
+            "teeth: the FLAME model's mesh has no ring of vertices around its lips, expected FLAME's mesh"
+        )
     return np.array(ordered)
 
 
 def _from_corner(vertices: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """The ring (N,) from the person's left corner of the mouth on; the right one is N / 2 further."""
+    """The ring (N,) from the person's left corner of the mouth on; the right one is N / 2
+    further."""
     half = len(ring) // 2
     x = vertices[ring, 0]
     return np.roll(ring, -int((x - np.roll(x, half)).argmax()))
 
 
 def _positions(vertices: np.ndarray, mouth: _Mouth) -> np.ndarray:
-    """(120, 3) teeth: an upper arch curved like the lips, as far forward as their inner surface allows, and a lower one
-    behind it."""
+    """(120, 3) teeth: an upper arch curved like the lips, as far forward as their inner surface
+    allows, and a lower one behind it."""
     lips, inside = vertices[mouth.lips], vertices[mouth.inside]
     left, right = lips[0], lips[len(lips) // 2]
     width, middle = left[0] - right[0], (left[0] + right[0]) / 2
@@ -214,7 +232,8 @@ def _positions(vertices: np.ndarray, mouth: _Mouth) -> np.ndarray:
     bite = (lips[:, 1].max() + lips[:, 1].min()) / 2
     height = np.ptp(vertices[mouth.rings[0], 1]) / 2  # both rows together fill the open end
     edge = bite - OVERBITE * width
-    reach = inside[:, 2] + curvature * (inside[:, 0] - middle) ** 2 - CLEARANCE * width  # on the axis
+    # on the axis
+    reach = inside[:, 2] + curvature * (inside[:, 0] - middle) ** 2 - CLEARANCE * width
     upper, lower = reach[inside[:, 1] > edge].min(), reach[inside[:, 1] < bite].min()
     rows = {"UE": arch + np.array([middle, edge, upper])}
     rows["UR"] = rows["UE"] + [0, bite + height - edge, 0]
@@ -228,18 +247,22 @@ def _positions(vertices: np.ndarray, mouth: _Mouth) -> np.ndarray:
 
 
 def _arch(half_width: float, curvature: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (15, 3), evenly spaced along z = −curvature · x² from left to right, and their outward normals (15, 3)."""
+    """Points (15, 3), evenly spaced along z = −curvature · x² from left to right, and their outward
+    normals (15, 3)."""
     x = np.linspace(half_width, -half_width, 257)
     length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(curvature * x**2)))])
     x = np.interp(np.linspace(0, length[-1], TEETH_PER_ROW), length, x)
     x = (x - x[::-1]) / 2
     zero = np.zeros_like(x)
     normals = np.stack([2 * curvature * x, zero, zero + 1], axis=1)
-    return np.stack([x, zero, -curvature * x**2], axis=1), normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.stack([x, zero, -curvature * x**2], axis=1), normals / np.linalg.norm(
+        normals, axis=1, keepdims=True
+    )
 
 
 def _followed(points: np.ndarray, displacements: np.ndarray, teeth: np.ndarray) -> np.ndarray:
-    """Displacements (T, 3, K) of the teeth (T, 3): smooth ones that fit those (M, 3, K) of the mouth's points (M, 3).
+    """Displacements (T, 3, K) of the teeth (T, 3): smooth ones that fit those (M, 3, K) of the
+    mouth's points (M, 3).
 
     Linear in width and height and quadratic in width, so that the arch grows and bends as a whole.
     """

@@ -1,8 +1,9 @@
 """Reading arrays from a pickle without running any code that it names.
 
-FLAME's model files are Python 2 pickles of numpy arrays, scipy.sparse matrices and chumpy objects. A pickle may name
-any function and have it called. Here every global of a short list is replaced by an inert class or function defined in
-this module, and any other is refused by name. Neither numpy's own reconstruction nor scipy or chumpy is used.
+FLAME's model files are Python 2 pickles of numpy arrays, scipy.sparse matrices and chumpy objects.
+A pickle may name any function and have it called. Here every global of a short list is replaced by
+an inert class or function defined in this module, and any other is refused by name. Neither numpy's
+own reconstruction nor scipy or chumpy is used.
 """
 
 import io
@@ -23,7 +24,9 @@ from ..files import read_bytes
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22
 """In a sparse matrix; FLAME's joint regressor has 25,115."""
-SPARSE_CLASS = re.compile(r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)")
+SPARSE_CLASS = re.compile(
+    r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
+)
 
 
 class _NotAnArray(Exception):
@@ -92,7 +95,8 @@ class _Refused(Exception):
 
 
 class _Function:
-    """A function that a pickle may call but not change: BUILD would write into the `__dict__` of a plain one."""
+    """A function that a pickle may call but not change: BUILD would write into the `__dict__` of a
+    plain one."""
 
     __slots__ = ("_call",)
 
@@ -112,7 +116,10 @@ class _RestrictedUnpickler(pickle.Unpickler):
         functions: dict[str, Callable[..., Any]] = {
             "_codecs.encode": self.encode,
             "collections.OrderedDict": OrderedDict,
-            **{f"{core}.multiarray._reconstruct": self.array_shell for core in ("numpy.core", "numpy._core")},
+            **{
+                f"{core}.multiarray._reconstruct": self.array_shell
+                for core in ("numpy.core", "numpy._core")
+            },
             **{f"{module}._reconstructor": self.rebuild for module in ("copy_reg", "copyreg")},
             **{f"{module}.set": set for module in ("__builtin__", "builtins")},
         }
@@ -134,7 +141,8 @@ class _RestrictedUnpickler(pickle.Unpickler):
         raise pickle.UnpicklingError("asks for objects outside the file")
 
     def array_shell(self, kind: Any, shape: Any, dtype: Any) -> _Array:
-        # numpy's own reconstructor would allocate `shape` at once; the contents arrive with the state.
+        # numpy's own reconstructor would allocate `shape` at once; the contents arrive with the
+        # state.
         return _Array()
 
     def rebuild(self, kind: Any, base: Any, state: Any) -> _Inert:
@@ -149,11 +157,13 @@ class _RestrictedUnpickler(pickle.Unpickler):
 
 
 def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of a pickled dictionary, dense, by key; `names` limits which entries are looked at.
+    """The arrays of a pickled dictionary, dense, by key; `names` limits which entries are looked
+    at.
 
-    A name such as "a/b" means the entry b of the dictionary a. scipy.sparse matrices are densified and chumpy
-    objects replaced by their value. Raises StgaError where the file is missing, truncated, too large, no dictionary
-    of arrays, or asks for any other class (named in the message).
+    A name such as "a/b" means the entry b of the dictionary a. scipy.sparse matrices are densified
+    and chumpy objects replaced by their value. Raises StgaError where the file is missing,
+    truncated, too large, no dictionary of arrays, or asks for any other class (named in the
+    message).
     """
     loaded = _load(path)
     if not isinstance(loaded, dict):
@@ -166,10 +176,14 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
             try:
                 arrays[key] = _dense(entries[name])
             except _NotAnArray as error:
-                raise StgaError(f"{path}: {key} is {error}, expected an array of numbers") from error
+                raise StgaError(
+                    f"{path}: {key} is {error}, expected an array of numbers"
+                ) from error
             except Exception as error:
                 # Shapes, indices and states are whatever the file says, of any type and size.
-                raise StgaError(f"{path}: {key} is malformed ({error}), expected an array of numbers") from error
+                raise StgaError(
+                    f"{path}: {key} is malformed ({error}), expected an array of numbers"
+                ) from error
     return arrays
 
 
@@ -187,7 +201,9 @@ def _load(path: Path) -> Any:
         _check_instructions(data)
         return _RestrictedUnpickler(data).load()
     except _Refused as error:
-        raise StgaError(f"{path}: asks for the class {error}, refused: only arrays are read") from error
+        raise StgaError(
+            f"{path}: asks for the class {error}, refused: only arrays are read"
+        ) from error
     except Exception as error:
         # A damaged pickle can raise nearly anything from the opcodes it happens to spell.
         reason = str(error) or type(error).__name__
@@ -195,7 +211,8 @@ def _load(path: Path) -> Any:
 
 
 def _check_instructions(data: bytes) -> None:
-    """Refuse memo slots beyond the file's length, for which the C unpickler would allocate a table."""
+    """Refuse memo slots beyond the file's length, for which the C unpickler would allocate a
+    table."""
     for opcode, argument, _ in pickletools.genops(data):
         if argument is not None and "PUT" in opcode.name and not 0 <= int(argument) <= len(data):
             raise pickle.UnpicklingError(f"memo slot {argument} in a file of {len(data)} bytes")
@@ -256,7 +273,9 @@ def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.nd
 def _dtype(value: Any) -> np.dtype[Any]:
     code = value.arguments[0] if isinstance(value, _Dtype) and value.arguments else None
     if not isinstance(code, str) or not re.fullmatch(r"[iuf][1248]|b1", code):
-        raise _NotAnArray(f"an array of type {code}" if isinstance(code, str) else "an array of unknown type")
+        raise _NotAnArray(
+            f"an array of type {code}" if isinstance(code, str) else "an array of unknown type"
+        )
     if code == "f1":
         raise _NotAnArray("an array of type f1")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
@@ -267,7 +286,11 @@ def _sparse(value: _Sparse) -> np.ndarray:
     """Dense (rows, columns) matrix of a pickled compressed or coordinate matrix."""
     state = value.state if isinstance(value.state, dict) else {}
     shape = state.get("_shape", state.get("shape"))
-    if not isinstance(shape, tuple) or len(shape) != 2 or not all(isinstance(n, int) and n >= 0 for n in shape):
+    if (
+        not isinstance(shape, tuple)
+        or len(shape) != 2
+        or not all(isinstance(n, int) and n >= 0 for n in shape)
+    ):
         raise _NotAnArray("a sparse matrix without a shape")
     if math.prod(shape) > MAX_DENSE_ELEMENTS:
         raise _NotAnArray(f"a sparse matrix of shape {shape}, too large to fill in")
@@ -275,10 +298,13 @@ def _sparse(value: _Sparse) -> np.ndarray:
     rows, columns = _sparse_indices(value.format, state)
     if not (data.shape == rows.shape == columns.shape):
         raise _NotAnArray("a sparse matrix whose indices do not match its data")
-    if len(data) and (min(rows.min(), columns.min()) < 0 or rows.max() >= shape[0] or columns.max() >= shape[1]):
+    if len(data) and (
+        min(rows.min(), columns.min()) < 0 or rows.max() >= shape[0] or columns.max() >= shape[1]
+    ):
         raise _NotAnArray("a sparse matrix with indices outside its shape")
     dense = np.zeros(shape, np.float64)
-    np.add.at(dense, (rows, columns), data)  # a sparse matrix may hold an entry twice, meaning their sum
+    # a sparse matrix may hold an entry twice, meaning their sum
+    np.add.at(dense, (rows, columns), data)
     return dense
 
 
@@ -309,9 +335,15 @@ def _chumpy(value: _Chumpy) -> np.ndarray:
         return _dense(state["x"])
     if "a" in state and "idxs" in state:
         source, chosen = _dense(state["a"]).ravel(), _dense(state["idxs"])
-        if chosen.dtype.kind not in "iu" or (chosen.size and not 0 <= chosen.min() <= chosen.max() < source.size):
+        if chosen.dtype.kind not in "iu" or (
+            chosen.size and not 0 <= chosen.min() <= chosen.max() < source.size
+        ):
             raise _NotAnArray(f"a {value.source} with indices outside its array")
         picked: np.ndarray = source[chosen]
         shape = state.get("preferred_shape")
-        return picked.reshape(shape) if isinstance(shape, tuple) and math.prod(shape) == picked.size else picked
+        return (
+            picked.reshape(shape)
+            if isinstance(shape, tuple) and math.prod(shape) == picked.size
+            else picked
+        )
     raise _NotAnArray(f"a {value.source}, whose value is not stored in the file")

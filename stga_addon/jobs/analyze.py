@@ -17,7 +17,8 @@ from .train import Train
 
 @dataclass(frozen=True)
 class Analyze:
-    """Show what a capture holds, and which effects training on it would use; or what a run or avatar file holds.
+    """Show what a capture holds, and which effects training on it would use; or what a run or
+    avatar file holds.
 
     timed: whether presets are timed as well, which takes longer.
     """
@@ -49,13 +50,16 @@ class Select:
     principal_point: str = like(Train, "principal_point")
     threshold: float = like(SelectionOptions, "threshold")
     zero_pose: str | None = like(
-        SelectionOptions, "zero_pose", default=None, help="motion that does not count as expression (default head)"
+        SelectionOptions,
+        "zero_pose",
+        default=None,
+        help="motion that does not count as expression (default head)",
     )
 
 
 def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
-    """Decide the effects of a training on the capture, and time the presets where that is asked for. Raises
-    StgaError; a capture without training views calls for nothing."""
+    """Decide the effects of a training on the capture, and time the presets where that is asked
+    for. Raises StgaError; a capture without training views calls for nothing."""
     from ..training.effects.plan import plan_effects
 
     report(Progress(stage="Analyzing the capture"))
@@ -63,13 +67,18 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     if not capture.views.get("train"):
         return Analyzed((), {})
     device, _ = choose_device(request.device)
-    _, plan = plan_effects(capture, make_settings(iterations=1, effects=dict(request.effects or {})), device)
+    _, plan = plan_effects(
+        capture, make_settings(iterations=1, effects=dict(request.effects or {})), device
+    )
     if not request.timed:
         return Analyzed(plan, {})
-    from ..training.preset_timing import time_presets  # imports Numba, which deciding effects does without
+    # imports Numba, which deciding effects does without
+    from ..training.preset_timing import time_presets
 
     report(Progress(0.5, "Timing the presets"))
-    return Analyzed(plan, {timing.preset: timing.seconds for timing in time_presets(capture, device=device)})
+    return Analyzed(
+        plan, {timing.preset: timing.seconds for timing in time_presets(capture, device=device)}
+    )
 
 
 def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:
@@ -87,12 +96,17 @@ def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed
 
 
 def select(request: Select, report: Report, say: Say) -> Selected:
-    """Select by the rule; says how much each timestep selects, and which regions as a whole. Raises StgaError."""
+    """Select by the rule; says how much each timestep selects, and which regions as a whole. Raises
+    StgaError."""
     capture = open_capture(request.capture, request.flame, request.principal_point)
     options = SelectionOptions(request.threshold, request.zero_pose or SelectionOptions.zero_pose)
     selection = select_capture(capture, options)
     say(f"threshold {1000 * request.threshold:g} mm, {len(capture.faces)} triangles")
     for timestep, faces in selection.items():
-        regions = [name for name, members in capture.regions.items() if members.any() and faces[members].all()]
+        regions = [
+            name
+            for name, members in capture.regions.items()
+            if members.any() and faces[members].all()
+        ]
         say(f"{timestep:5d}  {faces.mean():6.1%}  {', '.join(regions)}")
     return Selected(selection)

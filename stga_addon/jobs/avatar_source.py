@@ -1,5 +1,5 @@
-"""What an avatar is posed by: a capture, a motion, or the head of an open .blend file, also as a folder that another
-Python reads."""
+"""What an avatar is posed by: a capture, a motion, or the head of an open .blend file, also as a
+folder that another Python reads."""
 
 import logging
 import re
@@ -26,10 +26,12 @@ from ..training.run.folder import AVATAR, open_refined, open_run, read_run, with
 
 @dataclass(frozen=True)
 class Played:
-    """What the head of an open .blend file plays in the frames of its scene, however it is animated.
+    """What the head of an open .blend file plays in the frames of its scene, however it is
+    animated.
 
     meshes      frame -> (V, 3) meters
-    motion      FLAME parameters of these frames, arrays as `motion_of` takes them; None: the head has none
+    motion      FLAME parameters of these frames, arrays as `motion_of` takes them; None: the head
+                has none
     selection   frame -> (F,) bool: what the file's vertex groups train; None without any
     """
 
@@ -49,7 +51,8 @@ Posed = Any
 source          folder of a run, or avatar file
 capture, flame  whose meshes pose it; None: those of the run
 played          meshes that stand in for those of the capture
-motion          another person's motion, which poses it instead, with `motion_options`; `flame`: its model file
+motion          another person's motion, which poses it instead, with `motion_options`; `flame`: its
+                model file
 """
 
 
@@ -66,8 +69,8 @@ def motion_options_field(*needs: str) -> Any:
 
 
 def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
-    """The avatar of a run folder or file, and the capture that was given or that the run was trained on, as an open
-    .blend file's head plays it where the request says so.
+    """The avatar of a run folder or file, and the capture that was given or that the run was
+    trained on, as an open .blend file's head plays it where the request says so.
 
     Raises StgaError where the run's own capture has changed, or a given one has other triangles.
     """
@@ -82,7 +85,9 @@ def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
     if capture is None:
         return avatar, None
     if not np.array_equal(capture.faces, avatar.faces):
-        raise StgaError(f"{capture.root}: its mesh has other triangles than the one this avatar was trained on")
+        raise StgaError(
+            f"{capture.root}: its mesh has other triangles than the one this avatar was trained on"
+        )
     return avatar, capture if request.played is None else _as_played(capture, request.played)
 
 
@@ -116,15 +121,19 @@ def avatar_path(source: Path) -> Path:
 
 
 def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:
-    """The capture of a run, or another one whose meshes are to drive its avatar; with the run's refined tracking."""
+    """The capture of a run, or another one whose meshes are to drive its avatar; with the run's
+    refined tracking."""
     if given is None:
         return open_refined(folder, flame=flame)
     run = read_run(folder)
-    return with_refined_tracking(open_capture(given, flame or run.flame, run.principal_point), folder)
+    return with_refined_tracking(
+        open_capture(given, flame or run.flame, run.principal_point), folder
+    )
 
 
 def _as_played(capture: Capture, played: Played) -> Capture:
-    """The capture with the frames of an open .blend file. Raises StgaError for arrays of another head."""
+    """The capture with the frames of an open .blend file. Raises StgaError for arrays of another
+    head."""
     for name, arrays, shape, kind in (
         ("frame", played.meshes, capture.neutral.shape, "f"),
         ("selection of frame", played.selection or {}, capture.faces.shape[:1], "b"),
@@ -132,12 +141,16 @@ def _as_played(capture: Capture, played: Played) -> Capture:
         for frame, array in arrays.items():
             if array.dtype.kind != kind or array.shape != shape or not np.isfinite(array).all():
                 expected = f"{'finite numbers' if kind == 'f' else 'bool'} {shape}"
-                raise StgaError(f"played: {name} {frame}: expected {expected}, got {array.dtype} {array.shape}")
+                raise StgaError(
+                    f"played: {name} {frame}: expected {expected}, got {array.dtype} {array.shape}"
+                )
     flame = None
     if capture.flame is not None and played.motion is not None:
         flame = motion_of(Path("played"), played.motion, capture.flame.model)
         if len(flame.timesteps) != len(played.meshes):
-            raise StgaError(f"played: motion: expected {len(played.meshes)} frames, got {len(flame.timesteps)}")
+            raise StgaError(
+                f"played: motion: expected {len(played.meshes)} frames, got {len(flame.timesteps)}"
+            )
     meshes = dict(sorted(played.meshes.items()))
     return replace(capture, timesteps=tuple(meshes), mesh=meshes.__getitem__, flame=flame)
 
@@ -146,7 +159,8 @@ def _as_played(capture: Capture, played: Played) -> Capture:
 
 
 def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
-    """The request's motion on its avatar; says how far it is outside the trained range, where that is asked for.
+    """The request's motion on its avatar; says how far it is outside the trained range, where that
+    is asked for.
 
     Raises StgaError.
     """
@@ -156,8 +170,12 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
     flame = request.flame or (run.flame if run is not None else None)
     trained = None if run is None else _trained(source, request, say)
     if options.stay_trained is not None and trained is None:
-        raise StgaError(f"--stay-trained: {source} is no run with a FLAME capture, whose motion would be the range")
-    motion = open_motion(request.motion, flame, avatar.neutral, avatar.faces, options, trained, request.fps)
+        raise StgaError(
+            f"--stay-trained: {source} is no run with a FLAME capture, whose motion would be the range"
+        )
+    motion = open_motion(
+        request.motion, flame, avatar.neutral, avatar.faces, options, trained, request.fps
+    )
     for line in findings(motion):
         say(line)
     return motion
@@ -167,11 +185,14 @@ def motion_capture(request: Posed, motion: Motion, own: Capture | None) -> Captu
     """The motion as a capture, seen by the cameras of the run's own one."""
     assert request.motion is not None
     views = {} if own is None else own.views
-    return replace(sequence_capture(request.motion, motion.sequence, request.flame, views), fps=motion.fps)
+    return replace(
+        sequence_capture(request.motion, motion.sequence, request.flame, views), fps=motion.fps
+    )
 
 
 def findings(motion: Motion) -> list[str]:
-    """What to say about a motion: rows that were lost, and how far it goes beyond what was trained."""
+    """What to say about a motion: rows that were lost, and how far it goes beyond what was
+    trained."""
     lines = [f"{motion.lost} rows are missing and were interpolated"] if motion.lost else []
     for part, beyond in motion.outside.items():
         if beyond.any():
@@ -184,7 +205,8 @@ def findings(motion: Motion) -> list[str]:
 
 
 def _trained(folder: Path, request: Posed, say: Say) -> TrainedRange | None:
-    """What the run's capture holds, where the options ask for it; None where it was not tracked with FLAME."""
+    """What the run's capture holds, where the options ask for it; None where it was not tracked
+    with FLAME."""
     options = request.motion_options
     if options.neutral == "none" and options.stay_trained is None:
         return None
@@ -195,7 +217,9 @@ def _trained(folder: Path, request: Posed, say: Say) -> TrainedRange | None:
             raise
         say(f"{error}; the motion is put on the head without expression, not on its quiet face")
         return None
-    return None if own is None else trained_range([own.frame(timestep) for timestep in own.timesteps])
+    return (
+        None if own is None else trained_range([own.frame(timestep) for timestep in own.timesteps])
+    )
 
 
 # The head of an open .blend file
@@ -208,7 +232,8 @@ HEAD, SELECTION, PLAYED = "head.json", "selection.npz", "played.npz"
 
 @dataclass(frozen=True)
 class OpenHead:
-    """The head of the .blend file that Blender has open: what a command works on where nothing is named.
+    """The head of the .blend file that Blender has open: what a command works on where nothing is
+    named.
 
     fps        frames per second of the scene
     selection  what the file's vertex groups train, timestep -> (F,) bool; None without any
@@ -236,16 +261,24 @@ class _Stored:
 
 
 def write_head(folder: Path, head: OpenHead, played: bool) -> None:
-    """Write the head into the folder; `played`: with the meshes that it plays in the scene's frames.
+    """Write the head into the folder; `played`: with the meshes that it plays in the scene's
+    frames.
 
     Raises StgaError where the capture cannot be read, or the folder not be written.
     """
-    write_json(folder / HEAD, to_json(_Stored(head.capture, head.flame, head.avatar, head.principal_point, head.fps)))
+    write_json(
+        folder / HEAD,
+        to_json(_Stored(head.capture, head.flame, head.avatar, head.principal_point, head.fps)),
+    )
     selection = head.selection()
     if selection is not None:
-        write_npz(folder / SELECTION, {str(timestep): faces for timestep, faces in selection.items()})
+        write_npz(
+            folder / SELECTION, {str(timestep): faces for timestep, faces in selection.items()}
+        )
     if played:
-        write_npz(folder / PLAYED, {str(frame): mesh for frame, mesh in head.played().meshes.items()})
+        write_npz(
+            folder / PLAYED, {str(frame): mesh for frame, mesh in head.played().meshes.items()}
+        )
 
 
 def read_head(folder: Path) -> OpenHead:
@@ -272,7 +305,9 @@ def _read_selection(path: Path) -> dict[int, np.ndarray]:
     selection = _by_frame(path)
     for frame, faces in selection.items():
         if faces.dtype != bool or faces.ndim != 1:
-            raise StgaError(f"{path}: frame {frame}: expected bool (F,), got {faces.dtype} {faces.shape}")
+            raise StgaError(
+                f"{path}: frame {frame}: expected bool (F,), got {faces.dtype} {faces.shape}"
+            )
     return selection
 
 

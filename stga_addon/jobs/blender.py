@@ -1,4 +1,5 @@
-"""Rendering for Blender: images that it has recorded, and frames of a .blend file by the Blender of this machine."""
+"""Rendering for Blender: images that it has recorded, and frames of a .blend file by the Blender of
+this machine."""
 
 import os
 import re
@@ -25,7 +26,8 @@ from .results import Written
 from .train import Train
 
 PARTIAL = ".rendering-"
-"""Start of the name of the folder that Blender writes into; a picture leaves it when it is whole."""
+"""Start of the name of the folder that Blender writes into; a picture leaves it when it is
+whole."""
 SAVED = re.compile(r"Saved: '(?P<path>.+)'")
 """What Blender prints when it has written a picture."""
 LAST_LINES = 30
@@ -63,7 +65,11 @@ def render_recording(request: RenderRecording, report: Report, say: Say) -> Writ
     try:
         composer = Composer(request.device)
         output = request.output
-        with video_writer(output, request.fps) if is_video(output) else sequence_writer(output) as write:
+        with (
+            video_writer(output, request.fps)
+            if is_video(output)
+            else sequence_writer(output) as write
+        ):
             images = recorded_images(request.recording, request.images, composer)
             for image in counted(images, request.images, report, "Rendering", "Image"):
                 write(finished(image, request.background, is_video(request.output)))
@@ -74,7 +80,8 @@ def render_recording(request: RenderRecording, report: Report, say: Say) -> Writ
 
 @dataclass(frozen=True)
 class RenderBlend:
-    """Render frames of a .blend file with the Blender of the machine, as PNGs called by their numbers (000012.png).
+    """Render frames of a .blend file with the Blender of the machine, as PNGs called by their
+    numbers (000012.png).
 
     output          folder; pictures that it holds already stay
     frames          first and last
@@ -91,20 +98,25 @@ class RenderBlend:
         if self.blend.suffix.lower() != ".blend":
             raise StgaError(f"{self.blend}: expected a name that ends in .blend")
         if self.frames[0] > self.frames[1]:
-            raise StgaError(f"frames: expected the first and then the last, got {self.frames[0]}, {self.frames[1]}")
+            raise StgaError(
+                f"frames: expected the first and then the last, got {self.frames[0]}, {self.frames[1]}"
+            )
 
     @property
     def pictures(self) -> dict[int, Path]:
         """Frame -> its file."""
         first, last = self.frames
-        return {frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in range(first, last + 1)}
+        return {
+            frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in range(first, last + 1)
+        }
 
 
 def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
     """Render the frames that have no picture yet.
 
     The add-on has to be enabled in that Blender; it renders with the Python of this process, unless
-    STGA_PYTHON names another. Raises StgaError where Blender is missing or fails, Cancelled between two pictures.
+    STGA_PYTHON names another. Raises StgaError where Blender is missing or fails, Cancelled between
+    two pictures.
     """
     if not request.blend.is_file():
         raise StgaError(f"{request.blend}: is not a file; expected a .blend file")
@@ -112,7 +124,8 @@ def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
     missing = [frame for frame, path in pictures.items() if not path.exists()]
     done = len(pictures) - len(missing)
     report(Progress(done / len(pictures), "Rendering"))
-    for _, numbered in groupby(enumerate(missing), lambda item: item[1] - item[0]):  # runs that follow each other
+    # runs that follow each other
+    for _, numbered in groupby(enumerate(missing), lambda item: item[1] - item[0]):
         frames = [frame for _, frame in numbered]
         for _ in _rendered(request, frames[0], frames[-1], say):
             done += 1
@@ -152,7 +165,8 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
 
 
 def blender_command() -> list[str]:
-    """What starts this machine's Blender: the program or command in STGA_BLENDER, else the program `blender`."""
+    """What starts this machine's Blender: the program or command in STGA_BLENDER, else the program
+    `blender`."""
     text = os.environ.get(BLENDER_VARIABLE, "")
     if os.path.isfile(text):  # whose path may hold spaces
         return [text]
@@ -175,7 +189,9 @@ def _start(request: RenderBlend, first: int, last: int, folder: Path) -> subproc
         )  # fmt: skip
     except OSError as error:
         expected = f"expected it on PATH, or the command that starts it in {BLENDER_VARIABLE}"
-        raise StgaError(f"{command[0]}: Blender cannot be started ({error.strerror or error}); {expected}") from error
+        raise StgaError(
+            f"{command[0]}: Blender cannot be started ({error.strerror or error}); {expected}"
+        ) from error
 
 
 def _stop(process: subprocess.Popen[str]) -> None:

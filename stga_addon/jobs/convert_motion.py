@@ -28,16 +28,25 @@ SHAPES_SUFFIX = ".csv"
 
 @dataclass(frozen=True)
 class ConvertMotion:
-    """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or a motion to a CSV of shapes."""
+    """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or a motion to a CSV of
+    shapes."""
 
     source: Path = option(
         "a performance (CSV, JSON, text, take folder), a video of a face, FLAME parameters (.npz), or a capture "
         "tracked with FLAME", flag="MOTION",
     )  # fmt: skip
-    output: Path = option("ARKit's shapes (.csv) or FLAME parameters (.npz)", flag="--out", metavar="FILE")
-    flame: Path | None = like(Train, "flame", help="FLAME model file of the head (default: the bundled head)")
-    head: Path | None = option("capture whose identity a performance moves (default: average)", None, metavar="CAPTURE")
-    fps: float | None = option("frames per second of the result (default: as recorded)", None, above=0)
+    output: Path = option(
+        "ARKit's shapes (.csv) or FLAME parameters (.npz)", flag="--out", metavar="FILE"
+    )
+    flame: Path | None = like(
+        Train, "flame", help="FLAME model file of the head (default: the bundled head)"
+    )
+    head: Path | None = option(
+        "capture whose identity a performance moves (default: average)", None, metavar="CAPTURE"
+    )
+    fps: float | None = option(
+        "frames per second of the result (default: as recorded)", None, above=0
+    )
     options: MotionOptions = motion_options_field()
 
     @property
@@ -65,9 +74,13 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
         _write_shapes(request)
         return Written(request.output)
     if request.writes_shapes:
-        write_performance(request.output, prepared_performance(performance, request.options, request.fps))
+        write_performance(
+            request.output, prepared_performance(performance, request.options, request.fps)
+        )
         return Written(request.output)
-    motion = performed(performance, _person(request), str(request.flame), request.options, fps=request.fps)
+    motion = performed(
+        performance, _person(request), str(request.flame), request.options, fps=request.fps
+    )
     write_motion(request.output, motion.sequence)
     written = f"{request.output}: {len(motion.sequence.timesteps)} timesteps at {motion.fps:g} frames per second"
     return Written(request.output, (*findings(motion), written))
@@ -83,16 +96,21 @@ def _write_shapes(request: ConvertMotion) -> None:
         raise StgaError(f"--head: has no effect on {request.source}, which has its own identity")
     capture = open_capture(request.source, request.flame)
     if capture.flame is None:
-        raise StgaError(f"{request.source}: was not tracked with FLAME, so it has no parameters of expression and pose")
+        raise StgaError(
+            f"{request.source}: was not tracked with FLAME, so it has no parameters of expression and pose"
+        )
     sequence = capture.flame
-    if request.options.neutral != "none":  # of the parameters: what leaks into them are no weights from 0 to 1
+    # of the parameters: what leaks into them are no weights from 0 to 1
+    if request.options.neutral != "none":
         frames, _ = adapted(
             [sequence.frame(timestep) for timestep in sequence.timesteps],
             MotionOptions(neutral=request.options.neutral),
         )
         known = dict(zip(sequence.timesteps, frames, strict=True))
         sequence = replace(sequence, frame=known.__getitem__)
-    performance = captured_performance(sequence, str(request.source), playback_fps(capture, numbered=True))
+    performance = captured_performance(
+        sequence, str(request.source), playback_fps(capture, numbered=True)
+    )
     options = replace(request.options, neutral="none")
     write_performance(request.output, prepared_performance(performance, options, request.fps))
 
@@ -111,7 +129,10 @@ def _person(request: ConvertMotion) -> FlameSequence:
 def write_motion(path: Path, sequence: FlameSequence) -> None:
     """Write a sequence as FLAME parameters that `read_motion` takes."""
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    arrays = {name: np.stack([getattr(frame, name) for frame in frames]).astype(np.float32) for name in FRAME_FIELDS}
+    arrays = {
+        name: np.stack([getattr(frame, name) for frame in frames]).astype(np.float32)
+        for name in FRAME_FIELDS
+    }
     arrays |= {"shape": sequence.shape, "timesteps": np.array(sequence.timesteps)}
     if sequence.model.expression_names:
         arrays[EXPRESSION_NAMES] = np.array(sequence.model.expression_names)

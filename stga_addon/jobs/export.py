@@ -1,4 +1,5 @@
-"""Export of an avatar in another format: one frame, a range of frames, or splats with their FLAME motion."""
+"""Export of an avatar in another format: one frame, a range of frames, or splats with their FLAME
+motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -38,20 +39,31 @@ from .train import Train
 
 @dataclass(frozen=True)
 class Export:
-    """Write an avatar in another format, for other viewers and tools; other fields as of `avatar_source.Posed`."""
+    """Write an avatar in another format, for other viewers and tools; other fields as of
+    `avatar_source.Posed`."""
 
     source: Path = option("folder of a run, or avatar file", flag="RUN|AVATAR")
     output: Path = option("the file, or the folder of a format of several", flag="--out")
     file_format: str = option(
-        "file format", flag="--format", choices={name: format.description for name, format in FORMATS.items()}
+        "file format",
+        flag="--format",
+        choices={name: format.description for name, format in FORMATS.items()},
     )
     capture: Path | None = option("whose frames to bake (default: the run's)", None)
-    flame: Path | None = like(Train, "flame", help="FLAME model file of that capture, or of the motion")
+    flame: Path | None = like(
+        Train, "flame", help="FLAME model file of that capture, or of the motion"
+    )
     played: Played | None = None
-    timestep: int | None = option("of a format that holds one frame (default: the neutral mesh)", None, 0)
-    frames: tuple[int, int] | None = option("of a format that holds several (default: all)", None, metavar="FIRST:LAST")
+    timestep: int | None = option(
+        "of a format that holds one frame (default: the neutral mesh)", None, 0
+    )
+    frames: tuple[int, int] | None = option(
+        "of a format that holds several (default: all)", None, metavar="FIRST:LAST"
+    )
     fps: float | None = option(
-        f"frames per second of usd and web (default: the scene's or the capture's, else {DEFAULT_FPS:g})", None, above=0
+        f"frames per second of usd and web (default: the scene's or the capture's, else {DEFAULT_FPS:g})",
+        None,
+        above=0,
     )
     motion_only: bool = option(
         "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take stay in the page, and "
@@ -60,10 +72,13 @@ class Export:
     )
     motion: Path | None = motion_field()
     motion_options: MotionOptions = motion_options_field("motion")
-    albedo: bool = option("leave out the capture's light: colors are the albedo (docs/light.md)", False)
+    albedo: bool = option(
+        "leave out the capture's light: colors are the albedo (docs/light.md)", False
+    )
 
     def check(self) -> None:
-        """Raise StgaError for a file name of another format, and for what the format would leave out."""
+        """Raise StgaError for a file name of another format, and for what the format would leave
+        out."""
         held = {
             "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
             "frames": [name for name, format in FORMATS.items() if format.source == "range"],
@@ -75,8 +90,14 @@ class Export:
                 raise StgaError(
                     f"{flag} cannot be combined with --format {self.file_format}, only with {', '.join(formats)}"
                 )
-        if self.motion is not None and self.file_format in held["timestep"] and self.timestep is None:
-            raise StgaError(f"--motion: has no effect with --format {self.file_format} without --timestep")
+        if (
+            self.motion is not None
+            and self.file_format in held["timestep"]
+            and self.timestep is None
+        ):
+            raise StgaError(
+                f"--motion: has no effect with --format {self.file_format} without --timestep"
+            )
         check_suffix(self.output, self.file_format)
 
 
@@ -142,9 +163,15 @@ def still_playback(request: Export, avatar: Avatar, fps: float, say: Say) -> Pla
 
 
 def capture_playback(
-    request: Export, avatar: Avatar, capture: Capture, timesteps: tuple[int, ...], fps: float, say: Say
+    request: Export,
+    avatar: Avatar,
+    capture: Capture,
+    timesteps: tuple[int, ...],
+    fps: float,
+    say: Say,
 ) -> tuple[Playback, FlameSequence | None]:
-    """What a page of the capture's timesteps shows, and its FLAME motion. Says what it holds of a FLAME model."""
+    """What a page of the capture's timesteps shows, and its FLAME motion. Says what it holds of a
+    FLAME model."""
     playback = Playback(
         title=_title(request),
         fps=fps,
@@ -154,10 +181,19 @@ def capture_playback(
         motion_only=request.motion_only,
         controls=None if request.motion_only else page_controls(capture.flame),
     )
-    sequence = None if capture.flame is None else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
+    sequence = (
+        None
+        if capture.flame is None
+        else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
+    )
     notice = flame_notice(avatar, sequence, request.motion_only)
     has_rig = sequence is not None and not request.motion_only
-    _say_licence(f"{notice} --motion-only leaves them out, but not the meshes of the take." if has_rig else notice, say)
+    _say_licence(
+        f"{notice} --motion-only leaves them out, but not the meshes of the take."
+        if has_rig
+        else notice,
+        say,
+    )
     return playback, sequence
 
 
@@ -193,13 +229,16 @@ def _up(capture: Capture) -> tuple[float, float, float]:
     return (float(axis[0]), float(axis[1]), float(axis[2]))
 
 
-def _selection(request: Export, capture: Capture, timesteps: tuple[int, ...]) -> list[np.ndarray] | None:
+def _selection(
+    request: Export, capture: Capture, timesteps: tuple[int, ...]
+) -> list[np.ndarray] | None:
     """What each timestep trains: the open file's or the run's selection, else by the rule."""
     chosen: Mapping[int, np.ndarray] | None = None
     if request.played is not None:
         chosen = request.played.selection
     elif (request.source / SELECTION).exists():
-        from ..training.run.checkpoint import read_selection  # imports torch, which Blender may lack
+        # imports torch, which Blender may lack
+        from ..training.run.checkpoint import read_selection
 
         chosen = read_selection(request.source, len(capture.faces))
     if not chosen and request.played is None:
@@ -209,7 +248,8 @@ def _selection(request: Export, capture: Capture, timesteps: tuple[int, ...]) ->
 
 
 def _flame_timesteps(capture: Capture, timesteps: tuple[int, ...]) -> tuple[int, ...]:
-    """The timesteps of `capture.flame` for those of the capture, which an open head numbers by the scene's frames."""
+    """The timesteps of `capture.flame` for those of the capture, which an open head numbers by the
+    scene's frames."""
     assert capture.flame is not None
     numbered = dict(zip(capture.timesteps, capture.flame.timesteps, strict=True))
     return tuple(numbered[timestep] for timestep in timesteps)

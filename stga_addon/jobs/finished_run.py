@@ -1,4 +1,5 @@
-"""What is found out about a finished run: the light of its capture, kept in its avatar, and its quality on a split."""
+"""What is found out about a finished run: the light of its capture, kept in its avatar, and its
+quality on a split."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,14 @@ from ..files import write_json
 from ..light.environment import harmonics_of, read_hdr
 from ..options import like, option
 from ..progress import Progress, Report, Say, ignore
-from ..training.run.folder import AVATAR, WORLD_FILE, locked, open_refined, open_run, with_refined_tracking
+from ..training.run.folder import (
+    AVATAR,
+    WORLD_FILE,
+    locked,
+    open_refined,
+    open_run,
+    with_refined_tracking,
+)
 from .results import Written
 
 if TYPE_CHECKING:
@@ -29,7 +37,9 @@ class Relight:
     """Estimate the light of a run's capture, so that the lights of a scene can take its place."""
 
     run: Path = option("folder of a run", flag="RUN")
-    light: Path | None = option("environment of the studio, instead of an estimate", None, metavar="FILE.hdr")
+    light: Path | None = option(
+        "environment of the studio, instead of an estimate", None, metavar="FILE.hdr"
+    )
     card: tuple[float, float, float] | None = option(
         "sRGB in 0…1 of an 18 % gray card at the face that faces the central camera: level and white balance",
         None, 0, 1, flag="--gray-card", metavar="R,G,B",
@@ -44,7 +54,8 @@ class Relight:
 
 
 def relight(request: Relight, report: Report, say: Say) -> Written:
-    """Estimate the light, or take the known one, and write it into the run's avatar file. Raises StgaError."""
+    """Estimate the light, or take the known one, and write it into the run's avatar file. Raises
+    StgaError."""
     from ..light.estimate import Known
 
     folder = request.run
@@ -80,7 +91,11 @@ def add_light(
 
 def describe_light(light: AvatarLight) -> tuple[str, ...]:
     """Lines about where a light is from and how well it explains the capture."""
-    source = {"estimated": "estimated", "gray_card": "estimated, level by a gray card", "file": "from a file"}
+    source = {
+        "estimated": "estimated",
+        "gray_card": "estimated, level by a gray card",
+        "file": "from a file",
+    }
     line = f"light: {source[light.source]}; recorded colors differ from it by {light.residual:.1%}"
     if not light.damping:
         return (line,)
@@ -103,7 +118,8 @@ def _toward_central_camera(capture: Capture) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure PSNR, SSIM and LPIPS of a run's avatar on held-out views; they are written into the run's folder, too."""
+    """Measure PSNR, SSIM and LPIPS of a run's avatar on held-out views; they are written into the
+    run's folder, too."""
 
     run: Path = like(Relight, "run")
     split: str = option("views to measure on", "val", choices=("train", "val", "test"))
@@ -112,8 +128,9 @@ class Evaluate:
 
 
 def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
-    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder; of timesteps without training views, also
-    with the heads as they were before the avatar tracked them. Raises StgaError."""
+    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder; of timesteps without
+    training views, also with the heads as they were before the avatar tracked them. Raises
+    StgaError."""
     from ..training.evaluate.metrics import evaluate_avatar, psnr_recorded
 
     folder, split = request.run, request.split
@@ -131,16 +148,21 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})
     lines = [f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)]
-    unseen = {view.timestep for view in views} - {view.timestep for view in capture.views.get("train", ())}
+    unseen = {view.timestep for view in views} - {
+        view.timestep for view in capture.views.get("train", ())
+    }
     if (
         tracked.flame is not None
         and capture.flame is not None
         and any(
-            not np.array_equal(capture.flame.frame(t).parameters, tracked.flame.frame(t).parameters) for t in unseen
+            not np.array_equal(capture.flame.frame(t).parameters, tracked.flame.frame(t).parameters)
+            for t in unseen
         )
     ):
         before = _describe(evaluate_avatar(avatar, tracked, split))
-        lines.insert(1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}")
+        lines.insert(
+            1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}"
+        )
     return Written(path, tuple(lines))
 
 
@@ -151,9 +173,13 @@ def _details(quality: "Quality") -> list[str]:
         if region in quality.regions
     ]
     if quality.psnr_recorded is not None:
-        lines.append(f"  in front of its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB")
+        lines.append(
+            f"  in front of its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB"
+        )
     if quality.psnr_unmatched is not None:
-        lines.append(f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB")
+        lines.append(
+            f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB"
+        )
     if quality.lpips is None:
         from ..training.evaluate.lpips import MIN_SIDE_PX
 

@@ -2,7 +2,8 @@
 
 request.json   the request
 request.npz    its arrays
-result.json    what was found, where the request asks for something other than files; result.npz: its arrays
+result.json    what was found, where the request asks for something other than files; result.npz:
+               its arrays
 preview.npz    of a training: the avatar of a few seconds ago
 picture.npz    of a tracking: the head over the footage, `rgb` (H, W, 3) uint8
 besides the files of the worker's status (`worker.status`)
@@ -42,7 +43,9 @@ def check_request(request: Request) -> None:
     """Raise StgaError for what can be known to fail before a worker is started."""
     match request:
         case Train() | Refine() | Extend() if has_run(request.run):
-            raise StgaError(f"{request.run}: already holds a run; resume it, or choose another folder")
+            raise StgaError(
+                f"{request.run}: already holds a run; resume it, or choose another folder"
+            )
         case Resume():
             read_run(request.run)
         case Track() if is_written(request.out):
@@ -56,13 +59,21 @@ def check_request(request: Request) -> None:
 
 
 def worker_arguments(folder: Path, threads: int | None = None, resume: bool = False) -> list[str]:
-    """What a worker's interpreter runs after `-m` for the request in the folder (`stga perform`)."""
+    """What a worker's interpreter runs after `-m` for the request in the folder (`stga
+    perform`)."""
     limit = [] if threads is None else ["--threads", str(threads)]
-    return ["stga_addon", "perform", str(folder.resolve()), *limit, *(["--resume"] if resume else [])]
+    return [
+        "stga_addon",
+        "perform",
+        str(folder.resolve()),
+        *limit,
+        *(["--resume"] if resume else []),
+    ]
 
 
 def write_request(folder: Path, request: Request) -> None:
-    """Prepare the folder for a worker. Raises StgaError while one is working in it, or on a full disk."""
+    """Prepare the folder for a worker. Raises StgaError while one is working in it, or on a full
+    disk."""
     prepare_status_folder(folder)
     for stale in FILES:
         (folder / stale).unlink(missing_ok=True)
@@ -82,7 +93,8 @@ def has_request(folder: Path) -> bool:
 
 
 def remove_request(folder: Path) -> None:
-    """Remove the files of a request and its worker's status; a folder that holds no request stays as it is.
+    """Remove the files of a request and its worker's status; a folder that holds no request stays
+    as it is.
 
     Raises StgaError while its worker is working.
     """
@@ -111,9 +123,16 @@ def _write(path: Path, arrays_path: Path, value: Any, kinds: Any) -> None:
 
 def _read(path: Path, arrays_path: Path, kinds: Any) -> Any:
     values = read_json(path)
-    if not isinstance(values, dict) or (values.pop("format", None), values.pop("version", None)) != (FORMAT, VERSION):
-        raise StgaError(f"{path}: is not a request that this version reads (format '{FORMAT}', version {VERSION})")
+    if not isinstance(values, dict) or (
+        values.pop("format", None),
+        values.pop("version", None),
+    ) != (FORMAT, VERSION):
+        raise StgaError(
+            f"{path}: is not a request that this version reads (format '{FORMAT}', version {VERSION})"
+        )
     try:
-        return from_json(kinds, values, arrays=read_npz(arrays_path) if os.path.exists(arrays_path) else {})
+        return from_json(
+            kinds, values, arrays=read_npz(arrays_path) if os.path.exists(arrays_path) else {}
+        )
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error

@@ -19,7 +19,8 @@ Stamp = tuple[int, int]
 
 @dataclass(frozen=True)
 class RunFiles:
-    """Stamps of a run's files, and of the capture that is tracked for it; None: there is no such file."""
+    """Stamps of a run's files, and of the capture that is tracked for it; None: there is no such
+    file."""
 
     capture: Stamp | None = None
     picture: Stamp | None = None
@@ -33,13 +34,15 @@ class RunFiles:
 class RequestState:
     """What is known of a scene's request of one kind.
 
-    subject         run, capture or video that the request is about, as the scene names it; None: none
+    subject         run, capture or video that the request is about, as the scene names it; None:
+                    none
     folder          of the request, as found now: a run may have moved along with the .blend file
     snapshot        the worker's status as last read
     files           of a run, as last seen
     result_shown    the result has reached the scene, or never will
     shown_capture, shown_preview   stamps of the capture and the preview that were loaded last
-    loading         what is being read, or put into the scene: an avatar file, or the folder of the request
+    loading         what is being read, or put into the scene: an avatar file, or the folder of the
+                    request
     building        it is being built in slices
     error           one sentence: a result that could not be shown, or why monitoring stopped
     stopped         monitoring stopped after an unexpected error
@@ -83,9 +86,13 @@ class RequestState:
     def has_result(self) -> bool:
         """Whether the worker has ended with a result that is still to be shown."""
         state = self.snapshot.state
-        ended = state == WorkerState.FINISHED or (state == WorkerState.CANCELLED and self.kind in TRAINS)
+        ended = state == WorkerState.FINISHED or (
+            state == WorkerState.CANCELLED and self.kind in TRAINS
+        )
         # An avatar's tracking may have been cancelled; a video changes nothing in the scene.
-        is_there = self.files.avatar is not None if self.kind == Kind.AVATAR else self.kind != Kind.VIDEO
+        is_there = (
+            self.files.avatar is not None if self.kind == Kind.AVATAR else self.kind != Kind.VIDEO
+        )
         return ended and is_there and not self.result_shown
 
     @property
@@ -140,7 +147,8 @@ class StatusRead:
 
 @dataclass(frozen=True)
 class SceneFree:
-    """What the result changes can be changed now: Blender does not render, and nothing of it is in Edit Mode."""
+    """What the result changes can be changed now: Blender does not render, and nothing of it is in
+    Edit Mode."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +171,17 @@ class Failed:
     stops: bool = False
 
 
-Event = Started | CancelAsked | Dismissed | SceneRead | StatusRead | SceneFree | SliceBuilt | Shown | Failed
+Event = (
+    Started
+    | CancelAsked
+    | Dismissed
+    | SceneRead
+    | StatusRead
+    | SceneFree
+    | SliceBuilt
+    | Shown
+    | Failed
+)
 
 
 # Effects
@@ -193,11 +211,13 @@ class LoadAvatar(_OnPath):
 
 
 class Show(_OnPath):
-    """Put what was loaded into the scene, as far as it was read; answered by SliceBuilt, Shown or Failed."""
+    """Put what was loaded into the scene, as far as it was read; answered by SliceBuilt, Shown or
+    Failed."""
 
 
 class ReadCurve(_OnPath):
-    """Read the evaluations in the run for the panel's curve, or before the first ones the picture of the tracking."""
+    """Read the evaluations in the run for the panel's curve, or before the first ones the picture
+    of the tracking."""
 
 
 class StopWorker(_OnPath):
@@ -222,7 +242,18 @@ class Redraw:
     """Redraw the panels."""
 
 
-Effect = Store | StoreAvatar | LoadAvatar | Show | ReadCurve | StopWorker | KillWorker | RemoveFiles | PushUndo | Redraw
+Effect = (
+    Store
+    | StoreAvatar
+    | LoadAvatar
+    | Show
+    | ReadCurve
+    | StopWorker
+    | KillWorker
+    | RemoveFiles
+    | PushUndo
+    | Redraw
+)
 Outcome = tuple[RequestState, tuple[Effect, ...]]
 
 
@@ -249,7 +280,9 @@ def transition(state: RequestState, event: Event) -> Outcome:
         case Shown(undoable):
             return _loading_ended(state, undoable)
         case Failed(sentence, stops=True):
-            return replace(state, error=sentence, stopped=True, loading=None, building=False), (Redraw(),)
+            return replace(state, error=sentence, stopped=True, loading=None, building=False), (
+                Redraw(),
+            )
         case Failed(sentence):
             return _loading_ended(state, error=sentence)
 
@@ -277,11 +310,24 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     effects: list[Effect] = []
     before, worker = state, event.snapshot.state
     error = "" if state.stopped else state.error
-    state = replace(state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error, stopped=False)
-    drawn, drawn_before = ((each.folder, each.files.metrics, each.files.picture) for each in (state, before))
+    state = replace(
+        state,
+        folder=event.folder,
+        files=event.files,
+        snapshot=event.snapshot,
+        error=error,
+        stopped=False,
+    )
+    drawn, drawn_before = (
+        (each.folder, each.files.metrics, each.files.picture) for each in (state, before)
+    )
     if drawn != drawn_before and state.kind in (*TRAINS, Kind.TRACKING):
         effects.append(ReadCurve(state.run))
-    if (state.folder, state.files, state.snapshot) != (before.folder, before.files, before.snapshot):
+    if (state.folder, state.files, state.snapshot) != (
+        before.folder,
+        before.files,
+        before.snapshot,
+    ):
         effects.append(Redraw())
     if state.loading is not None:
         return state, tuple(effects)
@@ -298,8 +344,12 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
 def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) -> Outcome:
     """Load the tracked capture, the trained avatar, or a preview of it, once each."""
     capture, preview = state.files.capture, state.files.preview
-    if capture not in (None, state.shown_capture) and (state.snapshot.state.is_alive or state.has_result):
-        return replace(state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture), tuple(effects)
+    if capture not in (None, state.shown_capture) and (
+        state.snapshot.state.is_alive or state.has_result
+    ):
+        return replace(state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture), tuple(
+            effects
+        )
     if state.has_result:
         effects.append(StoreAvatar(state.run / AVATAR))
         if event.show_result:
@@ -307,7 +357,11 @@ def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) 
         else:
             state = replace(state, result_shown=True)
             effects.extend(_stored(state))
-    elif state.snapshot.state.is_alive and event.live_preview and preview not in (None, state.shown_preview):
+    elif (
+        state.snapshot.state.is_alive
+        and event.live_preview
+        and preview not in (None, state.shown_preview)
+    ):
         state = replace(state, loading=event.folder / PREVIEW, shown_preview=preview)
     if state.loading is not None:
         effects.append(LoadAvatar(state.loading))
@@ -323,5 +377,11 @@ def _loading_ended(state: RequestState, undoable: bool = False, error: str = "")
     if state.kind in TRANSIENT:
         forgotten, removed = _forgotten(state, error=error)
         return forgotten, (*undo, *removed)
-    state = replace(state, loading=None, building=False, error=error, result_shown=state.result_shown or was_result)
+    state = replace(
+        state,
+        loading=None,
+        building=False,
+        error=error,
+        result_shown=state.result_shown or was_result,
+    )
     return state, (*(_stored(state) if was_result else ()), *undo, Redraw())

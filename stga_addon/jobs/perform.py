@@ -33,8 +33,8 @@ def perform(request: Request, report: Report = ignore, say: Say = print) -> Resu
     """Carry out a request; returns what it found.
 
     say: told in lines what was decided and found.
-    Raises what the work raises: StgaError for mistakes and damaged files; Cancelled where the report stopped work that
-    has nothing to keep; KeyboardInterrupt after Ctrl-C.
+    Raises what the work raises: StgaError for mistakes and damaged files; Cancelled where the
+    report stopped work that has nothing to keep; KeyboardInterrupt after Ctrl-C.
     """
     refuse_useless(request)
     validate(request)
@@ -45,13 +45,17 @@ def perform(request: Request, report: Report = ignore, say: Say = print) -> Resu
     return result
 
 
-def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, resume: bool = False) -> Result | None:
-    """Carry out the request in a folder, with its status, previews and result there; None where it was cancelled.
+def perform_in_folder(
+    folder: Path, say: Say = print, also: Report = ignore, resume: bool = False
+) -> Result | None:
+    """Carry out the request in a folder, with its status, previews and result there; None where it
+    was cancelled.
 
-    also: reported to as well. resume: what the request's output folder holds is what this request began (`remaining`).
-    Raises as `perform` does; the message is in the final status, too.
+    also: reported to as well. resume: what the request's output folder holds is what this request
+    began (`remaining`). Raises as `perform` does; the message is in the final status, too.
     """
-    if not has_request(folder):  # before anything is written into a folder that may be of something else
+    # before anything is written into a folder that may be of something else
+    if not has_request(folder):
         raise StgaError(f"{folder}: holds no request")
     with status_writer(folder) as writer:
         writer.update(0.0, "Starting")
@@ -62,10 +66,13 @@ def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, res
 
                 begin_compiling()
                 load_ahead()
-            if resume and isinstance(request, Track) and is_written(request.out):  # ended before it wrote its result
+            # ended before it wrote its result
+            if resume and isinstance(request, Track) and is_written(request.out):
                 result: Result = Written(request.out)
             else:
-                result = perform(remaining(request) if resume else request, _StatusReport(writer, also), say)
+                result = perform(
+                    remaining(request) if resume else request, _StatusReport(writer, also), say
+                )
         except Cancelled:
             return None
         write_result(folder, result)
@@ -73,18 +80,25 @@ def perform_in_folder(folder: Path, say: Say = print, also: Report = ignore, res
 
 
 def load_ahead() -> None:
-    """Load what a training loads later, at its end too: an update of the add-on may exchange the files meanwhile."""
+    """Load what a training loads later, at its end too: an update of the add-on may exchange the
+    files meanwhile."""
     for room in LOADED_AHEAD:
         package = import_module(f"..{room}", __package__)
         for module in walk_packages(getattr(package, "__path__", ()), f"{package.__name__}."):
             if not module.name.endswith(TORCH_MODULES):
-                with suppress(ImportError):  # a package that not every Python has, and that nothing here needs
+                # a package that not every Python has, and that nothing here needs
+                with suppress(ImportError):
                     import_module(module.name)
 
 
 def remaining(request: Request) -> Request:
-    """What is left of a request that was interrupted: trainings are resumed, others write their files anew."""
-    return resumed(request) if isinstance(request, Train | Refine | Extend) and has_run(request.run) else request
+    """What is left of a request that was interrupted: trainings are resumed, others write their
+    files anew."""
+    return (
+        resumed(request)
+        if isinstance(request, Train | Refine | Extend) and has_run(request.run)
+        else request
+    )
 
 
 class _StatusReport:
@@ -95,7 +109,9 @@ class _StatusReport:
         self._previewed_s = monotonic()
 
     def __call__(self, progress: Progress) -> bool:
-        stop = self._writer.update(progress.share, progress.stage, progress.detail, progress.figures)
+        stop = self._writer.update(
+            progress.share, progress.stage, progress.detail, progress.figures
+        )
         if progress.preview is not None and monotonic() - self._previewed_s > PREVIEW_INTERVAL_S:
             progress.preview(self._writer.folder / PREVIEW)
             self._previewed_s = monotonic()

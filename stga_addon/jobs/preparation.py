@@ -1,6 +1,8 @@
-"""Compilation ahead of a training: `python -m stga_addon.jobs.preparation`, which Blender starts with a capture.
+"""Compilation ahead of a training: `python -m stga_addon.jobs.preparation`, which Blender starts
+with a capture.
 
-The first training on a machine compiles Numba's kernels, and bytecode of the packages that an extension brings.
+The first training on a machine compiles Numba's kernels, and bytecode of the packages that an
+extension brings.
 """
 
 import os
@@ -14,7 +16,8 @@ from .perform import load_ahead
 
 
 def prepare() -> None:
-    """Compile what a training runs; without an effect while another process does, or where nothing can be written."""
+    """Compile what a training runs; without an effect while another process does, or where nothing
+    can be written."""
     os.environ[OWN_KERNELS] = "1"
     folder = cache_folder()
     with suppress(OSError):  # BlockingIOError among them

@@ -29,16 +29,19 @@ class Checked:
 
 
 def start_check(python: str) -> "subprocess.Popen[str]":
-    """The process whose output `finish_check` judges. Raises StgaError where the interpreter cannot be started."""
+    """The process whose output `finish_check` judges. Raises StgaError where the interpreter cannot
+    be started."""
     return start_python(
         python, ["stga_addon.jobs.python_report"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, errors="replace",
     )  # fmt: skip
 
 
-def finish_check(python: str, process: "subprocess.Popen[str]", timeout_s: float = CHECK_TIMEOUT_S) -> Checked:
-    """Wait for a check that was started. Raises StgaError where the interpreter lacks something, which the sentence
-    names, or does not answer; it is ended then."""
+def finish_check(
+    python: str, process: "subprocess.Popen[str]", timeout_s: float = CHECK_TIMEOUT_S
+) -> Checked:
+    """Wait for a check that was started. Raises StgaError where the interpreter lacks something,
+    which the sentence names, or does not answer; it is ended then."""
     with process:
         try:
             output, errors = process.communicate(timeout=timeout_s)
@@ -57,13 +60,18 @@ def finish_check(python: str, process: "subprocess.Popen[str]", timeout_s: float
 
 
 def describe_check(python: str, report: dict[str, Any]) -> str:
-    """The line of a check from what python_report.py prints. Raises StgaError where something is missing."""
+    """The line of a check from what python_report.py prints. Raises StgaError where something is
+    missing."""
     version, versions, failures = report["python"], report["versions"], report["failures"]
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_PYTHON:
         raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
     missing = [package_name(text) for module, text in REQUIREMENTS.items() if module in failures]
     if missing:
-        why = next((text for text in failures.values() if not text.startswith("ModuleNotFoundError")), "")
+        why = next(
+            (text for text in failures.values() if not text.startswith("ModuleNotFoundError")), ""
+        )
         failed = f" ({why})" if why else ""
-        raise StgaError(f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that there")
+        raise StgaError(
+            f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that there"
+        )
     return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"

@@ -1,4 +1,5 @@
-"""Reports as JSON which packages and device an interpreter has: `python -m stga_addon.jobs.python_report`."""
+"""Reports as JSON which packages and device an interpreter has: `python -m
+stga_addon.jobs.python_report`."""
 
 import importlib
 import json
@@ -27,9 +28,11 @@ def main() -> None:
 
 
 def _adapters() -> tuple[list[str], str]:
-    """The GPUs that can train, as `--device gpu:NAME` names them, and the device to report: the first GPU, or the CPU.
+    """The GPUs that can train, as `--device gpu:NAME` names them, and the device to report: the
+    first GPU, or the CPU.
 
-    Whether that GPU is right and faster than the CPU is tried before each training (`choose_device`), not here.
+    Whether that GPU is right and faster than the CPU is tried before each training
+    (`choose_device`), not here.
     """
     cpu = f"CPU with {os.cpu_count()} threads"
     try:
@@ -38,7 +41,9 @@ def _adapters() -> tuple[list[str], str]:
         found = adapters()
     except Exception:  # a package is missing, or a driver fails: the CPU trains
         return [], cpu
-    return list(found), next((name for name, adapter in found.items() if not is_software(adapter)), cpu)
+    return list(found), next(
+        (name for name, adapter in found.items() if not is_software(adapter)), cpu
+    )
 
 
 if __name__ == "__main__":

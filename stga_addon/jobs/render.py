@@ -1,4 +1,5 @@
-"""Rendering of an avatar or a PLY: one PNG per camera entry, a video of its motion, or a turntable."""
+"""Rendering of an avatar or a PLY: one PNG per camera entry, a video of its motion, or a
+turntable."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -60,7 +61,11 @@ class Render:
         None, 0, 360, metavar="DEGREES", bare=0.0,
     )  # fmt: skip
     camera: int | None = option(
-        "camera of the video (default: the central one)", None, 0, metavar="INDEX", needs=(("video", "turntable"),)
+        "camera of the video (default: the central one)",
+        None,
+        0,
+        metavar="INDEX",
+        needs=(("video", "turntable"),),
     )
     fps: float | None = option(
         f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})", None, 0
@@ -73,10 +78,14 @@ class Render:
         "timesteps to render (default: all), not of a turntable", None, 0, metavar="FIRST:LAST"
     )
     capture: Path | None = option("whose meshes drive the avatar (default: the run's)", None)
-    flame: Path | None = like(Train, "flame", help="FLAME model file of that capture, or of the motion")
+    flame: Path | None = like(
+        Train, "flame", help="FLAME model file of that capture, or of the motion"
+    )
     motion: Path | None = motion_field()
     played: Played | None = None
-    background: tuple[float, float, float] = option("white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1)
+    background: tuple[float, float, float] = option(
+        "white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1
+    )
     principal_point: str | None = like(
         Train,
         "principal_point",
@@ -86,12 +95,16 @@ class Render:
     )
     device: str = like(Train, "device")
     motion_options: MotionOptions = motion_options_field("motion")
-    light: Path | None = option("environment (.hdr) or lights (.toml) that light the avatar", None, metavar="FILE")
+    light: Path | None = option(
+        "environment (.hdr) or lights (.toml) that light the avatar", None, metavar="FILE"
+    )
     light_turn: float = option(
         "turn that light around the head during the video", 0.0, -36000, 36000,
         metavar="DEGREES", needs=("light", ("video", "turntable")),
     )  # fmt: skip
-    world: bool = option("put the run's world behind the avatar (train with --effect world=on)", False)
+    world: bool = option(
+        "put the run's world behind the avatar (train with --effect world=on)", False
+    )
 
     @property
     def is_film(self) -> bool:
@@ -105,14 +118,17 @@ class Render:
         if self.cameras is None and not self.is_film:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
         if self.frames is not None and self.turntable is not None:
-            raise StgaError("--frames: has no effect with --turntable, which plays all of the motion")
+            raise StgaError(
+                "--frames: has no effect with --turntable, which plays all of the motion"
+            )
 
 
 # Work
 
 
 def render(request: Render, report: Report, say: Say) -> Written:
-    """Render the pictures or the video. A cancelled video is not written; pictures that are finished stay.
+    """Render the pictures or the video. A cancelled video is not written; pictures that are
+    finished stay.
 
     Raises StgaError.
     """
@@ -126,7 +142,11 @@ def render(request: Render, report: Report, say: Say) -> Written:
         views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
     composer = Composer(request.device)
     composer.choose()
-    subject = _subject(request, composer) if request.motion is None else _reenacted(request, composer, say)
+    subject = (
+        _subject(request, composer)
+        if request.motion is None
+        else _reenacted(request, composer, say)
+    )
     if request.is_film:
         _film(request, subject, subject.views if views is None else views, report)
     else:
@@ -139,7 +159,9 @@ def render(request: Render, report: Report, say: Say) -> Written:
                 for index in sorted(cameras)
             ]
         timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
-        _write_pictures(request.output, subject, [view for view in views if view.timestep in timesteps], report)
+        _write_pictures(
+            request.output, subject, [view for view in views if view.timestep in timesteps], report
+        )
     return Written(request.output)
 
 
@@ -171,7 +193,9 @@ def _write_pictures(folder: Path, subject: _Subject, views: Sequence[View], repo
     overwritten = next((name for name in names if target / name in captured), None)
     if overwritten is not None:
         raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
-    for view, name in counted(zip(views, names, strict=True), len(views), report, "Rendering", "Image"):
+    for view, name in counted(
+        zip(views, names, strict=True), len(views), report, "Rendering", "Image"
+    ):
         with replacing(folder / name) as partial:
             Image.fromarray(to_uint8(subject.image(view, 0.0))).save(partial, format="PNG")
 
@@ -187,10 +211,23 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
         count = max(len(timesteps), _turntable_images(request, subject.fps), 1)
         timesteps = to_and_fro(timesteps, count)
         center, half = subject.center(), np.radians(request.turntable) / 2
-        angles = (-half, half) if half else covered_angles([view.camera for view in views], start.camera, center)
-        path = [replace(start, camera=camera) for camera in turntable(start.camera, center, count, angles)]
-    path = [replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)]
-    writer = video_writer(request.output, subject.fps) if request.video else sequence_writer(request.output)
+        angles = (
+            (-half, half)
+            if half
+            else covered_angles([view.camera for view in views], start.camera, center)
+        )
+        path = [
+            replace(start, camera=camera)
+            for camera in turntable(start.camera, center, count, angles)
+        ]
+    path = [
+        replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)
+    ]
+    writer = (
+        video_writer(request.output, subject.fps)
+        if request.video
+        else sequence_writer(request.output)
+    )
     with writer as write:
         for n, view in enumerate(counted(path, len(path), report, "Rendering", "Image")):
             write(to_uint8(subject.image(view, n / len(path))))
@@ -211,7 +248,9 @@ def _turntable_images(request: Render, fps: float) -> int:
     """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
     images = request.seconds * fps
     if images > MAX_TURNTABLE_IMAGES:
-        asked = f"--seconds {request.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
+        asked = (
+            f"--seconds {request.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
+        )
         raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
     return round(images)
 
@@ -225,7 +264,9 @@ def _chosen_camera(request: Render, views: Sequence[View]) -> View:
         indices = sorted(first)
         return first[indices[central_camera([first[index].camera for index in indices])]]
     if request.camera not in first:
-        raise StgaError(f"--camera {request.camera}: there are only {', '.join(map(str, sorted(first)))}")
+        raise StgaError(
+            f"--camera {request.camera}: there are only {', '.join(map(str, sorted(first)))}"
+        )
     return first[request.camera]
 
 
@@ -233,7 +274,9 @@ def _subject(request: Render, composer: Composer) -> _Subject:
     """An avatar with its capture, or a plain world-space PLY."""
     if is_ply(request.source):
         if request.light is not None:
-            raise StgaError(f"{request.source}: is a PLY, whose light is not known; --light needs an avatar")
+            raise StgaError(
+                f"{request.source}: is a PLY, whose light is not known; --light needs an avatar"
+            )
         if request.world:
             raise StgaError(f"{request.source}: is a PLY; --world needs the folder of a run")
         from ..render.render import render
@@ -247,11 +290,15 @@ def _subject(request: Render, composer: Composer) -> _Subject:
         )
     avatar, capture = open_avatar(request)
     if capture is None:
-        raise StgaError(f"{request.source}: an avatar needs the meshes of a capture to follow; give --capture")
+        raise StgaError(
+            f"{request.source}: an avatar needs the meshes of a capture to follow; give --capture"
+        )
 
     def mesh(view: View) -> np.ndarray:
         if view.timestep not in capture.timesteps:
-            raise StgaError(f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for")
+            raise StgaError(
+                f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for"
+            )
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
@@ -266,7 +313,9 @@ def _subject(request: Render, composer: Composer) -> _Subject:
 def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
     """An avatar moved by another person's motion."""
     if is_ply(request.source):
-        raise StgaError(f"{request.source}: is a PLY, whose splats are bound to no mesh that a motion could move")
+        raise StgaError(
+            f"{request.source}: is a PLY, whose splats are bound to no mesh that a motion could move"
+        )
     avatar = read_avatar(avatar_path(request.source))
     motion = open_avatar_motion(request, avatar, say)
     sequence = motion.sequence
@@ -285,19 +334,28 @@ def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
 def _pictured(
     request: Render, avatar: Avatar, mesh: Callable[[View], np.ndarray], composer: Composer
 ) -> Callable[[View, float], np.ndarray]:
-    """The picture of an avatar on the mesh of a view, as it was recorded or under the light that is asked for."""
+    """The picture of an avatar on the mesh of a view, as it was recorded or under the light that is
+    asked for."""
     from ..render.render import render_avatar, render_colors
 
     behind = _world(request.source) if request.world else None
     if request.light is None:
-        return lambda view, _: render_avatar(avatar, mesh(view), view.camera, request.background, composer, behind)
+        return lambda view, _: render_avatar(
+            avatar, mesh(view), view.camera, request.background, composer, behind
+        )
     relighter, lighting = Relighter(avatar), read_lighting(request.light)
 
     def picture(view: View, share: float) -> np.ndarray:
         posed = mesh(view)
-        light = turned(lighting, _middle(posed), request.light_turn * share) if request.light_turn else lighting
+        light = (
+            turned(lighting, _middle(posed), request.light_turn * share)
+            if request.light_turn
+            else lighting
+        )
         colors = relighter.colors(posed, view.camera.position, light)
-        return render_colors(avatar, posed, view.camera, colors, request.background, composer, behind)
+        return render_colors(
+            avatar, posed, view.camera, colors, request.background, composer, behind
+        )
 
     return picture
 
@@ -306,7 +364,9 @@ def _world(source: Path) -> Splats:
     """Raises StgaError where the run of an avatar has no world."""
     path = avatar_path(source).with_name(WORLD_FILE)
     if not path.is_file():
-        raise StgaError(f"{path}: is missing; --world shows what a training with --effect world=on has written")
+        raise StgaError(
+            f"{path}: is missing; --world shows what a training with --effect world=on has written"
+        )
     return read_ply(path)
 
 
@@ -316,7 +376,8 @@ def _middle(vertices: np.ndarray) -> np.ndarray:
 
 
 def unique_names(paths: list[str]) -> list[str]:
-    """File names with the suffix .png; where entries share one, their folders become part of it, then a number."""
+    """File names with the suffix .png; where entries share one, their folders become part of it,
+    then a number."""
     pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
     names = [png.name for png in pngs]
     if len(set(names)) < len(names):

@@ -18,8 +18,8 @@ from .train import Extend, Refine, Resume, SelectForTake, Train
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Train variants of the settings in turns, so that other load on the machine slows all of them alike, and measure
-    their avatars. Exists in a checkout only.
+    """Train variants of the settings in turns, so that other load on the machine slows all of them
+    alike, and measure their avatars. Exists in a checkout only.
 
     out             folder; each variant's run is in a folder of its name
     seconds         of training for each variant
@@ -60,7 +60,8 @@ class Kind(StrEnum):
 class Job:
     """The work of a request, and what Blender knows of it.
 
-    work     module and function, loaded when they are needed; the extension's zip leaves `development` out
+    work     module and function, loaded when they are needed; the extension's zip leaves
+             `development` out
     kind     of those that Blender asks for; subject: the field that names what it is about
     """
 
@@ -98,9 +99,11 @@ class RequestKind:
 
     label, cancel   what is running, for messages; what Cancel does
     ends            what is said when it finished, was cancelled, failed, or its folder is not found
-    is_stored       the .blend file remembers it; its folder is in that of what it makes, others' are temporary
+    is_stored       the .blend file remembers it; its folder is in that of what it makes, others'
+                    are temporary
     trains          it has a run, whose previews and avatar are shown on the head
-    is_transient    it leaves nothing but its result in the scene: killed when it is cancelled, gone when it ended
+    is_transient    it leaves nothing but its result in the scene: killed when it is cancelled, gone
+                    when it ended
     """
 
     label: str
@@ -137,6 +140,7 @@ KINDS = {
     ),
 }  # fmt: skip
 STORED, TRAINS, TRANSIENT = (
-    {kind for kind, shown in KINDS.items() if getattr(shown, name)} for name in ("is_stored", "trains", "is_transient")
+    {kind for kind, shown in KINDS.items() if getattr(shown, name)}
+    for name in ("is_stored", "trains", "is_transient")
 )
 DISMISSIBLE = set(KINDS) - TRANSIENT

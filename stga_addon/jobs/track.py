@@ -1,4 +1,5 @@
-"""Tracking: footage to a capture, solving one again around poses made by hand, and from footage to an avatar."""
+"""Tracking: footage to a capture, solving one again around poses made by hand, and from footage to
+an avatar."""
 
 import math
 import os
@@ -35,7 +36,8 @@ SYNC = {
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
 """What `Track.mattes` may be but a folder of masks."""
 CAPTURE_FOLDER, RUN_FOLDER, INPUTS = "capture", "run", "inputs.json"
-"""In the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which alone continues."""
+"""In the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which alone
+continues."""
 
 
 def _parsed_mattes(text: str) -> str:
@@ -45,7 +47,9 @@ def _parsed_mattes(text: str) -> str:
 def _parsed_offset(text: str) -> tuple[str, int]:
     name, _, frames = text.rpartition("=")
     if not name or not frames.removeprefix("-").isdecimal() or len(frames) > 9:
-        raise StgaError(f"expected a camera and a number of frames, as in left=-3, not {shorten(text)}")
+        raise StgaError(
+            f"expected a camera and a number of frames, as in left=-3, not {shorten(text)}"
+        )
     return name, int(frames)
 
 
@@ -53,7 +57,9 @@ def _parsed_offset(text: str) -> tuple[str, int]:
 class Track:
     """Track a head through footage of one or more cameras, and write a capture."""
 
-    footage: Path = option("folder with a folder of images or a video for each camera, or one video", flag="FOOTAGE")
+    footage: Path = option(
+        "folder with a folder of images or a video for each camera, or one video", flag="FOOTAGE"
+    )
     model: Path | None = option(
         "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb) (default: the bundled head)",
         flag="--model", metavar="HEAD",
@@ -108,7 +114,8 @@ class MakeAvatar:
 
     Called again with the same arguments, it continues where it was interrupted.
 
-    track, train    write to CAPTURE_FOLDER and RUN_FOLDER of one folder, `out`; the FLAME model is that of `track`
+    track, train    write to CAPTURE_FOLDER and RUN_FOLDER of one folder, `out`; the FLAME model is
+                    that of `track`
     """
 
     track: Track
@@ -122,7 +129,9 @@ class MakeAvatar:
         """Raise StgaError where the two do not belong together."""
         wanted = self.out / CAPTURE_FOLDER, self.out / CAPTURE_FOLDER, self.out / RUN_FOLDER
         if (self.track.out, self.train.capture, self.train.run) != wanted:
-            raise StgaError(f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}")
+            raise StgaError(
+                f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
+            )
 
 
 # Work
@@ -143,8 +152,8 @@ STAGES = {
     "Images": (0.985, 0.99),
     "Heads": (0.99, 1.0),
 }
-"""Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its share of the time on
-two processors where one camera recorded a video of 1080p."""
+"""Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its
+share of the time on two processors where one camera recorded a video of 1080p."""
 FOCAL_SOURCES = {
     "given": "as given",
     "file": "as the file says",
@@ -155,15 +164,17 @@ FOCAL_SOURCES = {
 
 
 def track(request: Track, report: Report, say: Say) -> Written:
-    """Track the head into a capture. Raises StgaError; cancelled, it leaves what was found so far, from which the same
-    request continues."""
+    """Track the head into a capture. Raises StgaError; cancelled, it leaves what was found so far,
+    from which the same request continues."""
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
     from ..tracking.track import track as track_footage
 
     steps = _Steps(report)
     steps.report("Opening the footage", 0, 1)
-    frames = FrameRange(request.start, request.stop, request.step, dict(request.offset or {}), request.sync)
+    frames = FrameRange(
+        request.start, request.stop, request.step, dict(request.offset or {}), request.sync
+    )
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
     found = track_footage(
@@ -175,7 +186,11 @@ def track(request: Track, report: Report, say: Say) -> Written:
     lines = [
         *(f"warning: {warning}" for warning in found.warnings),
         f"reprojection error: {found.median_px:.2f} px (median); by camera and timestep in tracking.json",
-        *([] if found.focal_px is None else [f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}"]),
+        *(
+            []
+            if found.focal_px is None
+            else [f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}"]
+        ),
         *([] if found.torso is None else [f"torso: {found.torso.description}"]),
         f"capture: {request.out}",
     ]
@@ -202,7 +217,9 @@ class _Steps:
         begin, end = STAGES.get(stage, (0.0, 0.9))
         share = begin + (end - begin) * done / max(total, 1)
         figures = {"left_s": self._time_left.after(share), **self._quality}
-        self._now = Progress(share, stage, f"{done} of {total}" if total > 1 else "", lambda: figures)
+        self._now = Progress(
+            share, stage, f"{done} of {total}" if total > 1 else "", lambda: figures
+        )
         if self._report(self._now):
             raise Cancelled
 
@@ -219,17 +236,21 @@ TRACKING_SHARE = 0.5
 
 
 def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
-    """Track unless that was done, and train or continue the run. Raises StgaError where the folder began with other
-    inputs, and as both do."""
+    """Track unless that was done, and train or continue the run. Raises StgaError where the folder
+    began with other inputs, and as both do."""
 
     def report_tracking(progress: Progress) -> bool:
         share, stage = TRACKING_SHARE * progress.share, f"Tracking: {progress.stage}"
         figures = dict(progress.figures())
-        figures["left_s"] = figures.get("left_s", math.nan) + (request.train.settings.seconds or 0.0)
+        figures["left_s"] = figures.get("left_s", math.nan) + (
+            request.train.settings.seconds or 0.0
+        )
         return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
-        return report(replace(progress, share=TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share))
+        return report(
+            replace(progress, share=TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share)
+        )
 
     begin = perf_counter()
     _track(request.track, report_tracking, say)
@@ -238,8 +259,15 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
     new = replace(request.train, flame=flame)
     trained = train(resumed(new) if has_run(new.run) else new, report_training, say)
     end = perf_counter()
-    times = f"tracking {format_duration(tracked - begin)}, training {format_duration(end - tracked)}"
-    lines = ["", *_tracking_lines(request), *trained.lines, f"time: {times}, in all {format_duration(end - begin)}"]
+    times = (
+        f"tracking {format_duration(tracked - begin)}, training {format_duration(end - tracked)}"
+    )
+    lines = [
+        "",
+        *_tracking_lines(request),
+        *trained.lines,
+        f"time: {times}, in all {format_duration(end - begin)}",
+    ]
     return Written(request.train.run / AVATAR, tuple(lines))
 
 
@@ -272,9 +300,13 @@ def _tracking_lines(request: MakeAvatar) -> list[str]:
         )
         lines = [f"warning: {warning}" for warning in report["warnings"]]
         lines += [f"footage: cameras {len(errors)}, timesteps {len(timesteps)}"]
-        lines += [f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"]
+        lines += [
+            f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"
+        ]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise StgaError(f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})") from error
+        raise StgaError(
+            f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})"
+        ) from error
     files = [capture / SHEET_FILE, capture / REPORT_FILE, request.train.run / CURVE]
     return [*lines, f"report: {', '.join(str(path) for path in files if path.exists())}"]
 
@@ -284,10 +316,13 @@ def check_inputs(track: Track) -> None:
     out, inputs = track.out.parent, _inputs(track)
     if (out / INPUTS).exists():
         stored = read_inputs(out)
-        before = {name: stored.get(name, getattr(Track, name, None)) for name in inputs}  # an older version noted less
+        # an older version noted less
+        before = {name: stored.get(name, getattr(Track, name, None)) for name in inputs}
         changed = next((name for name in inputs if before[name] != inputs[name]), None)
         if changed is not None:
-            raise StgaError(f"{changed}: {out} began with {shorten(before[changed])}; give another --out")
+            raise StgaError(
+                f"{changed}: {out} began with {shorten(before[changed])}; give another --out"
+            )
     elif is_written(track.out) or (out / RUN_FOLDER).exists():
         raise StgaError(f"{out}: holds something else ({INPUTS} is missing); give another --out")
 
@@ -301,7 +336,11 @@ def read_inputs(out: Path) -> dict[str, Any]:
 
 
 def _inputs(track: Track) -> dict[str, Any]:
-    """What decides how it is tracked, as JSON: the fields of `Track` but its folder; paths are absolute."""
+    """What decides how it is tracked, as JSON: the fields of `Track` but its folder; paths are
+    absolute."""
     values = {spec.name: getattr(track, spec.name) for spec in fields(Track) if spec.name != "out"}
     values["offset"] = dict(sorted((track.offset or {}).items()))
-    return {name: os.path.abspath(value) if isinstance(value, Path) else value for name, value in values.items()}
+    return {
+        name: os.path.abspath(value) if isinstance(value, Path) else value
+        for name, value in values.items()
+    }

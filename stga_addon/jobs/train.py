@@ -8,7 +8,13 @@ import numpy as np
 
 from ..avatar.file import read_avatar
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
-from ..capture.model import Capture, first_timesteps, join_takes, require_same_head, require_same_scale
+from ..capture.model import (
+    Capture,
+    first_timesteps,
+    join_takes,
+    require_same_head,
+    require_same_scale,
+)
 from ..capture.open import open_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
@@ -55,7 +61,9 @@ class Train:
     capture: Path = option("folder of the capture", flag="CAPTURE")
     settings: TrainingSettings = setting()
     flame: Path | None = option("FLAME model file (.pkl or .npz)", None, metavar="FILE")
-    principal_point: str = option("what cy means in the capture", DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS)
+    principal_point: str = option(
+        "what cy means in the capture", DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS
+    )
     device: str = option(
         "gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto (default): that of the run, "
         "else a GPU if it is right and faster than the CPU in a trial of a second, else the CPU",
@@ -84,7 +92,12 @@ def resumed(request: "Train | Refine | Extend") -> Resume:
     """What continues the run of a request that was interrupted."""
     if isinstance(request, Train):
         return Resume(
-            request.run, request.capture, request.flame, request.principal_point, request.device, request.selection
+            request.run,
+            request.capture,
+            request.flame,
+            request.principal_point,
+            request.device,
+            request.selection,
         )
     return Resume(request.run, flame=request.flame, device=request.device)
 
@@ -93,11 +106,19 @@ def resumed(request: "Train | Refine | Extend") -> Resume:
 class _Continue:
     """Continue a finished run in a run of its own. seconds, iterations: one of the two."""
 
-    run: Path = option("folder of the run that continues it (default: RUN_2, RUN_3, …)", flag="--out", metavar="NEW")
+    run: Path = option(
+        "folder of the run that continues it (default: RUN_2, RUN_3, …)",
+        flag="--out",
+        metavar="NEW",
+    )
     parent: Path = option("folder of a run", flag="RUN")
     _: KW_ONLY
     growth: float = option(
-        "splats to add, as a share of those on the triangles that are trained", 0.0, 0, MAX_GROWTH, metavar="SHARE"
+        "splats to add, as a share of those on the triangles that are trained",
+        0.0,
+        0,
+        MAX_GROWTH,
+        metavar="SHARE",
     )
     seconds: float | None = like(
         TrainingSettings, "seconds", help="training time (default 20s to refine, 1m to extend)"
@@ -115,7 +136,8 @@ class _Continue:
 
 @dataclass(frozen=True)
 class Refine(_Continue):
-    """Train one region of a finished avatar further; every other splat stays as it is, and so does the run.
+    """Train one region of a finished avatar further; every other splat stays as it is, and so does
+    the run.
 
     weights: (F,) of each triangle of a painted region, instead of `region`.
     """
@@ -125,12 +147,16 @@ class Refine(_Continue):
         "", metavar="NAME|FILE", is_path=is_region_file,
     )  # fmt: skip
     weights: np.ndarray | None = None
-    frames: tuple[int, int] | None = option("timesteps to train on (default: all)", None, 0, metavar="FIRST-LAST")
+    frames: tuple[int, int] | None = option(
+        "timesteps to train on (default: all)", None, 0, metavar="FIRST-LAST"
+    )
 
     def check(self) -> None:
         """Raise StgaError unless there is one region and one budget."""
         if not self.region and self.weights is None:
-            raise StgaError("--region: is missing; expected the name of a region or a file of triangle weights")
+            raise StgaError(
+                "--region: is missing; expected the name of a region or a file of triangle weights"
+            )
         if self.region and self.weights is not None:
             raise StgaError("region: expected its name, its file or painted weights")
         super().check()
@@ -163,7 +189,8 @@ class SelectForTake:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run that can be trained: its capture, of all its takes, and what each timestep trains, where that is given."""
+    """A run that can be trained: its capture, of all its takes, and what each timestep trains,
+    where that is given."""
 
     request: Train | Resume | Refine | Extend
     run: Run
@@ -174,7 +201,11 @@ class Prepared:
         """The path of the avatar. Raises as `training.run.session.train`."""
         from ..training.run.session import train
 
-        folder, resumes, falls_back = self.request.run, isinstance(self.request, Resume), self.request.device == "auto"
+        folder, resumes, falls_back = (
+            self.request.run,
+            isinstance(self.request, Resume),
+            self.request.device == "auto",
+        )
         return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
 
 
@@ -199,12 +230,17 @@ def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -
         return is_stopped
 
     def report_afterwards(progress: Progress) -> bool:
-        return report(replace(latest, stage=progress.stage, preview=None))  # with the figures of the training
+        # with the figures of the training
+        return report(replace(latest, stage=progress.stage, preview=None))
 
     avatar = prepared.train(report_training)
     lines = report_run(folder)
-    if not is_stopped:  # whoever stops a training does not wait; `stga relight` finds the light out later
-        lines += [*_light_of(prepared, avatar, report_afterwards), *_world_of(prepared, report_afterwards)]
+    # whoever stops a training does not wait; `stga relight` finds the light out later
+    if not is_stopped:
+        lines += [
+            *_light_of(prepared, avatar, report_afterwards),
+            *_world_of(prepared, report_afterwards),
+        ]
     lines.append(f"avatar: {avatar}")
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
@@ -212,19 +248,25 @@ def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -
 
 
 def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ...]:
-    """Write the light of the capture into the avatar; what there is to say about it, or why there is none."""
+    """Write the light of the capture into the avatar; what there is to say about it, or why there
+    is none."""
     if any(decision.effect == RELIGHT and not decision.on for decision in prepared.run.effect_plan):
-        return ("light: not estimated (the effect relight is off); `stga relight RUN` estimates it",)
+        return (
+            "light: not estimated (the effect relight is off); `stga relight RUN` estimates it",
+        )
     from .finished_run import add_light
 
     try:
-        return add_light(avatar, with_refined_tracking(prepared.capture, prepared.request.run), report=report)
+        return add_light(
+            avatar, with_refined_tracking(prepared.capture, prepared.request.run), report=report
+        )
     except StgaError as error:  # an avatar without it is whole
         return (f"light: not estimated ({error})",)
 
 
 def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
-    """Write what stands still behind the person into the run's folder, where its effect is on; what there is to say."""
+    """Write what stands still behind the person into the run's folder, where its effect is on; what
+    there is to say."""
     if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
         return ()
     from ..training.world.world_splats import world_of
@@ -241,7 +283,9 @@ def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
 def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
     if not isinstance(request, Resume) and has_run(request.run):
-        raise StgaError(f"{request.run}: already holds a run; resume it (--resume), or choose another folder (--out)")
+        raise StgaError(
+            f"{request.run}: already holds a run; resume it (--resume), or choose another folder (--out)"
+        )
     match request:
         case Train():
             return _new_run(request, report, say)
@@ -254,9 +298,12 @@ def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say)
 
 
 def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
-    """timestep of the take -> (F,) bool: what extending the run by it would train. Raises StgaError."""
+    """timestep of the take -> (F,) bool: what extending the run by it would train. Raises
+    StgaError."""
     report(Progress(stage="Comparing the avatar with the images"))
-    wanted = Extend(request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame)
+    wanted = Extend(
+        request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame
+    )
     _, _, selection, run = _joined_takes(wanted, say)
     start = run.takes[-1].start
     selection = {timestep - start: faces for timestep, faces in selection.items()}
@@ -293,7 +340,8 @@ def _resumed_run(request: Resume, say: Say) -> Prepared:
 
 
 def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
-    """Raises StgaError where the run, the region or the frames do not exist, or no camera sees the region."""
+    """Raises StgaError where the run, the region or the frames do not exist, or no camera sees the
+    region."""
     from ..training.run.continuation import continued_settings, is_faced
 
     device = _continuing_device(request, say)
@@ -306,7 +354,9 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         region, name = request.weights >= SELECTED_WEIGHT, "painted"
     else:
         found = request.weights.shape
-        raise StgaError(f"weights: expected one for each triangle ({len(capture.faces)},), got {found}")
+        raise StgaError(
+            f"weights: expected one for each triangle ({len(capture.faces)},), got {found}"
+        )
     face = read_avatar(request.parent / AVATAR).splats.face
     count = int(region[face].sum())
     if not count:
@@ -316,14 +366,18 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         request.seed,
     )  # fmt: skip
     frames = request.frames or (min(capture.timesteps), max(capture.timesteps))
-    views = [view for view in capture.views.get("train", ()) if frames[0] <= view.timestep <= frames[1]]
+    views = [
+        view for view in capture.views.get("train", ()) if frames[0] <= view.timestep <= frames[1]
+    ]
     between = f"from timestep {frames[0]} to {frames[1]}"
     if not views:
         raise StgaError(f"{request.parent}: its capture has no training views {between}")
     if not is_faced(capture, views, region):
         raise StgaError(f"region '{name}': faces no training camera {between}")
     continuation = _continuation(request.parent, frames)
-    run = replace(opened.run, settings=settings, device=device, identity=None, continuation=continuation)
+    run = replace(
+        opened.run, settings=settings, device=device, identity=None, continuation=continuation
+    )
     return Prepared(request, run, capture, {capture.timesteps[0]: region})
 
 
@@ -352,8 +406,9 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
 def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Selection, Run]:
     """The run, its capture joined with the new takes, what these train, and the run with them.
 
-    Raises StgaError where the run or a take does not exist, or a take is of another head, has no training views or is
-    in the run already. Says which views do not show the head as the avatar does.
+    Raises StgaError where the run or a take does not exist, or a take is of another head, has no
+    training views or is in the run already. Says which views do not show the head as the avatar
+    does.
     """
     from ..training.run.continuation import select_for_takes
 
@@ -384,7 +439,9 @@ def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
     take = open_capture(path, run.flame, run.principal_point)
     require_same_head(opened.capture, take)
     if not take.views.get("train"):
-        raise StgaError(f"{take.root}: has no training views, so there is nothing to extend the avatar with")
+        raise StgaError(
+            f"{take.root}: has no training views, so there is nothing to extend the avatar with"
+        )
     require_same_scale(opened.takes[0], take)
     if any(take.root == old.root for old in opened.takes):
         raise StgaError(f"{take.root}: is a take of this run already")

@@ -1,4 +1,5 @@
-"""The kernels of `raster.cpu.shade` and `raster.cpu.shadow` in NumPy, for Pythons without Numba such as Blender's.
+"""The kernels of `raster.cpu.shade` and `raster.cpu.shadow` in NumPy, for Pythons without Numba
+such as Blender's.
 
 Vectors are rows of their own here, (3, N): NumPy is slow where the last axis is short.
 """
@@ -22,7 +23,12 @@ def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None
     corners = np.stack([points[faces[:, k]].T for k in range(3)]).astype(np.float64)
     low, high = np.clip(corners.min(0)[:2], 0, size), np.clip(corners.max(0)[:2], 0, size)
     area = _crossed(corners[1] - corners[0], corners[2] - corners[0], 0, 1)
-    drawn = np.isfinite(corners).all((0, 1)) & (np.abs(area) > 1e-12) & (low < size).all(0) & (high > 0).all(0)
+    drawn = (
+        np.isfinite(corners).all((0, 1))
+        & (np.abs(area) > 1e-12)
+        & (low < size).all(0)
+        & (high > 0).all(0)
+    )
     order = np.flatnonzero(drawn)
     # From far to near, so that the nearest are mostly written last.
     order = order[np.argsort(-corners[:, 2, order].sum(0))]
@@ -32,21 +38,31 @@ def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None
 
 
 def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None:
-    """Draw triangles (3 corners, 3, F) row by row: of each the texels between where it begins and ends."""
+    """Draw triangles (3 corners, 3, F) row by row: of each the texels between where it begins and
+    ends."""
     size, u, v = len(depth), corners[1] - corners[0], corners[2] - corners[0]
     across, down = _crossed(u, v, 2, 1) / area, _crossed(u, v, 0, 2) / area
     plane = across, down, corners[0, 2] - across * corners[0, 0] - down * corners[0, 1]
-    high, middle, low = np.take_along_axis(corners, np.argsort(corners[:, 1], axis=0)[:, None], axis=0)
+    high, middle, low = np.take_along_axis(
+        corners, np.argsort(corners[:, 1], axis=0)[:, None], axis=0
+    )
     rows = np.ceil(high[1] - 0.5) - 1, np.floor(middle[1] - 0.5), np.floor(low[1] - 0.5)
     limits = [np.clip(row, -1, size - 1).astype(np.int64) for row in rows]
     long = _line(high, low)
-    for before, last, short in ((*limits[:2], _line(high, middle)), (*limits[1:], _line(middle, low))):
+    for before, last, short in (
+        (*limits[:2], _line(high, middle)),
+        (*limits[1:], _line(middle, low)),
+    ):
         count = last - before
         row = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count - before - 1, count)
         y = row + 0.5
-        a, b = (np.repeat(slope, count) * y + np.repeat(begin, count) for slope, begin in (long, short))
+        a, b = (
+            np.repeat(slope, count) * y + np.repeat(begin, count) for slope, begin in (long, short)
+        )
         begin = np.ceil(np.maximum(np.minimum(a, b), 0) - 0.5).clip(0)
-        texels = np.maximum(np.floor(np.minimum(np.maximum(a, b), size) - 0.5) - begin + 1, 0).astype(np.int64)
+        texels = np.maximum(
+            np.floor(np.minimum(np.maximum(a, b), size) - 0.5) - begin + 1, 0
+        ).astype(np.int64)
         steepness, down, z = (np.repeat(values, count) for values in plane)
         z += steepness * (begin + 0.5) + down * y
         along = np.arange(int(texels.sum())) - np.repeat(np.cumsum(texels) - texels, texels)
@@ -67,14 +83,17 @@ def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write_least(values: np.ndarray, at: np.ndarray, found: np.ndarray) -> None:
-    """As `np.minimum.at`, which older NumPy is slow at: what is still less after it was written is written again."""
+    """As `np.minimum.at`, which older NumPy is slow at: what is still less after it was written is
+    written again."""
     while len(at):
         less = found < values[at]
         at, found = at[less], found[less]
         values[at] = found
 
 
-def lit_shares(depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: float, lit: np.ndarray) -> None:
+def lit_shares(
+    depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: float, lit: np.ndarray
+) -> None:
     """As `raster.cpu.shadow.lit_shares`; step: a whole number."""
     size, reach = len(depth), int(step)
     border, width = 2 * reach + 3, 2 * reach + 2
@@ -84,7 +103,10 @@ def lit_shares(depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: fl
     least, most = _windows(padded, width, np.minimum), _windows(padded, width, np.maximum)
     for start in range(0, len(points), CHUNK_POINTS):
         part = slice(start, start + CHUNK_POINTS)
-        x, y = (np.clip(points[part, k] - np.float32(0.5), -1.5 - reach, size + reach + 0.5) + border for k in range(2))
+        x, y = (
+            np.clip(points[part, k] - np.float32(0.5), -1.5 - reach, size + reach + 0.5) + border
+            for k in range(2)
+        )
         z = points[part, 2] - bias[part]
         corner = (y.astype(np.int64) - reach) * least.shape[1] + (x.astype(np.int64) - reach)
         # Most points are nearer than all texels that are looked up, or farther.
@@ -104,8 +126,11 @@ def _windows(values: np.ndarray, width: int, reduced: Callable[..., np.ndarray])
     return values
 
 
-def _looked_up(padded: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, step: int) -> np.ndarray:
-    """(N,) share of the 3 × 3 places around x, y (N,), or of the one, that z (N,) is not farther than."""
+def _looked_up(
+    padded: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, step: int
+) -> np.ndarray:
+    """(N,) share of the 3 × 3 places around x, y (N,), or of the one, that z (N,) is not farther
+    than."""
     flat, width = padded.reshape(-1), len(padded)
     left, top = np.floor(x), np.floor(y)
     right, lower = x - left, y - top
@@ -133,7 +158,13 @@ def add_lights(
         place, normal = (np.ascontiguousarray(rows[part].T) for rows in (points, normals))
         view = eye[:, None] - place
         view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
-        surface = normal, view, np.maximum(_dot(normal, view), MIN_FACING), roughness[part], reflectance[part]
+        surface = (
+            normal,
+            view,
+            np.maximum(_dot(normal, view), MIN_FACING),
+            roughness[part],
+            reflectance[part],
+        )
         arriving, reflected = np.zeros_like(view), np.zeros_like(view)
         for light in lights:
             toward, strength, width = toward_light(light, place)
@@ -154,8 +185,11 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def toward_light(light: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors (3, N) to a light (a row of `raster.cpu.shade`), factors (N,) of its color, and its width (N,)."""
+def toward_light(
+    light: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors (3, N) to a light (a row of `raster.cpu.shade`), factors (N,) of its color, and
+    its width (N,)."""
     if light[0] == SUN:
         ones = np.ones(points.shape[1], np.float32)
         return np.broadcast_to(-light[4:7, None], points.shape), ones, light[15] * ones
@@ -176,7 +210,8 @@ def _gloss(
     toward: np.ndarray, width: np.ndarray, normal: np.ndarray, view: np.ndarray, toward_eye: np.ndarray,
     roughness: np.ndarray, reflectance: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """(N,) as `raster.cpu.shade.ggx` of lights that are `width` (N,) wide; 0 where there is no roughness."""
+    """(N,) as `raster.cpu.shade.ggx` of lights that are `width` (N,) wide; 0 where there is no
+    roughness."""
     half = toward + view
     half *= 1 / np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))
     facing = np.maximum(_dot(normal, toward), 0)

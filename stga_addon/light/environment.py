@@ -14,7 +14,9 @@ from .harmonics import basis, rotated, uniform
 from .values import KINDS, SHAPES, SKIN_ROUGHNESS, Light, Lighting
 
 MAX_PIXELS, MAX_HEADER_BYTES = 1 << 26, 1 << 16
-HEADER = re.compile(rb"#\?(?:RADIANCE|RGBE)[^\n]*\n(?:[^\n]*\n){0,200}?\n-Y (\d{1,6}) \+X (\d{1,6})\n")
+HEADER = re.compile(
+    rb"#\?(?:RADIANCE|RGBE)[^\n]*\n(?:[^\n]*\n){0,200}?\n-Y (\d{1,6}) \+X (\d{1,6})\n"
+)
 MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 0x7FFF
 """Widths of images whose rows may be compressed."""
 MAX_SUNS = 4
@@ -23,13 +25,15 @@ SUN_CONTRAST = 12.0
 SUN_RADIUS = np.radians(12)
 """Bright pixels within this angle of the brightest one are one sun."""
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From Blender's axes (z up) to those of a capture that its add-on shows upright (y up, the face looks along z)."""
+"""From Blender's axes (z up) to those of a capture that its add-on shows upright (y up, the face
+looks along z)."""
 
 
 def read_hdr(path: Path) -> np.ndarray:
     """(H, W, 3) float32 linear radiance of a Radiance picture (.hdr, RGBE), rows from the top.
 
-    Reads flat and run-length encoded rows (Ward, "Real Pixels", Graphics Gems II). Raises StgaError.
+    Reads flat and run-length encoded rows (Ward, "Real Pixels", Graphics Gems II). Raises
+    StgaError.
     """
     data = read_bytes(path)
     header = HEADER.match(data[:MAX_HEADER_BYTES])
@@ -82,7 +86,8 @@ def _unpacked(body: np.ndarray, at: int, channel: np.ndarray) -> int:
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (H, W, 3) that the pixels of an equirectangular image show, and their solid angles (H, 1).
+    """Unit vectors (H, W, 3) that the pixels of an equirectangular image show, and their solid
+    angles (H, 1).
 
     Blender's: z up, the image's middle shows +x, its quarter to the left +y.
     """
@@ -90,18 +95,26 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     turn = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
     ring = np.sin(polar)[:, None]
     vectors = np.stack(
-        [ring * np.cos(turn), ring * np.sin(turn), np.broadcast_to(np.cos(polar)[:, None], (height, width))], axis=-1
+        [
+            ring * np.cos(turn),
+            ring * np.sin(turn),
+            np.broadcast_to(np.cos(polar)[:, None], (height, width)),
+        ],
+        axis=-1,
     )
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     return vectors, ((edges[:-1] - edges[1:]) * 2 * np.pi / width)[:, None]
 
 
-def split_environment(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> tuple[np.ndarray, tuple[Light, ...]]:
+def split_environment(
+    image: np.ndarray, rotation: np.ndarray = UPRIGHT
+) -> tuple[np.ndarray, tuple[Light, ...]]:
     """Harmonics (9, 3) of an environment, and its brightest parts as suns, which throw shadows.
 
-    image: (H, W, 3) linear radiance, equirectangular as `pixel_directions`. rotation: (3, 3) from Blender's axes to
-    those of the result. Suns are what is brighter than SUN_CONTRAST times the mean, at most MAX_SUNS; harmonics hold
-    the rest, so that both together have the environment's irradiance.
+    image: (H, W, 3) linear radiance, equirectangular as `pixel_directions`. rotation: (3, 3) from
+    Blender's axes to those of the result. Suns are what is brighter than SUN_CONTRAST times the
+    mean, at most MAX_SUNS; harmonics hold the rest, so that both together have the environment's
+    irradiance.
     """
     image = smaller(np.asarray(image, np.float64))
     vectors, angle = pixel_directions(*image.shape[:2])
@@ -126,7 +139,9 @@ def harmonics_of(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> np.ndarra
     """(9, 3) of a whole environment, see `split_environment`."""
     image = smaller(np.asarray(image, np.float64))
     vectors, angle = pixel_directions(*image.shape[:2])
-    return np.asarray(basis((vectors @ rotation.T).reshape(-1, 3)).T @ (image * angle[..., None]).reshape(-1, 3))
+    return np.asarray(
+        basis((vectors @ rotation.T).reshape(-1, 3)).T @ (image * angle[..., None]).reshape(-1, 3)
+    )
 
 
 def smaller(image: np.ndarray, height: int = 128) -> np.ndarray:
@@ -135,7 +150,9 @@ def smaller(image: np.ndarray, height: int = 128) -> np.ndarray:
     rows, columns = image.shape[0] // step * step, image.shape[1] // step * step
     if step == 1:
         return image
-    return np.asarray(image[:rows, :columns].reshape(rows // step, step, columns // step, step, -1).mean((1, 3)))
+    return np.asarray(
+        image[:rows, :columns].reshape(rows // step, step, columns // step, step, -1).mean((1, 3))
+    )
 
 
 MAX_LIGHTS = 64
@@ -144,7 +161,8 @@ MAX_NUMBER = 1e6
 
 @dataclass(frozen=True)
 class LightEntry:
-    """A table [[lights]]: see `values.Light`; `strength` is Blender's, in W/m² of a sun and in W of others."""
+    """A table [[lights]]: see `values.Light`; `strength` is Blender's, in W/m² of a sun and in W of
+    others."""
 
     kind: str = setting(choices=KINDS)
     strength: float = setting(minimum=0, maximum=MAX_NUMBER)
@@ -165,7 +183,8 @@ class LightEntry:
 
 @dataclass(frozen=True)
 class LightFile:
-    """A file of lights, in meters and axes of the capture. world: radiance from everywhere. See `values.Lighting`."""
+    """A file of lights, in meters and axes of the capture. world: radiance from everywhere. See
+    `values.Lighting`."""
 
     world: tuple[float, float, float] = setting((0.0, 0.0, 0.0), 0, MAX_NUMBER)
     lights: tuple[LightEntry, ...] = ()
@@ -182,14 +201,17 @@ class LightFile:
 
 
 def read_lighting(path: Path) -> Lighting:
-    """The lighting of an .hdr environment, which stands as Blender shows it around the upright head, or of a .toml
+    """The lighting of an .hdr environment, which stands as Blender shows it around the upright
+    head, or of a .toml
     file (`LightFile`). Raises StgaError naming the file."""
     suffix = path.suffix.lower()
     if suffix == ".hdr":
         world, suns = split_environment(read_hdr(path))
         return Lighting(world, suns)
     if suffix != ".toml":
-        raise StgaError(f"{path}: expected light as an environment (.hdr) or a list of lights (.toml)")
+        raise StgaError(
+            f"{path}: expected light as an environment (.hdr) or a list of lights (.toml)"
+        )
     values = read_toml(path)
     try:
         entries = values.get("lights", [])
@@ -200,7 +222,9 @@ def read_lighting(path: Path) -> Lighting:
         raise StgaError(f"{path}: {error}") from error
     lights = []
     for entry in found.lights:
-        own = {name: value for name, value in vars(entry).items() if name not in ("strength", "color")}
+        own = {
+            name: value for name, value in vars(entry).items() if name not in ("strength", "color")
+        }
         lights.append(Light(color=entry.strength * np.array(entry.color), **own))
     rest = {name: value for name, value in vars(found).items() if name not in ("world", "lights")}
     return Lighting(uniform(found.world), tuple(lights), **rest)
@@ -211,14 +235,20 @@ def _completed(kind: type, values: Any) -> Any:
     if not isinstance(values, dict):
         return values
     defaults = {spec.name: spec.default for spec in fields(kind) if spec.default is not MISSING}
-    return {**{name: list(v) if isinstance(v, tuple) else v for name, v in defaults.items()}, **values}
+    return {
+        **{name: list(v) if isinstance(v, tuple) else v for name, v in defaults.items()},
+        **values,
+    }
 
 
 def turned(lighting: Lighting, center: np.ndarray, degrees: float) -> Lighting:
     """The lighting turned about the upward axis (+y) through center (3,)."""
     angle = np.radians(degrees)
     matrix = np.eye(4)
-    matrix[0, [0, 2]], matrix[2, [0, 2]] = (np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))
+    matrix[0, [0, 2]], matrix[2, [0, 2]] = (
+        (np.cos(angle), np.sin(angle)),
+        (-np.sin(angle), np.cos(angle)),
+    )
     matrix[:3, 3] = center - matrix[:3, :3] @ center
     lights = tuple(light.transformed(matrix) for light in lighting.lights)
     return replace(lighting, world=rotated(lighting.world, matrix[:3, :3]), lights=lights)

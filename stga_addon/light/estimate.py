@@ -19,7 +19,8 @@ from .values import Light
 MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800
 """Views that are looked at, evenly spread, and the size that larger images are reduced to."""
 MIN_FACING = 0.35
-"""Cosine between a triangle's normal and the direction to the camera, below which its color is not used."""
+"""Cosine between a triangle's normal and the direction to the camera, below which its color is not
+used."""
 HIDDEN_M = 0.003
 """A triangle is hidden by what is nearer to the camera by as much."""
 POINTS = (np.eye(3) + 1 / 3) / 2
@@ -45,13 +46,18 @@ def views_by_time(capture: Capture) -> dict[int, list[View]]:
     found: dict[int, list[View]] = {}
     for view in capture.views.get("train", ()):
         found.setdefault(view.timestep, []).append(view)
-    return {time: evenly_spread(found[time], MAX_CAMERAS) for time in evenly_spread(sorted(found), MAX_TIMESTEPS)}
+    return {
+        time: evenly_spread(found[time], MAX_CAMERAS)
+        for time in evenly_spread(sorted(found), MAX_TIMESTEPS)
+    }
 
 
 def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -> Observed:
-    """Mean color of each triangle in the darker half of the cameras that face it, which have the fewest highlights.
+    """Mean color of each triangle in the darker half of the cameras that face it, which have the
+    fewest highlights.
 
-    T are those of `views_by_time`, in its order; reads all their images. exposure: as in `estimate.Known`.
+    T are those of `views_by_time`, in its order; reads all their images. exposure: as in
+    `estimate.Known`.
     """
     by_time = views_by_time(capture)
     colors, cameras = [], []
@@ -64,9 +70,11 @@ def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -
     return Observed(np.stack(colors), np.stack(cameras))
 
 
-def _view_colors(capture: Capture, mesh: np.ndarray, view: View, exposure: np.ndarray | None) -> np.ndarray:
-    """(F, 3) linear mean color of each triangle at POINTS, without its camera's exposure (2, 3); NaN where it is hidden
-    or seen aslant."""
+def _view_colors(
+    capture: Capture, mesh: np.ndarray, view: View, exposure: np.ndarray | None
+) -> np.ndarray:
+    """(F, 3) linear mean color of each triangle at POINTS, without its camera's exposure (2, 3);
+    NaN where it is hidden or seen aslant."""
     gain, offset = np.eye(2)[:, :1] if exposure is None else exposure
     scale = min(1.0, MAX_SIDE_PX / max(view.camera.width, view.camera.height))
     view, image, mask = read_view(view, scale)
@@ -85,7 +93,9 @@ def _view_colors(capture: Capture, mesh: np.ndarray, view: View, exposure: np.nd
     for weights in POINTS:
         pixels, _ = view.camera.project(np.einsum("k,fkc->fc", weights, corners))
         column, row = np.floor(pixels).astype(np.int64).T
-        inside = facing & (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
+        inside = (
+            facing & (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
+        )
         column, row = np.where(inside, column, 0), np.where(inside, row, 0)
         inside &= usable[row, column]
         color = np.clip((image[row, column] - offset) / gain, 0, 255)
@@ -99,11 +109,14 @@ def _inner(mask: np.ndarray) -> np.ndarray:
     padded = np.pad(mask, 2)
     height, width = mask.shape
     around = (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)
-    return np.asarray(np.logical_and.reduce([padded[y : y + height, x : x + width] for y, x in around]))
+    return np.asarray(
+        np.logical_and.reduce([padded[y : y + height, x : x + width] for y, x in around])
+    )
 
 
 def _darker_half(colors: np.ndarray) -> np.ndarray:
-    """(F, 3) of colors by camera (C, F, 3), NaN where unseen: channel by channel the mean of the darker half."""
+    """(F, 3) of colors by camera (C, F, 3), NaN where unseen: channel by channel the mean of the
+    darker half."""
     ordered = np.sort(colors, axis=0)  # NaN comes last
     count = np.isfinite(colors[..., :1]).sum(0)
     taken = np.arange(len(colors))[:, None, None] < (count + 1) // 2
@@ -113,27 +126,33 @@ def _darker_half(colors: np.ndarray) -> np.ndarray:
 
 ITERATIONS = 40
 PRIOR = 0.7
-"""Weight of alike albedos, as a multiple of the observations of a triangle that is seen at every timestep."""
+"""Weight of alike albedos, as a multiple of the observations of a triangle that is seen at every
+timestep."""
 POSED_DIRECTIONS = 96
 """By which the transfer of a posed mesh is found, at each timestep."""
 UNSEEN_WEIGHT = 1e-3
 """Of a timestep at which no camera sees a vertex, where each camera counts 1."""
 MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
-"""Transfer of the constant harmonic below which a triangle counts for nothing: its own shadow hides the light."""
+"""Transfer of the constant harmonic below which a triangle counts for nothing: its own shadow hides
+the light."""
 LOSS_SCALE = 3.0
 """Residual at which an observation's weight has halved, in medians."""
 RIDGE = 1e-4
 MIN_ARRIVING, DARK = 0.02, 1e-5
-"""Least irradiance that a color is divided by, as a share of the mean; and what counts as no light or albedo."""
+"""Least irradiance that a color is divided by, as a share of the mean; and what counts as no light
+or albedo."""
 TYPICAL_ALBEDO = 0.36
-"""Of skin (green), which sets the level of an estimated light; exposure and the eyedropper correct it."""
+"""Of skin (green), which sets the level of an estimated light; exposure and the eyedropper correct
+it."""
 HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
-"""Residuals from which on the light is too hard to be taken away, and at which albedo is damped most."""
+"""Residuals from which on the light is too hard to be taken away, and at which albedo is damped
+most."""
 MAX_DAMPING = 0.6
 CARD_REFLECTANCE = 0.18
 
 EYE_ROUGHNESS = 0.2
-"""Of highlights on eyes: about as sharp as splats of half a millimeter on a ball of 12 mm can show."""
+"""Of highlights on eyes: about as sharp as splats of half a millimeter on a ball of 12 mm can
+show."""
 MIN_RADIUS_M, MAX_RADIUS_M = 0.007, 0.017
 MAX_DEVIATION = 0.12
 """Share of the radius by which the vertices of an eyeball may leave the sphere, on average."""
@@ -145,8 +164,8 @@ class Known:
     """What is known of a capture's light and cameras.
 
     radiance   (9, 3) harmonics in the capture's axes; None: estimated
-    card       (K, 3) linear colors of a gray card of 18 % at the face that faces `toward`, or of a gray ball where that
-               is its normal; None: the level is unknown
+    card       (K, 3) linear colors of a gray card of 18 % at the face that faces `toward`, or of a
+               gray ball where that is its normal; None: the level is unknown
     toward     (K, 3) unit vectors
     exposure   gain and offset of images
     """
@@ -157,14 +176,22 @@ class Known:
     exposure: ViewExposure = lambda view: None
 
 
-def estimate_light(capture: Capture, known: Known = Known(), report: Report = ignore) -> AvatarLight:
-    """The light of the capture and how its neutral mesh receives light. Raises StgaError without training views."""
+def estimate_light(
+    capture: Capture, known: Known = Known(), report: Report = ignore
+) -> AvatarLight:
+    """The light of the capture and how its neutral mesh receives light. Raises StgaError without
+    training views."""
     if not capture.views.get("train"):
-        raise StgaError(f"{capture.root}: has no training views, from which its light could be estimated")
+        raise StgaError(
+            f"{capture.root}: has no training views, from which its light could be estimated"
+        )
     transfer, occlusion = transfer_of(capture.neutral, capture.faces)
     observed = observe(capture, known.exposure, report)
     posed = np.stack(
-        [transfer_of(capture.mesh(time), capture.faces, POSED_DIRECTIONS)[0] for time in views_by_time(capture)]
+        [
+            transfer_of(capture.mesh(time), capture.faces, POSED_DIRECTIONS)[0]
+            for time in views_by_time(capture)
+        ]
     )
     radiance, residual = fit_light(observed.color, posed[:, capture.faces].mean(2), known.radiance)
     source = "estimated"
@@ -174,10 +201,17 @@ def estimate_light(capture: Capture, known: Known = Known(), report: Report = ig
         assert known.toward is not None
         # At the level and white balance at which gray that faces `toward` shows the card's colors.
         arriving = np.maximum((basis(known.toward) * LAMBERT @ radiance).mean(0), 1e-6)
-        radiance, source = radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving), "gray_card"
+        radiance, source = (
+            radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving),
+            "gray_card",
+        )
     bounce = Bounce(capture.neutral, capture.faces, occlusion)
-    irradiance = recorded_irradiance(np.maximum(posed @ radiance, DARK), observed.cameras, capture.faces, bounce)
-    damping = MAX_DAMPING * float(np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1))
+    irradiance = recorded_irradiance(
+        np.maximum(posed @ radiance, DARK), observed.cameras, capture.faces, bounce
+    )
+    damping = MAX_DAMPING * float(
+        np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1)
+    )
     return AvatarLight(
         radiance=radiance.astype(np.float32),
         transfer=transfer,
@@ -190,28 +224,36 @@ def estimate_light(capture: Capture, known: Known = Known(), report: Report = ig
     )
 
 
-def recorded_irradiance(direct: np.ndarray, cameras: np.ndarray, faces: np.ndarray, bounce: Bounce) -> np.ndarray:
+def recorded_irradiance(
+    direct: np.ndarray, cameras: np.ndarray, faces: np.ndarray, bounce: Bounce
+) -> np.ndarray:
     """(V, 3): mean over timesteps of what arrived at vertices, direct (T, V, 3) and by skin around.
 
-    Timesteps count as many times as cameras (T, F) see the vertex then: teeth where the mouth is open, eyeballs where
-    the lids are.
+    Timesteps count as many times as cameras (T, F) see the vertex then: teeth where the mouth is
+    open, eyeballs where the lids are.
     """
     total, count = np.zeros(direct.shape[1:]), np.zeros((direct.shape[1], 1))
     for arriving, seen in zip(direct, cameras, strict=True):
-        weight = np.bincount(faces.ravel(), np.repeat(seen, 3), len(arriving))[:, None] + UNSEEN_WEIGHT
+        weight = (
+            np.bincount(faces.ravel(), np.repeat(seen, 3), len(arriving))[:, None] + UNSEEN_WEIGHT
+        )
         total += weight * (arriving + bounce.light(arriving))
         count += weight
     return np.asarray(total / count)
 
 
-def fit_light(color: np.ndarray, received: np.ndarray, given: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Radiance (9, 3) and residual, by linear colors (T, F, 3) of triangles, NaN where they are not seen.
+def fit_light(
+    color: np.ndarray, received: np.ndarray, given: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """Radiance (9, 3) and residual, by linear colors (T, F, 3) of triangles, NaN where they are not
+    seen.
 
     received (T, F, 9): transfer of the posed triangles. given: only the residual is new.
 
-    Minimizes Σ w (color − albedo · transfer · radiance)² over triangles and timesteps, alternating between light and
-    albedo, which is drawn to the median; weights w are those of the Cauchy loss. The level is such that the median
-    albedo is TYPICAL_ALBEDO in an even, white light: mean irradiance is the same in all channels.
+    Minimizes Σ w (color − albedo · transfer · radiance)² over triangles and timesteps, alternating
+    between light and albedo, which is drawn to the median; weights w are those of the Cauchy loss.
+    The level is such that the median albedo is TYPICAL_ALBEDO in an even, white light: mean
+    irradiance is the same in all channels.
     """
     times, faces = color.shape[:2]
     usable = np.isfinite(color[..., 0]) & (received[..., 0] > MIN_OPEN_TRANSFER)
@@ -241,17 +283,23 @@ def _albedo(
     color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray, typical: np.ndarray, faces: int,
     times: int,
 ) -> np.ndarray:  # fmt: skip
-    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical` by the prior."""
+    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical` by the
+    prior."""
     prior = PRIOR * times * (arriving**2).mean(0)
     found = np.empty_like(color)
     for k in range(3):
-        upper = np.bincount(face, weight[:, k] * color[:, k] * arriving[:, k], faces) + prior[k] * typical[k]
+        upper = (
+            np.bincount(face, weight[:, k] * color[:, k] * arriving[:, k], faces)
+            + prior[k] * typical[k]
+        )
         lower = np.bincount(face, weight[:, k] * arriving[:, k] ** 2, faces) + prior[k]
         found[:, k] = (upper / lower)[face]
     return found
 
 
-def _solve(color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _solve(
+    color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
     """(9, 3) radiance with the least weighted error, slightly drawn to 0."""
     found = np.empty((COUNT, 3))
     for k in range(3):
@@ -259,14 +307,17 @@ def _solve(color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: 
         matrix = rows.T @ rows
         ridge = RIDGE * np.trace(matrix) / COUNT * np.eye(COUNT)
         ridge[np.diag_indices(COUNT)] += DARK**2  # a channel that shows nothing
-        found[:, k] = np.linalg.solve(matrix + ridge, rows.T @ (color[:, k] * np.sqrt(weight[:, k])))
+        found[:, k] = np.linalg.solve(
+            matrix + ridge, rows.T @ (color[:, k] * np.sqrt(weight[:, k]))
+        )
     return found
 
 
 def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V,) float32: EYE_ROUGHNESS on eyeballs, 0 elsewhere (skin).
 
-    An eyeball is a part of its own that is nearly a sphere of an eye's size, as in FLAME and ICT-FaceKit.
+    An eyeball is a part of its own that is nearly a sphere of an eye's size, as in FLAME and
+    ICT-FaceKit.
     """
     part = connected_parts(len(neutral), faces)
     found = np.zeros(len(neutral), np.float32)

@@ -6,13 +6,15 @@ from ..avatar.splats import SH_C0, harmonics
 
 COUNT = 9
 LAMBERT = np.array([np.pi] + [2 * np.pi / 3] * 3 + [np.pi / 4] * 5)
-"""Irradiance of an unoccluded surface is Σ LAMBERT · basis(normal) · radiance (Ramamoorthi and Hanrahan 2001)."""
+"""Irradiance of an unoccluded surface is Σ LAMBERT · basis(normal) · radiance (Ramamoorthi and
+Hanrahan 2001)."""
 GLOSSY = np.array([1.0] + [0.85] * 3 + [0.62] * 5)
 """The same for the mean radiance in a lobe of SKIN_ROUGHNESS around a direction."""
 
 
 def basis(directions: np.ndarray) -> np.ndarray:
-    """(N, 9) of unit vectors (N, 3), orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x² − y²."""
+    """(N, 9) of unit vectors (N, 3), orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x²
+    − y²."""
     x, y, z = np.asarray(directions).T
     constant, *rest = harmonics(-x, -y, z)[:COUNT]
     return np.stack([np.full_like(x, constant), *rest], axis=-1)

@@ -16,21 +16,24 @@ from .values import Caster, Light, Lighting
 MAP_SIZE = 512
 """Texels a side of a light's shadow map, which just holds the head."""
 LIFT_M = 0.001
-"""Points are lifted off the surface by as much along its normal, so that it does not shade itself."""
+"""Points are lifted off the surface by as much along its normal, so that it does not shade
+itself."""
 BIAS_M, MAX_BIAS_M = 0.001, 0.006
-"""A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the taps, at most
-MAX_BIAS_M."""
+"""A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the
+taps, at most MAX_BIAS_M."""
 TAP_STEP = 1.0
 """Texels between the 3 × 3 places that are looked up: splats soften edges already."""
 Projection = Callable[[np.ndarray], np.ndarray]
-"""Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light cannot see them."""
+"""Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light
+cannot see them."""
 
 
 @dataclass(frozen=True)
 class LightView:
     """How a light sees space: parallel for a sun, else in perspective from its position.
 
-    axes (3, 3): columns across, up and forward. origin (3,). scale: texels per meter, or per unit of slope.
+    axes (3, 3): columns across, up and forward. origin (3,). scale: texels per meter, or per unit
+    of slope.
     """
 
     axes: np.ndarray
@@ -42,7 +45,8 @@ class LightView:
 
 @dataclass(frozen=True)
 class HeadBounds:
-    """Middle (3,) of a posed head's box, the diagonal of the box, and the radius around its middle of the head."""
+    """Middle (3,) of a posed head's box, the diagonal of the box, and the radius around its middle
+    of the head."""
 
     center: np.ndarray
     diagonal: float
@@ -61,7 +65,8 @@ def head_bounds(vertices: np.ndarray) -> HeadBounds:
 def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
     """The view of a light around a head.
 
-    A light inside the sphere around the head sees it under a wide angle, and loses what lies behind it.
+    A light inside the sphere around the head sees it under a wide angle, and loses what lies behind
+    it.
     """
     center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
     if light.kind == "sun":
@@ -75,7 +80,9 @@ def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightV
     across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
-    return LightView(axes, center if light.kind == "sun" else light.position, scale, light.kind == "sun", size)
+    return LightView(
+        axes, center if light.kind == "sun" else light.position, scale, light.kind == "sun", size
+    )
 
 
 def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
@@ -118,15 +125,25 @@ class ShadowMap:
         depth = np.full((size, size), np.inf if is_parallel else 0, np.float32)
         for mesh in (Caster(vertices, faces), *casters):
             points = self._project(mesh.vertices)
-            if not is_parallel:  # of a plane in perspective, not depth but 1 / depth is linear in texels
+            # of a plane in perspective, not depth but 1 / depth is linear in texels
+            if not is_parallel:
                 points[:, 2] = -1 / points[:, 2]
             kernels("shadow").add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
-        self.depth = depth if is_parallel else np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
+        self.depth = (
+            depth
+            if is_parallel
+            else np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
+        )
 
     def lit(
-        self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP, normals: np.ndarray | None = None
+        self,
+        points: np.ndarray,
+        bias: float = BIAS_M,
+        step: float = TAP_STEP,
+        normals: np.ndarray | None = None,
     ) -> np.ndarray:
-        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the surface.
+        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the
+        surface.
 
         normals (N, 3): of the surface there, which make `bias` larger on slopes.
         """
@@ -137,7 +154,9 @@ class ShadowMap:
         kernels("shadow").lit_shares(self.depth, places, biases, np.float32(step), found)
         return found
 
-    def _slope_bias(self, points: np.ndarray, normals: np.ndarray, bias: float, step: float) -> np.ndarray:
+    def _slope_bias(
+        self, points: np.ndarray, normals: np.ndarray, bias: float, step: float
+    ) -> np.ndarray:
         """(N,) float32 meters."""
         if self._light.kind == "sun":
             cosine = normals @ -self._light.direction.astype(np.float32)
@@ -147,12 +166,19 @@ class ShadowMap:
             cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
         cosine = np.clip(cosine, 0.05, 1)
         slope = np.sqrt(1 - cosine**2) / cosine
-        return np.asarray(np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32)
+        return np.asarray(
+            np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32
+        )
 
 
 def kernels(name: str) -> Any:
-    """The module `raster.cpu.shade`, with `add_lights`, or `raster.cpu.shadow`, with `add_depths` and `lit_shares`."""
-    return array_kernels if find_spec("numba") is None else import_module(f"...raster.cpu.{name}", __name__)
+    """The module `raster.cpu.shade`, with `add_lights`, or `raster.cpu.shadow`, with `add_depths`
+    and `lit_shares`."""
+    return (
+        array_kernels
+        if find_spec("numba") is None
+        else import_module(f"...raster.cpu.{name}", __name__)
+    )
 
 
 FEW, SOME, MANY = 1, 2, 3
@@ -163,7 +189,13 @@ MIN_FADE = 1e-4
 class Lamps:
     """Lights around a head posed as mesh (V, 3) meters, with what blocks them."""
 
-    def __init__(self, lighting: Lighting, mesh: np.ndarray, faces: np.ndarray, casters: Sequence[Caster] = ()) -> None:
+    def __init__(
+        self,
+        lighting: Lighting,
+        mesh: np.ndarray,
+        faces: np.ndarray,
+        casters: Sequence[Caster] = (),
+    ) -> None:
         center = (mesh.max(0) + mesh.min(0)) / 2
         self._maps: list[ShadowMap] = []
         rows = [np.zeros((0, 16), np.float32)]
@@ -179,9 +211,15 @@ class Lamps:
         return self.shade(points, normals, np.zeros(3), np.zeros(len(points), np.float32), 0.0)[0]
 
     def shade(
-        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray, reflectance: float
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        eye: np.ndarray,
+        roughness: np.ndarray,
+        reflectance: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Irradiance and highlight (N, 3) float32 at points (N, 3), seen from eye (3,); see `raster.cpu.shade`."""
+        """Irradiance and highlight (N, 3) float32 at points (N, 3), seen from eye (3,); see
+        `raster.cpu.shade`."""
         found = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
         if not len(self._table):
             return found
@@ -197,9 +235,12 @@ class Lamps:
 
 
 def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
-    """(points, 16) float32: a light as rows of the table of `raster.cpu.shade`, for a head around `center` (3,)."""
+    """(points, 16) float32: a light as rows of the table of `raster.cpu.shade`, for a head around
+    `center` (3,)."""
     places, width = _places(light, center)
-    intensity = {"sun": 1.0, "point": 1 / (4 * np.pi), "spot": 1 / (4 * np.pi), "area": 1 / np.pi}[light.kind]
+    intensity = {"sun": 1.0, "point": 1 / (4 * np.pi), "spot": 1 / (4 * np.pi), "area": 1 / np.pi}[
+        light.kind
+    ]
     edge = np.cos(light.cone / 2)
     fade = max((1 - edge) * light.blend, MIN_FADE)
     color = light.color * intensity / len(places)
@@ -209,7 +250,8 @@ def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
 
 
 def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
-    """Positions (points, 3) that stand for a light, and the width of each for `raster.cpu.shade`."""
+    """Positions (points, 3) that stand for a light, and the width of each for
+    `raster.cpu.shade`."""
     if light.kind == "sun":
         return light.position[None], float(np.tan(light.angle / 2))
     if light.kind != "area":
@@ -227,7 +269,8 @@ def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def distant_light(light: Light, center: np.ndarray) -> np.ndarray:
-    """(9, 3) harmonics of a light as if it were far away from a head around `center` (3,), without shadows."""
+    """(9, 3) harmonics of a light as if it were far away from a head around `center` (3,), without
+    shadows."""
     found = np.zeros((COUNT, 3))
     for row in light_rows(light, center, -1):
         toward, strength, _ = toward_light(row, np.asarray(center, np.float32)[:, None])

@@ -1,4 +1,5 @@
-"""Colors of an avatar's splats under the light of a scene, and how much of the recorded ones that light keeps."""
+"""Colors of an avatar's splats under the light of a scene, and how much of the recorded ones that
+light keeps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,12 +18,14 @@ from .surface import Bounce, Lashes, at_splats, find_lashes, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
 UNLIKE_LIGHT = 0.2
-"""Difference between two lights from which on nothing is kept, as a share of the capture's light."""
+"""Difference between two lights from which on nothing is kept, as a share of the capture's
+light."""
 ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
-"""Difference between what arrives at a splat, now and in the capture, up to which all is kept and from which on
-nothing, as a share: other objects' shadows."""
+"""Difference between what arrives at a splat, now and in the capture, up to which all is kept and
+from which on nothing, as a share: other objects' shadows."""
 RIDGE = 1e-6
-"""Of the mean of a matrix's diagonal, added to it: meshes that receive no light in some harmonics."""
+"""Of the mean of a matrix's diagonal, added to it: meshes that receive no light in some
+harmonics."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,8 @@ class Kept:
 
 
 def recorded_light(transfer: np.ndarray, bounce: Bounce, irradiance: np.ndarray) -> np.ndarray:
-    """(9, 3) harmonics of the light that gave vertices of the neutral mesh irradiance (V, 3); transfer (V, 9)."""
+    """(9, 3) harmonics of the light that gave vertices of the neutral mesh irradiance (V, 3);
+    transfer (V, 9)."""
     direct = np.repeat(transfer.T[..., None].astype(np.float64), 3, axis=2)
     columns = np.stack([each + bounce.light(each) for each in direct], axis=1)
     found = np.empty((COUNT, 3))
@@ -50,13 +54,16 @@ def recorded_light(transfer: np.ndarray, bounce: Bounce, irradiance: np.ndarray)
 
 
 def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
-    """By the light of the capture and of the scene, both (9, 3) in the same axes, lamps as if they were far away.
+    """By the light of the capture and of the scene, both (9, 3) in the same axes, lamps as if they
+    were far away.
 
     They are compared as irradiance by direction, each channel but for a factor.
     """
     old, new = (LAMBERT[:COUNT, None] * light for light in (recorded, distant))
     gain = np.maximum((old * new).sum(0) / np.maximum((old * old).sum(0), 1e-12), 0)
-    difference = float(np.linalg.norm(new - gain * old) / max(float(np.linalg.norm(gain * old)), 1e-12))
+    difference = float(
+        np.linalg.norm(new - gain * old) / max(float(np.linalg.norm(gain * old)), 1e-12)
+    )
     return Kept(1 - float(_smooth_step(np.array(difference / UNLIKE_LIGHT))), gain)
 
 
@@ -64,8 +71,12 @@ def kept_shares(kept: Kept, arriving: np.ndarray, irradiance: np.ndarray) -> np.
     """(N,) float32 of what arrives at splats now, and of what arrived in the capture (N, 3)."""
     same = np.asarray(kept.gain, np.float32) * irradiance
     off = arriving - same
-    square = np.einsum("nk,nk->n", off, off) / np.maximum(np.einsum("nk,nk->n", same, same), np.float32(1e-12))
-    share = 1 - _smooth_step((np.sqrt(square) - ALIKE_AT_SPLAT) / (UNLIKE_AT_SPLAT - ALIKE_AT_SPLAT))
+    square = np.einsum("nk,nk->n", off, off) / np.maximum(
+        np.einsum("nk,nk->n", same, same), np.float32(1e-12)
+    )
+    share = 1 - _smooth_step(
+        (np.sqrt(square) - ALIKE_AT_SPLAT) / (UNLIKE_AT_SPLAT - ALIKE_AT_SPLAT)
+    )
     return np.asarray(kept.share * share, np.float32)
 
 
@@ -78,24 +89,29 @@ def _smooth_step(values: np.ndarray) -> np.ndarray:
 REFLECTANCE = 0.04
 """Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
 MIN_IRRADIANCE = 0.15
-"""Least irradiance of the capture that color is divided by, as a share of its mean: what was darker is noise."""
+"""Least irradiance of the capture that color is divided by, as a share of its mean: what was darker
+is noise."""
 HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.034, 0.14, 0.1
-"""Part of what arrived in the capture that came back as highlights, from skin and from wet eyes, which mirror what is
-in front of them; it is taken from the recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
+"""Part of what arrived in the capture that came back as highlights, from skin and from wet eyes,
+which mirror what is in front of them; it is taken from the recorded colors, of which at least
+MIN_DIFFUSE_SHARE remains."""
 VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
-"""Recorded colors are means over directions from which a splat's surface is seen, at a cosine above 0.3: by degree,
-harmonics over their value straight from the front."""
+"""Recorded colors are means over directions from which a splat's surface is seen, at a cosine above
+0.3: by degree, harmonics over their value straight from the front."""
 
 
 class Relighter:
-    """An avatar whose file holds its light (`Avatar.light`), ready to be lit by a scene; made once, used every frame.
+    """An avatar whose file holds its light (`Avatar.light`), ready to be lit by a scene; made once,
+    used every frame.
 
     Properties are float32, by splat. Raises StgaError where the avatar has no light.
     """
 
     def __init__(self, avatar: Avatar) -> None:
         if avatar.light is None:
-            raise StgaError("the avatar does not know the light of its capture; `stga relight RUN` estimates it")
+            raise StgaError(
+                "the avatar does not know the light of its capture; `stga relight RUN` estimates it"
+            )
         self.avatar, self.light = avatar, avatar.light
         self.face, self.weights = surface_points(avatar)
         self.corners = np.ascontiguousarray(avatar.faces[self.face])
@@ -133,15 +149,19 @@ class Relighter:
 
     @cached_property
     def diffuse_color(self) -> np.ndarray:
-        """(N, 3) recorded sRGB without what depends on the view: mean over directions from which a splat is seen."""
+        """(N, 3) recorded sRGB without what depends on the view: mean over directions from which a
+        splat is seen."""
         sh = self.avatar.splats.sh
         means = np.repeat(VIEW_MEANS, (1, 3, 5, 7))[: sh.shape[1], None].astype(np.float32)
-        normals = self._at_splats(vertex_normals(self.avatar.neutral.astype(np.float64), self.avatar.faces))
+        normals = self._at_splats(
+            vertex_normals(self.avatar.neutral.astype(np.float64), self.avatar.faces)
+        )
         return sh_color(means * sh, -self._unit(normals)).astype(np.float32)
 
     @cached_property
     def recorded_light(self) -> np.ndarray:
-        """(9, 3) harmonics of the capture's light in the axes of the neutral mesh, mean over its timesteps."""
+        """(9, 3) harmonics of the capture's light in the axes of the neutral mesh, mean over its
+        timesteps."""
         return recorded_light(self.light.transfer, self.bounce, self.light.irradiance)
 
     @cached_property
@@ -150,22 +170,26 @@ class Relighter:
         return find_lashes(self.avatar, self.corners, self.weights, self.roughness, self.albedo)
 
     def lash_casters(self, mesh: np.ndarray, lighting: Lighting) -> tuple[Caster, ...]:
-        """The lashes of a head posed as `mesh` (V, 3), where there are any and a light throws shadows."""
+        """The lashes of a head posed as `mesh` (V, 3), where there are any and a light throws
+        shadows."""
         shadowed = lighting.shadows and any(light.casts_shadow for light in lighting.lights)
         return (self.lashes.caster(mesh),) if shadowed and len(self.lashes.face) else ()
 
     def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
-        """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh` (V, 3): what
-        `transfer` is multiplied with."""
+        """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh`
+        (V, 3): what `transfer` is multiplied with."""
         # Open vertices, which the jaw moves least, say how the head is turned.
         weights = np.asarray(self.light.occlusion, np.float64) + 1e-3
-        rotation, _ = weighted_procrustes(np.asarray(mesh, np.float64), self.avatar.neutral, weights)
+        rotation, _ = weighted_procrustes(
+            np.asarray(mesh, np.float64), self.avatar.neutral, weights
+        )
         return rotated(world, rotation)
 
     def colors(
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
     ) -> np.ndarray:
-        """(N, 3) float32 sRGB of the splats, not clipped above 1: the `sh` of degree 0 is (color − 0.5) / SH_C0.
+        """(N, 3) float32 sRGB of the splats, not clipped above 1: the `sh` of degree 0 is (color −
+        0.5) / SH_C0.
 
         mesh: (V, 3) posed. eye: (3,) position of the camera. All in meters of the avatar's space.
         """
@@ -178,48 +202,76 @@ class Relighter:
         share = {"recorded": 0.0, "mix": lighting.mix, "scene": 1.0}[lighting.mode]
         if not share:
             return self._recorded(mesh, eye)
-        lit = self._lit(np.asarray(mesh, np.float64), np.asarray(eye, np.float64), lighting, casters)
+        lit = self._lit(
+            np.asarray(mesh, np.float64), np.asarray(eye, np.float64), lighting, casters
+        )
         lit *= np.float32(2**lighting.exposure) / np.asarray(lighting.white, np.float32)
         return lit if share == 1 else share * lit + (1 - share) * self._recorded(mesh, eye)
 
     def distant_in_head(self, mesh: np.ndarray, lighting: Lighting) -> tuple[np.ndarray, Kept]:
-        """(9, 6) float32 harmonics of the world, and of the world with lamps as if they were far away, in the axes of
-        the neutral mesh, for a head posed as `mesh` (V, 3); and how much of recorded colors they keep."""
+        """(9, 6) float32 harmonics of the world, and of the world with lamps as if they were far
+        away, in the axes of the neutral mesh, for a head posed as `mesh` (V, 3); and how much of
+        recorded colors they keep."""
         center = (mesh.max(0) + mesh.min(0)) / 2
-        distant = lighting.world + sum((distant_light(light, center) for light in lighting.lights), np.zeros((9, 3)))
+        distant = lighting.world + sum(
+            (distant_light(light, center) for light in lighting.lights), np.zeros((9, 3))
+        )
         # Both at once: turning them into the head's axes takes longer than the rest.
         both = self.world_in_head(mesh, np.concatenate([lighting.world, distant], axis=1))
         found = kept(self.recorded_light, both[:, 3:])
         # Other highlights than the capture's are asked for.
-        same = max(0.0, 1 - abs(lighting.specular - 1)) * max(0.0, 1 - abs(lighting.roughness / SKIN_ROUGHNESS - 1))
+        same = max(0.0, 1 - abs(lighting.specular - 1)) * max(
+            0.0, 1 - abs(lighting.roughness / SKIN_ROUGHNESS - 1)
+        )
         return both.astype(np.float32), replace(found, share=found.share * same)
 
-    def _lit(self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster]) -> np.ndarray:
+    def _lit(
+        self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster]
+    ) -> np.ndarray:
         vertex_normal = vertex_normals(mesh, self.avatar.faces)
         distant, likeness = self.distant_in_head(mesh, lighting)
         world = distant[:, :3]
-        lamps = Lamps(lighting, mesh, self.avatar.faces, (*casters, *self.lash_casters(mesh, lighting)))
+        lamps = Lamps(
+            lighting, mesh, self.avatar.faces, (*casters, *self.lash_casters(mesh, lighting))
+        )
         at_vertices = np.maximum(self.light.transfer @ world, 0)
         at_vertices += lamps.irradiance(mesh + LIFT_M * vertex_normal, vertex_normal)
         # All at once, because the places of the vertices in memory are what takes time.
-        at_splats = self._at_splats(np.concatenate([mesh, vertex_normal, self.bounce.light(at_vertices)], axis=1))
+        at_splats = self._at_splats(
+            np.concatenate([mesh, vertex_normal, self.bounce.light(at_vertices)], axis=1)
+        )
         points, normals = np.ascontiguousarray(at_splats[:, :3]), self._unit(at_splats[:, 3:6])
-        roughness = np.where(self.roughness > 0, self.roughness, np.float32(max(lighting.roughness, 0.05)))
-        arriving, highlight = lamps.shade(points + LIFT_M * normals, normals, eye, roughness, REFLECTANCE)
+        roughness = np.where(
+            self.roughness > 0, self.roughness, np.float32(max(lighting.roughness, 0.05))
+        )
+        arriving, highlight = lamps.shade(
+            points + LIFT_M * normals, normals, eye, roughness, REFLECTANCE
+        )
         arriving += np.maximum(self.transfer @ world, 0) + at_splats[:, 6:]
         highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
-        albedo = self._albedo(self.diffuse_color + self._strain_color(mesh)) if self._strained else self.albedo
-        lit = np.asarray(albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight)
+        albedo = (
+            self._albedo(self.diffuse_color + self._strain_color(mesh))
+            if self._strained
+            else self.albedo
+        )
+        lit = np.asarray(
+            albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight
+        )
         if likeness.share > 0:
             same = np.asarray(likeness.gain, np.float32) * self._recorded(mesh, eye)
             lit += kept_shares(likeness, arriving, self.irradiance)[:, None] * (same - lit)
         return lit
 
     def _sky_highlight(
-        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray, roughness: np.ndarray
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        eye: np.ndarray,
+        world: np.ndarray,
+        roughness: np.ndarray,
     ) -> np.ndarray:
-        """(N, 3) of the world: its mean radiance around the mirrored direction times the lobe's reflectance (Karis
-        2014)."""
+        """(N, 3) of the world: its mean radiance around the mirrored direction times the lobe's
+        reflectance (Karis 2014)."""
         if not np.any(world):
             return np.zeros_like(points)
         view = self._unit(eye.astype(np.float32) - points)
@@ -235,9 +287,13 @@ class Relighter:
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
         linear = srgb_to_linear(np.maximum(color, 0))
-        share = np.where(self.roughness > 0, np.float32(WET_HIGHLIGHT_SHARE), np.float32(HIGHLIGHT_SHARE))
+        share = np.where(
+            self.roughness > 0, np.float32(WET_HIGHLIGHT_SHARE), np.float32(HIGHLIGHT_SHARE)
+        )
         highlight = share[:, None] * self.irradiance / np.pi
-        albedo = np.pi * np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear) / self.irradiance
+        albedo = (
+            np.pi * np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear) / self.irradiance
+        )
         damping = self.light.damping
         if damping:
             albedo = np.maximum(albedo, 1e-4)
@@ -250,11 +306,18 @@ class Relighter:
 
     def _strain_color(self, mesh: np.ndarray) -> np.ndarray:
         splats = self.avatar.splats
-        return np.asarray(np.einsum("ns,nsc->nc", self.avatar.frames(mesh).strain[splats.face], splats.strain_color))
+        return np.asarray(
+            np.einsum(
+                "ns,nsc->nc", self.avatar.frames(mesh).strain[splats.face], splats.strain_color
+            )
+        )
 
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""
-        splats, direction = self.avatar.splats, self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32))
+        splats, direction = (
+            self.avatar.splats,
+            self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32)),
+        )
         color = sh_color(splats.sh, direction)
         if self._strained:
             color = color + self._strain_color(mesh)
@@ -270,12 +333,14 @@ class Relighter:
 
     @staticmethod
     def _unit(vectors: np.ndarray) -> np.ndarray:
-        square = np.einsum("nk,nk->n", vectors, vectors)  # np.linalg.norm is slow where the last axis is short
+        # np.linalg.norm is slow where the last axis is short
+        square = np.einsum("nk,nk->n", vectors, vectors)
         return np.asarray(vectors / np.maximum(np.sqrt(square), np.float32(1e-12))[:, None])
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:
-    """The avatar without its light: colors are albedo in sRGB, from every side and under every strain the same.
+    """The avatar without its light: colors are albedo in sRGB, from every side and under every
+    strain the same.
 
     Raises StgaError where the avatar has no light.
     """

@@ -1,4 +1,5 @@
-"""GLSL that lights splats as `relight.Relighter` does, for Blender's shaders and the web page's player."""
+"""GLSL that lights splats as `relight.Relighter` does, for Blender's shaders and the web page's
+player."""
 
 from pathlib import Path
 

@@ -20,20 +20,28 @@ MAP_SIZE, BIAS_M, LIFT_M = 256, 0.0015, 0.002
 """As in `lamps`, for maps of half the size."""
 
 
-def transfer_of(vertices: np.ndarray, faces: np.ndarray, directions: int = DIRECTIONS) -> tuple[np.ndarray, np.ndarray]:
-    """Transfer (V, 9) float32 and occlusion (V,) float32 of a mesh (V, 3) meters, see `avatar.light.AvatarLight`.
+def transfer_of(
+    vertices: np.ndarray, faces: np.ndarray, directions: int = DIRECTIONS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transfer (V, 9) float32 and occlusion (V,) float32 of a mesh (V, 3) meters, see
+    `avatar.light.AvatarLight`.
 
-    Σ over even directions d of visible(d) · max(0, n·d) · basis(d) · 4π / directions (Sloan, Kautz and Snyder 2002);
-    a direction's visibility at all vertices is one depth map.
+    Σ over even directions d of visible(d) · max(0, n·d) · basis(d) · 4π / directions (Sloan, Kautz
+    and Snyder 2002); a direction's visibility at all vertices is one depth map.
     """
     vertices = np.asarray(vertices, np.float64)
     normals = vertex_normals(vertices, faces)
     points, sky = vertices + LIFT_M * normals, even_directions(directions)
     harmonics = basis(sky) * (4 * np.pi / directions)
-    transfer, open_sky, whole_sky = np.zeros((len(vertices), harmonics.shape[1])), *np.zeros((2, len(vertices)))
+    transfer, open_sky, whole_sky = (
+        np.zeros((len(vertices), harmonics.shape[1])),
+        *np.zeros((2, len(vertices))),
+    )
     for direction, harmonic in zip(sky, harmonics, strict=True):
         cosine = np.maximum(normals @ direction, 0)
-        depths = ShadowMap(vertices, faces, Light("sun", np.ones(3), direction=-direction), size=MAP_SIZE)
+        depths = ShadowMap(
+            vertices, faces, Light("sun", np.ones(3), direction=-direction), size=MAP_SIZE
+        )
         reached = cosine * depths.lit(points, BIAS_M, step=0)
         transfer += reached[:, None] * harmonic
         open_sky += reached
@@ -42,7 +50,8 @@ def transfer_of(vertices: np.ndarray, faces: np.ndarray, directions: int = DIREC
 
 
 CELL_M = 0.02
-"""Side of the cells in which irradiance is averaged; a vertex sees the mean of its own and the 26 around it."""
+"""Side of the cells in which irradiance is averaged; a vertex sees the mean of its own and the 26
+around it."""
 SKIN = np.array([0.5, 0.33, 0.25])
 """Albedo of the skin that light is reflected by."""
 MIN_OPEN = 0.3
@@ -62,15 +71,19 @@ class Bounce:
         self._sum_of_weights = self._around(self._weight)
 
     def light(self, irradiance: np.ndarray) -> np.ndarray:
-        """(V, 3) irradiance that a vertex gets from skin around it, of what arrives at vertices (V, 3)."""
-        near = np.stack([self._around(self._weight * channel) for channel in np.asarray(irradiance).T], axis=-1)
+        """(V, 3) irradiance that a vertex gets from skin around it, of what arrives at vertices (V,
+        3)."""
+        near = np.stack(
+            [self._around(self._weight * channel) for channel in np.asarray(irradiance).T], axis=-1
+        )
         return np.asarray(self._blocked * near / np.maximum(self._sum_of_weights, 1e-12)[:, None])
 
     def _around(self, values: np.ndarray) -> np.ndarray:
         """(V,): sum of values (V,) in each vertex's cell and those around it."""
         total = np.bincount(self._cell, values, int(np.prod(self._shape))).reshape(self._shape)
         for axis in range(3):
-            ahead, behind = np.roll(total, 1, axis), np.roll(total, -1, axis)  # the outermost cells are empty
+            # the outermost cells are empty
+            ahead, behind = np.roll(total, 1, axis), np.roll(total, -1, axis)
             total = total + ahead + behind
         return np.asarray(total.ravel()[self._cell])
 
@@ -82,8 +95,9 @@ MAX_STEPS = 6
 def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
     """Where splats are on the neutral mesh: a triangle (N,), and weights (N, 3) of its corners.
 
-    From its own triangle on, a splat walks over the edge beyond which it lies, up to MAX_STEPS times; of the triangles
-    that it comes by, the one with the nearest point counts, within it up to clamping.
+    From its own triangle on, a splat walks over the edge beyond which it lies, up to MAX_STEPS
+    times; of the triangles that it comes by, the one with the nearest point counts, within it up to
+    clamping.
     """
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     face = avatar.splats.face.astype(np.int64)
@@ -115,8 +129,8 @@ def _beyond_edges(faces: np.ndarray) -> np.ndarray:
 
 
 def _nearest(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Barycentric coordinates (N, 3) of points (N, 3) in the planes of triangles (N, 3, 3), the same clamped to the
-    triangle, and the square of the distance (N,) from there."""
+    """Barycentric coordinates (N, 3) of points (N, 3) in the planes of triangles (N, 3, 3), the
+    same clamped to the triangle, and the square of the distance (N,) from there."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     offset = points - a
     uu, uv, vv = _dot(first, first), _dot(first, second), _dot(second, second)
@@ -135,7 +149,8 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def at_splats(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(N, C) float32 of values (V, C) at points of triangles: faces (N, 3) their corners, weights (N, 3)."""
+    """(N, C) float32 of values (V, C) at points of triangles: faces (N, 3) their corners, weights
+    (N, 3)."""
     values = np.ascontiguousarray(values, np.float32)
     found = np.zeros((len(faces), values.shape[1]), np.float32)
     for k in range(3):
@@ -151,7 +166,8 @@ MIN_HEIGHT_M = 0.002
 """Above the mesh: shadow maps have a bias, and splats of skin lie within 1.5 mm."""
 MIN_OPACITY, MAX_ALBEDO = 0.3, 0.15
 EXTENT = 2.0
-"""Distance of a lash's corners from its middle, in standard deviations of the splat: gaps between lashes close."""
+"""Distance of a lash's corners from its middle, in standard deviations of the splat: gaps between
+lashes close."""
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
@@ -159,7 +175,8 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 class Lashes:
     """Four-cornered cards in the frames of triangles.
 
-    face (M,) of the mesh. corners (M, 4, 3) float32 in the frame of that triangle (`avatar.embedding`).
+    face (M,) of the mesh. corners (M, 4, 3) float32 in the frame of that triangle
+    (`avatar.embedding`).
     """
 
     avatar: Avatar
@@ -177,11 +194,16 @@ class Lashes:
 
 
 def find_lashes(
-    avatar: Avatar, corners: np.ndarray, weights: np.ndarray, roughness: np.ndarray, albedo: np.ndarray
+    avatar: Avatar,
+    corners: np.ndarray,
+    weights: np.ndarray,
+    roughness: np.ndarray,
+    albedo: np.ndarray,
 ) -> Lashes:
     """The lashes of an avatar whose light is known.
 
-    corners, weights (N, 3): `surface.surface_points`. roughness (N,) and albedo (N, 3) of the splats.
+    corners, weights (N, 3): `surface.surface_points`. roughness (N,) and albedo (N, 3) of the
+    splats.
     """
     assert avatar.light is not None
     splats, neutral = avatar.splats, avatar.neutral.astype(np.float64)
@@ -210,13 +232,16 @@ def _near_eyes(points: np.ndarray, neutral: np.ndarray, avatar: Avatar) -> np.nd
 
 
 def _cards(avatar: Avatar, splat: np.ndarray) -> np.ndarray:
-    """(M, 4, 3) float32: ends of the two longest axes of splats (M,), in turn, in the frames of their triangles."""
+    """(M, 4, 3) float32: ends of the two longest axes of splats (M,), in turn, in the frames of
+    their triangles."""
     rows = avatar.splats.rows(splat)
     scale = np.exp(rows.log_scale.astype(np.float64))
     longest = np.argsort(-scale, axis=1, kind="stable")[:, :2]
     axes = np.swapaxes(to_matrices(rows.rotation), 1, 2)
     first, second = (
-        EXTENT * np.take_along_axis(scale, longest[:, k, None], 1) * axes[np.arange(len(splat)), longest[:, k]]
+        EXTENT
+        * np.take_along_axis(scale, longest[:, k, None], 1)
+        * axes[np.arange(len(splat)), longest[:, k]]
         for k in range(2)
     )
     offsets = np.stack([first, second, -first, -second], axis=1)

@@ -1,13 +1,15 @@
 """Lights and lighting as plain values, in Blender's units.
 
-Space: that of the avatar's meshes (world meters of its capture, or of the head object in Blender). Axes are any, as
-long as lights, world and mesh share them. Colors are linear, with sRGB's primaries.
+Space: that of the avatar's meshes (world meters of its capture, or of the head object in Blender).
+Axes are any, as long as lights, world and mesh share them. Colors are linear, with sRGB's
+primaries.
 
-Units: a sun's color is irradiance in W/m² on a surface that faces it; that of other lights is power in W, of which a
-surface that faces a point at distance d gets power / (4 π d²), and one that faces the middle of a small area light
-power / (π d²): Blender's strength times its color. The world's radiance is in W/m²/sr, Blender's strength times its
-color: radiance 1 from everywhere is irradiance π. A surface of albedo ρ under irradiance E has radiance ρ E / π, which
-is the display's white (sRGB 1) where it is 1.
+Units: a sun's color is irradiance in W/m² on a surface that faces it; that of other lights is power
+in W, of which a surface that faces a point at distance d gets power / (4 π d²), and one that faces
+the middle of a small area light power / (π d²): Blender's strength times its color. The world's
+radiance is in W/m²/sr, Blender's strength times its
+color: radiance 1 from everywhere is irradiance π. A surface of albedo ρ under irradiance E has
+radiance ρ E / π, which is the display's white (sRGB 1) where it is 1.
 """
 
 from dataclasses import dataclass, field, replace
@@ -33,8 +35,8 @@ class Light:
     kind       one of KINDS
     color      (3,) linear red, green, blue: irradiance in W/m² of a sun, else power in W
     position   (3,) meters; of a sun it counts for nothing
-    direction  (3,) in which it shines: a sun's rays, a spot's axis, the normal of an area light's bright side; of a
-               point it counts for nothing
+    direction  (3,) in which it shines: a sun's rays, a spot's axis, the normal of an area light's
+               bright side; of a point it counts for nothing
     radius     meters, of a point or spot: how soft its shadows are
     angle      radians, of a sun: the angle that it takes in the sky
     size       (width, height) meters of an area light
@@ -43,7 +45,8 @@ class Light:
     cone       radians, of a spot: full angle, as Blender's `spot_size`
     blend      0…1, of a spot: share of the cone that fades out, as Blender's `spot_blend`
     casts_shadow  whether it is blocked by head and casters
-    diffuse, specular  factors of what it adds to the skin's diffuse color and to highlights, as Blender's
+    diffuse, specular  factors of what it adds to the skin's diffuse color and to highlights, as
+                       Blender's
     """
 
     kind: str
@@ -71,9 +74,11 @@ class Light:
             object.__setattr__(self, name, _direction(getattr(self, name)))
 
     def transformed(self, matrix: np.ndarray) -> "Light":
-        """The light in another space: matrix (4, 4) rigid, or with uniform scale, which scales lengths.
+        """The light in another space: matrix (4, 4) rigid, or with uniform scale, which scales
+        lengths.
 
-        A color stays as it is: scaled lengths change what arrives of a power, as in a scene that is scaled.
+        A color stays as it is: scaled lengths change what arrives of a power, as in a scene that is
+        scaled.
         """
         scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
         return replace(
@@ -95,16 +100,19 @@ def no_world() -> np.ndarray:
 class Lighting:
     """The light of a scene, and how an avatar answers to it.
 
-    world      (9, 3) spherical harmonics of the world's radiance by direction of sight (`harmonics.basis`)
+    world      (9, 3) spherical harmonics of the world's radiance by direction of sight
+               (`harmonics.basis`)
     lights     see `Light`; an environment's sun is one of them (`environment.split_environment`)
-    mode       "recorded": the colors as trained, unchanged to the bit; "scene": relit; "mix": between the two
+    mode       "recorded": the colors as trained, unchanged to the bit; "scene": relit; "mix":
+               between the two
     mix        share of "scene" in "mix", 0…1, in linear light
     exposure   stops (powers of two) by which relit colors are made brighter
-    white      (3,) linear color that the capture shows of what is white under its own light, relative to the estimate:
-               relit colors are divided by it (the eyedropper)
+    white      (3,) linear color that the capture shows of what is white under its own light,
+               relative to the estimate: relit colors are divided by it (the eyedropper)
     roughness  of highlights on skin; 0.05…1. Eyeballs have their own (`AvatarLight.roughness`)
     specular   factor of highlights; 0: none
-    shadows    whether lights are blocked by the head and casters; world light is always occluded by the head
+    shadows    whether lights are blocked by the head and casters; world light is always occluded by
+               the head
     """
 
     world: np.ndarray = field(default_factory=no_world)
@@ -124,7 +132,8 @@ class Lighting:
 
 @dataclass(frozen=True)
 class Caster:
-    """Something else in the scene that throws shadows onto the head: vertices (V, 3) meters, triangles (F, 3)."""
+    """Something else in the scene that throws shadows onto the head: vertices (V, 3) meters,
+    triangles (F, 3)."""
 
     vertices: np.ndarray
     faces: np.ndarray

@@ -9,6 +9,7 @@ OWN_KERNELS = "STGA_OWN_KERNELS"
 
 
 def has_kernels(folder: Path) -> bool:
-    """Whether a Numba cache below `folder` holds kernels of the package as it is: an update replaces its files."""
+    """Whether a Numba cache below `folder` holds kernels of the package as it is: an update
+    replaces its files."""
     indices = folder.rglob(f"{LAST_COMPILED.stem}.{LAST_COMPILED.stem}-*.nbi")
     return any(index.stat().st_mtime >= LAST_COMPILED.stat().st_mtime for index in indices)

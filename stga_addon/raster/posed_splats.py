@@ -12,8 +12,9 @@ from ..avatar.splats import Splats
 class PosedSplats:
     """One set of splats in a scene with others: a layer of `compose`.
 
-    frames: those of the splats' triangles (`WORLD` for a world-space set), in the space that the splats were trained
-    in. to_world (4, 4): from that space to the scene; it may scale and shear. antialiased as in `Avatar`.
+    frames: those of the splats' triangles (`WORLD` for a world-space set), in the space that the
+    splats were trained in. to_world (4, 4): from that space to the scene; it may scale and shear.
+    antialiased as in `Avatar`.
     """
 
     splats: Splats
@@ -26,8 +27,9 @@ class PosedSplats:
 class ComposedImage:
     """Image of several layers on a transparent background.
 
-    rgb (3, H, W) float32: display values (sRGB), premultiplied with alpha (H, W). depth (H, W): meters along the view
-    axis, the alpha-weighted mean of what a pixel shows, 0 where that is nothing; None if it was not asked for.
+    rgb (3, H, W) float32: display values (sRGB), premultiplied with alpha (H, W). depth (H, W):
+    meters along the view axis, the alpha-weighted mean of what a pixel shows, 0 where that is
+    nothing; None if it was not asked for.
     """
 
     rgb: np.ndarray

@@ -1,4 +1,5 @@
-"""Render client: renders in this process, or through a render server in another interpreter where packages are missing.
+"""Render client: renders in this process, or through a render server in another interpreter where
+packages are missing.
 
 Importing this needs numpy only.
 """
@@ -25,13 +26,16 @@ REQUIRED_PACKAGES = ("numba", "platformdirs")
 class RenderClient:
     """Renders layers for any thread, one image at a time.
 
-    find_python: the interpreter of the server where this one lacks REQUIRED_PACKAGES; raises StgaError if none is set.
+    find_python: the interpreter of the server where this one lacks REQUIRED_PACKAGES; raises
+    StgaError if none is set.
     find_device: the device, as `Composer` takes it.
 
     failure  why the CPU renders instead of a GPU that has failed; "" where none has
     """
 
-    def __init__(self, find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto") -> None:
+    def __init__(
+        self, find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto"
+    ) -> None:
         self._find_python, self._find_device = find_python, find_device
         self._lock = threading.Lock()
         self._composer = Composer()
@@ -39,8 +43,11 @@ class RenderClient:
         self._server_device = self.failure = ""
         self._sent: Sequence[PosedSplats] | None = None
 
-    def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
-        """`Composer.compose`, in this process or by the server. Raises StgaError where neither can render."""
+    def compose(
+        self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
+    ) -> ComposedImage:
+        """`Composer.compose`, in this process or by the server. Raises StgaError where neither can
+        render."""
         with self._lock:
             device = self._find_device()
             if missing_packages():
@@ -64,7 +71,9 @@ class RenderClient:
                 with suppress(OSError):  # data that was not yet written
                     cast(BinaryIO, pipe).close()
 
-    def _request(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool) -> ComposedImage:
+    def _request(
+        self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool
+    ) -> ComposedImage:
         if self._server is None:
             python, self._server_device = self._python(), self._find_device()
             arguments = ["stga_addon.render.server", self._server_device]
@@ -79,10 +88,14 @@ class RenderClient:
             reply = receive(cast(BinaryIO, server.stdout))
         except (OSError, EOFError, ValueError) as error:
             self.close()
-            raise StgaError(f"{python}: the render server exited unexpectedly; that Python needs numba") from error
+            raise StgaError(
+                f"{python}: the render server exited unexpectedly; that Python needs numba"
+            ) from error
         self._sent, self.failure = layers, str(reply.get("failure", ""))
         if "error" in reply:
-            raise StgaError(f"{python}: the render server could not render the image ({reply['error']})")
+            raise StgaError(
+                f"{python}: the render server could not render the image ({reply['error']})"
+            )
         return ComposedImage(reply["rgb"], reply["alpha"], reply["depth"] if with_depth else None)
 
     def _python(self) -> str:

@@ -1,4 +1,5 @@
-"""The device that trains or renders, the GPU where it is right and faster, else the CPU; and pictures made there."""
+"""The device that trains or renders, the GPU where it is right and faster, else the CPU; and
+pictures made there."""
 
 import logging
 from collections.abc import Sequence
@@ -25,14 +26,17 @@ def is_device(value: Any) -> bool:
     """Whether a value is one of DEVICES or "gpu:" and a name."""
     if not isinstance(value, str):
         return False
-    return value in DEVICES or (value.startswith(GPU) and len(GPU) < len(value) <= MAX_DEVICE_LENGTH)
+    return value in DEVICES or (
+        value.startswith(GPU) and len(GPU) < len(value) <= MAX_DEVICE_LENGTH
+    )
 
 
 def choose_device(requested: str, task: str = "Training") -> tuple[str, str]:
     """The device, "cpu" or "gpu:" and an adapter's name, and a sentence that explains the choice.
 
-    requested: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or the only one with
-    this part in its name). "auto" takes the first adapter that is not software, right and faster than the CPU.
+    requested: "auto", "cpu", "gpu" (the first adapter) or "gpu:NAME" (the adapter of that name, or
+    the only one with this part in its name). "auto" takes the first adapter that is not software,
+    right and faster than the CPU.
     task: what is done there. Raises StgaError if a GPU is requested and none works.
     """
     if requested == "cpu":
@@ -42,12 +46,15 @@ def choose_device(requested: str, task: str = "Training") -> tuple[str, str]:
     adapter = adapter_name(requested)
     trial = _trial(adapter)
     if not trial.is_right:
-        raise StgaError(f"--device {requested}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu")
+        raise StgaError(
+            f"--device {requested}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu"
+        )
     return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
 
 
 def adapter_names(software: bool = True) -> list[str]:
-    """The adapters that `choose_device` knows, real GPUs first. Raises StgaError if there is none."""
+    """The adapters that `choose_device` knows, real GPUs first. Raises StgaError if there is
+    none."""
     if find_spec("wgpu") is None:
         raise StgaError("--device gpu: the package wgpu (WebGPU) is not installed")
     from ..raster.gpu.adapters import adapters, is_software
@@ -60,7 +67,8 @@ def adapter_names(software: bool = True) -> list[str]:
 
 
 def adapter_name(device: str) -> str:
-    """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError where there is none, or several."""
+    """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError where there is none, or
+    several."""
     names, part = adapter_names(), device.removeprefix(GPU)
     if device == "gpu" or part in names:
         return names[0] if device == "gpu" else part
@@ -86,7 +94,9 @@ def _fastest(task: str) -> tuple[str, str]:
             continue
         if trial.is_right and trial.device_s < trial.cpu_s:
             return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
-        reasons.append(f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial))
+        reasons.append(
+            f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial)
+        )
     return "cpu", f"{task} on the CPU: {'; '.join(reasons)}"
 
 
@@ -127,13 +137,17 @@ class Composer:
         self.requested, self.device, self.failure = requested, "", ""
 
     def choose(self) -> str:
-        """The device of the next image. Raises StgaError where the one that is asked for by name does not work."""
+        """The device of the next image. Raises StgaError where the one that is asked for by name
+        does not work."""
         if not self.device:
             self.device, _ = choose_device(self.requested, "Rendering")
         return self.device
 
-    def compose(self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
-        """See `cpu.compose.compose`. Raises StgaError where a device that is asked for by name cannot render."""
+    def compose(
+        self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
+    ) -> ComposedImage:
+        """See `cpu.compose.compose`. Raises StgaError where a device that is asked for by name
+        cannot render."""
         if self.choose() != "cpu":
             from ..raster.gpu import compose as gpu
 
@@ -142,7 +156,11 @@ class Composer:
             except Exception as error:  # a driver raises what it likes
                 if self.requested != "auto":
                     raise
-                cause = error.cause if isinstance(error, DeviceError) else f"{self.device}: {first_line(error)}"
+                cause = (
+                    error.cause
+                    if isinstance(error, DeviceError)
+                    else f"{self.device}: {first_line(error)}"
+                )
                 self.device, self.failure = "cpu", one_line(f"{cause}; the CPU renders instead")
                 logging.getLogger(__name__).warning(self.failure)
         from ..raster.cpu import compose as cpu

@@ -42,11 +42,13 @@ def render(
 ) -> np.ndarray:
     """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
 
-    splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH coefficients);
-    positions in the frames of their triangles (`avatar.embedding.face_frames`), or in world meters with `WORLD`.
-    camera: pose and intrinsics with OpenCV axes. background: sRGB in 0…1. antialiased: whether splats narrower than a
-    pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was trained. composer: chooses the device; the
-    CPU without one. behind: others in world space, such as those of a run's world.
+    splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH
+    coefficients); positions in the frames of their triangles (`avatar.embedding.face_frames`), or
+    in world meters with `WORLD`.
+    camera: pose and intrinsics with OpenCV axes. background: sRGB in 0…1. antialiased: whether
+    splats narrower than a pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was
+    trained. composer: chooses the device; the CPU without one. behind: others in world space, such
+    as those of a run's world.
     """
     if behind is not None or (composer is not None and composer.choose() != "cpu"):
         layers = [PosedSplats(splats, frames, np.eye(4), antialiased)]
@@ -55,7 +57,9 @@ def render(
         composed = (composer or Composer("cpu")).compose(layers, camera)
         rest = (1 - composed.alpha) * np.array(background, np.float32)[:, None, None]
         return np.clip(composed.rgb + rest, 0, 1)
-    parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
+    parameters = Parameters(
+        *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
+    )
     output = render_forward(
         parameters, splats.face, frames_in_camera(frames, camera), splats.sh_degree,
         np.array(background, np.float32), antialiased=antialiased,
@@ -71,8 +75,11 @@ def render_avatar(
     composer: Composer | None = None,
     behind: Splats | None = None,
 ) -> np.ndarray:
-    """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of `render`."""
-    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer, behind)
+    """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of
+    `render`."""
+    return render(
+        avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer, behind
+    )
 
 
 def render_colors(
@@ -84,10 +91,13 @@ def render_colors(
     composer: Composer | None = None,
     behind: Splats | None = None,
 ) -> np.ndarray:
-    """`render_avatar` with sRGB colors (N, 3) of the splats, as `light.relight` finds them, instead of their own."""
+    """`render_avatar` with sRGB colors (N, 3) of the splats, as `light.relight` finds them, instead
+    of their own."""
     sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
     splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))
-    return render(splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer, behind)
+    return render(
+        splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer, behind
+    )
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

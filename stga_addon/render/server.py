@@ -32,8 +32,12 @@ def send(stream: BinaryIO, arrays: Mapping[str, Any]) -> None:
 
 
 def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
-    """Read one message. Raises EOFError at the end of the stream, ValueError for what is no message."""
-    mark, size = _read_exactly(stream, len(MARK)), int.from_bytes(_read_exactly(stream, 8), "little")
+    """Read one message. Raises EOFError at the end of the stream, ValueError for what is no
+    message."""
+    mark, size = (
+        _read_exactly(stream, len(MARK)),
+        int.from_bytes(_read_exactly(stream, 8), "little"),
+    )
     if mark != MARK:
         raise ValueError(f"a message begins with {MARK!r}, got {mark!r}")
     with np.load(io.BytesIO(_read_exactly(stream, size)), allow_pickle=False) as arrays:
@@ -52,20 +56,31 @@ def unpack_camera(arrays: Mapping[str, np.ndarray]) -> Camera:
     return Camera(int(width), int(height), fl_x, fl_y, cx, cy, arrays["pose"])
 
 
-def pack_layers(layers: Sequence[PosedSplats], before: Sequence[PosedSplats] = ()) -> dict[str, Any]:
-    """Layers as named arrays; without the splats of those that have the same as the layer `before` at their index."""
+def pack_layers(
+    layers: Sequence[PosedSplats], before: Sequence[PosedSplats] = ()
+) -> dict[str, Any]:
+    """Layers as named arrays; without the splats of those that have the same as the layer `before`
+    at their index."""
     arrays: dict[str, Any] = {"layers": len(layers)}
     for index, layer in enumerate(layers):
         if index >= len(before) or not _same_splats(layer.splats, before[index].splats):
-            arrays |= {f"{index} splats {name}": getattr(layer.splats, name) for name in SPLAT_FIELDS}
+            arrays |= {
+                f"{index} splats {name}": getattr(layer.splats, name) for name in SPLAT_FIELDS
+            }
         arrays |= {f"{index} frames {name}": getattr(layer.frames, name) for name in FRAME_FIELDS}
         arrays |= {f"{index} to_world": layer.to_world, f"{index} antialiased": layer.antialiased}
     return arrays
 
 
-def unpack_layers(arrays: Mapping[str, np.ndarray], before: Sequence[PosedSplats] = ()) -> list[PosedSplats]:
-    """The inverse of `pack_layers`. Raises KeyError where splats are missing from the arrays and from `before`."""
-    names = [[f"{index} splats {name}" for name in SPLAT_FIELDS] for index in range(int(arrays["layers"]))]
+def unpack_layers(
+    arrays: Mapping[str, np.ndarray], before: Sequence[PosedSplats] = ()
+) -> list[PosedSplats]:
+    """The inverse of `pack_layers`. Raises KeyError where splats are missing from the arrays and
+    from `before`."""
+    names = [
+        [f"{index} splats {name}" for name in SPLAT_FIELDS]
+        for index in range(int(arrays["layers"]))
+    ]
     splats = [
         Splats(**{field: arrays[name] for field, name in zip(SPLAT_FIELDS, stored, strict=True)})
         if stored[0] in arrays or index >= len(before)
@@ -84,7 +99,9 @@ def unpack_layers(arrays: Mapping[str, np.ndarray], before: Sequence[PosedSplats
 
 
 def _same_splats(one: Splats, other: Splats) -> bool:
-    return one is other or all(np.array_equal(getattr(one, name), getattr(other, name)) for name in SPLAT_FIELDS)
+    return one is other or all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in SPLAT_FIELDS
+    )
 
 
 def _read_exactly(stream: BinaryIO, size: int) -> bytes:
@@ -123,7 +140,10 @@ def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
             send(replies, {"error": f"{kind}{error}"})
         else:
             depth = {} if image.depth is None else {"depth": image.depth}
-            send(replies, {"rgb": image.rgb, "alpha": image.alpha, "failure": composer.failure, **depth})
+            send(
+                replies,
+                {"rgb": image.rgb, "alpha": image.alpha, "failure": composer.failure, **depth},
+            )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Videos: recordings of what each image shows, and MP4 files or numbered PNGs, written image by image."""
+"""Videos: recordings of what each image shows, and MP4 files or numbered PNGs, written image by
+image."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +24,8 @@ CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
 QUALITY = {"crf": "16", "preset": "medium"}
 """Constant rate factor of x264: 18 is called visually lossless, lower is better."""
 BT709, LIMITED_RANGE = 1, 1
-"""Values of FFmpeg's AVCOL_* enumerations: what players assume of untagged high-definition video."""
+"""Values of FFmpeg's AVCOL_* enumerations: what players assume of untagged high-definition
+video."""
 IMAGE_NAME = re.compile(r"\d{4,}\.png", re.IGNORECASE)
 """Name of an image of a sequence: 0012.png."""
 
@@ -34,31 +36,37 @@ WriteImage = Callable[[np.ndarray], None]
 def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
     """Write an MP4 file: the block is given a function that appends an image (H, W, 3) uint8, sRGB.
 
-    All images have the size of the first; odd sizes are extended by a row or column, which the format needs. The file
-    appears when the block ends without an exception. Raises StgaError where it cannot be written, or no video has
-    such a frame rate.
+    All images have the size of the first; odd sizes are extended by a row or column, which the
+    format needs. The file appears when the block ends without an exception. Raises StgaError where
+    it cannot be written, or no video has such a frame rate.
     """
     check_rate(path, fps)
     import av
 
     with replacing(path) as partial:
         try:
-            with av.open(str(partial), "w", format="mp4", options={"movflags": "faststart"}) as container:
+            with av.open(
+                str(partial), "w", format="mp4", options={"movflags": "faststart"}
+            ) as container:
                 append, finish = _encoder(container, Fraction(fps).limit_denominator(1001))
                 yield append
                 finish()
         except av.error.FFmpegError as error:
-            raise StgaError(f"{path}: the video cannot be written ({error.strerror or error})") from error
+            raise StgaError(
+                f"{path}: the video cannot be written ({error.strerror or error})"
+            ) from error
 
 
 @contextmanager
 def sequence_writer(folder: Path) -> Iterator[WriteImage]:
-    """Write 0001.png, 0002.png, … into the folder: the block is given a function that writes the next image.
+    """Write 0001.png, 0002.png, … into the folder: the block is given a function that writes the
+    next image.
 
-    Images: (H, W, 3) or, with straight alpha, (H, W, 4) uint8, sRGB. They replace an earlier sequence: when the block
-    ends, its other images are removed, also where it was cut short, so that the folder never holds images of two; all
-    else in it stays. Raises StgaError where one cannot be written or removed, and, before any is written, where the
-    folder holds images with such names that `sequence_writer` did not write.
+    Images: (H, W, 3) or, with straight alpha, (H, W, 4) uint8, sRGB. They replace an earlier
+    sequence: when the block ends, its other images are removed, also where it was cut short, so
+    that the folder never holds images of two; all else in it stays. Raises StgaError where one
+    cannot be written or removed, and, before any is written, where the folder holds images with
+    such names that `sequence_writer` did not write.
     """
     from PIL import Image
 
@@ -90,10 +98,14 @@ def _encoder(container: Any, rate: Fraction) -> tuple[WriteImage, Callable[[], N
     def append(image: np.ndarray) -> None:
         nonlocal is_empty
         odd = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
-        frame = VideoFrame.from_ndarray(np.ascontiguousarray(np.pad(image, odd, mode="edge")), format="rgb24")
+        frame = VideoFrame.from_ndarray(
+            np.ascontiguousarray(np.pad(image, odd, mode="edge")), format="rgb24"
+        )
         if is_empty:
             stream.width, stream.height, is_empty = frame.width, frame.height, False
-        frame = frame.reformat(format=PIXEL_FORMAT, dst_colorspace=BT709, dst_color_range=LIMITED_RANGE)
+        frame = frame.reformat(
+            format=PIXEL_FORMAT, dst_colorspace=BT709, dst_color_range=LIMITED_RANGE
+        )
         container.mux(stream.encode(frame))
 
     return append, lambda: container.mux(stream.encode())
@@ -109,7 +121,8 @@ def is_video(output: Path) -> bool:
 
 
 def check_output(output: Path) -> None:
-    """Raise StgaError where a video, or the PNGs of a folder, cannot be written, or others' images are there."""
+    """Raise StgaError where a video, or the PNGs of a folder, cannot be written, or others' images
+    are there."""
     check_writable(output if is_video(output) else output / FIRST_IMAGE)
     if not is_video(output):
         NumberedFiles(output, IMAGE_NAME)
@@ -142,7 +155,9 @@ class Recorder:
         try:
             yield
         except OSError as error:
-            raise StgaError(f"{self.path}: cannot be written ({error.strerror or error})") from error
+            raise StgaError(
+                f"{self.path}: cannot be written ({error.strerror or error})"
+            ) from error
 
 
 def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[ComposedImage]:
@@ -155,14 +170,21 @@ def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[Comp
                 layers = unpack_layers(message, layers)
                 yield composer.compose(layers, unpack_camera(message))
     except (OSError, EOFError, KeyError, ValueError) as error:
-        raise StgaError(f"{path}: cannot be read as the images of a video ({type(error).__name__})") from error
+        raise StgaError(
+            f"{path}: cannot be read as the images of a video ({type(error).__name__})"
+        ) from error
 
 
-def finished(image: ComposedImage, background: tuple[float, float, float] | None, opaque: bool) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB over the background, or (H, W, 4) with straight alpha where it is None and not `opaque`."""
+def finished(
+    image: ComposedImage, background: tuple[float, float, float] | None, opaque: bool
+) -> np.ndarray:
+    """(H, W, 3) uint8 sRGB over the background, or (H, W, 4) with straight alpha where it is None
+    and not `opaque`."""
     color, alpha = image.rgb.transpose(1, 2, 0), image.alpha[..., None]
     if background is None and not opaque:
-        pixels = np.concatenate([color / np.maximum(alpha, np.finfo(np.float32).tiny), alpha], axis=2)
+        pixels = np.concatenate(
+            [color / np.maximum(alpha, np.finfo(np.float32).tiny), alpha], axis=2
+        )
     else:
         pixels = color + (1 - alpha) * np.array(background or (0, 0, 0), np.float32)
     return np.asarray(np.rint(np.clip(pixels, 0, 1) * 255), np.uint8)

@@ -50,7 +50,8 @@ def evaluated_vertices(obj: Any) -> np.ndarray:
 
 
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """A smooth-shaded mesh of vertices (V, 3) and triangles (F, 3); order and vertex order of the faces are kept."""
+    """A smooth-shaded mesh of vertices (V, 3) and triangles (F, 3); order and vertex order of the
+    faces are kept."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))
     mesh.vertices.foreach_set("co", flat_floats(vertices))

@@ -26,7 +26,8 @@ DISTANCE = 2.2
 
 
 def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
-    """Let the 3D viewports look at the head from the side of `camera`, or from the front where it is None.
+    """Let the 3D viewports look at the head from the side of `camera`, or from the front where it
+    is None.
 
     They stay free to orbit. A viewport that looks through a camera stays so.
     The dashed lines from cameras and bones to their parent are hidden.
@@ -48,7 +49,8 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
 
 
 def frame_alone(head: Any, scene: Any, frames_per_second: float) -> None:
-    """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on the head.
+    """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on
+    the head.
 
     The world is white, the background of captures without one of their own.
     """
@@ -83,10 +85,12 @@ WORLD_NAME = "World splats"
 
 
 def set_up_head(capture: Capture) -> Any:
-    """Bring the capture's head and cameras into the open file's empty scene; returns the head. Raises StgaError."""
+    """Bring the capture's head and cameras into the open file's empty scene; returns the head.
+    Raises StgaError."""
     head = import_head(capture)
     model = capture.flame_file
-    head[tags.FLAME_MODEL] = "" if model is None else str(model.resolve())  # so that Train works in the saved file
+    # so that Train works in the saved file
+    head[tags.FLAME_MODEL] = "" if model is None else str(model.resolve())
     cameras = import_cameras(capture, capture_root(capture.root))
     configure_scene(current_scene(), capture, central(cameras))
     return head
@@ -95,7 +99,8 @@ def set_up_head(capture: Capture) -> Any:
 def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     """Show the avatar in place of the mesh, with every viewport on it; returns the splats.
 
-    link: the avatar's file, relative to the .blend file; fps: frames per second at which the scene plays.
+    link: the avatar's file, relative to the .blend file; fps: frames per second at which the scene
+    plays.
     """
     shown = show_avatar(avatar, head)
     shown[tags.AVATAR] = link
@@ -106,10 +111,13 @@ def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
 
 
 def show_world(avatar_file: Path, head: Any) -> Any:
-    """Show the splats of the world that lie beside an avatar file, where the head's capture stands: hidden until they
-    are wanted. Returns them; None where there are none, or the scene has them already. Raises StgaError."""
+    """Show the splats of the world that lie beside an avatar file, where the head's capture stands:
+    hidden until they are wanted. Returns them; None where there are none, or the scene has them
+    already. Raises StgaError."""
     path = avatar_file.with_name(WORLD_FILE).resolve()
-    if not path.is_file() or any(thing.get(tags.WORLD) == str(path) for thing in current_scene().objects):
+    if not path.is_file() or any(
+        thing.get(tags.WORLD) == str(path) for thing in current_scene().objects
+    ):
         return None
     world = show_world_splats(read_ply(path), WORLD_NAME)
     world.parent = head.parent

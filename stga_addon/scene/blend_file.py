@@ -55,7 +55,8 @@ def frames_per_second(scene: Any) -> float:
 
 
 def set_frames_per_second(scene: Any, rate: float) -> None:
-    """Let the scene play at the rate; Blender holds a whole number and a divisor, such as 30 and 1.001."""
+    """Let the scene play at the rate; Blender holds a whole number and a divisor, such as 30 and
+    1.001."""
     whole = max(1, round(rate))
     scene.render.fps, scene.render.fps_base = whole, whole / rate
 
@@ -67,7 +68,8 @@ def go_to_frame(frame: int) -> None:
 
 
 def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
-    """Set each frame of the scene in turn, with progress at the mouse pointer; restore the current frame at the end."""
+    """Set each frame of the scene in turn, with progress at the mouse pointer; restore the current
+    frame at the end."""
     scene, manager, numbers = bpy.context.scene, bpy.context.window_manager, list(numbers)
     frame, subframe = scene.frame_current, scene.frame_subframe
     manager.progress_begin(0, max(len(numbers), 1))

@@ -1,4 +1,5 @@
-"""Blender's cameras: imported from captures with their images, exported, and as calibrated cameras."""
+"""Blender's cameras: imported from captures with their images, exported, and as calibrated
+cameras."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -33,26 +34,37 @@ def image_size(render: Any) -> tuple[int, int]:
 
 
 def render_camera(
-    camera: Any, depsgraph: Any, width: int, height: int, border: tuple[int, int, int, int] | None = None
+    camera: Any,
+    depsgraph: Any,
+    width: int,
+    height: int,
+    border: tuple[int, int, int, int] | None = None,
 ) -> Camera:
     """The scene's camera for a final image of width × height pixels.
 
-    camera: the evaluated camera object. border: x, y, width and height in pixels of the render region, from the bottom
-    left; None: the whole image. Raises StgaError unless it is a perspective camera.
+    camera: the evaluated camera object. border: x, y, width and height in pixels of the render
+    region, from the bottom left; None: the whole image. Raises StgaError unless it is a perspective
+    camera.
     """
     if camera is None or camera.type != "CAMERA":
         raise StgaError("The scene has no camera to render through")
     if camera.data.type != "PERSP":
-        raise StgaError(f"{camera.name}: is not a perspective camera; STGA Splats renders through no other type")
+        raise StgaError(
+            f"{camera.name}: is not a perspective camera; STGA Splats renders through no other type"
+        )
     render = depsgraph.scene.render
     projection = camera.calc_matrix_camera(
         depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
     )
-    whole = camera_of(np.array(camera.matrix_world.normalized(), np.float64), projection, width, height)
+    whole = camera_of(
+        np.array(camera.matrix_world.normalized(), np.float64), projection, width, height
+    )
     if border is None:
         return whole
     x, y, columns, rows = border
-    return replace(whole, width=columns, height=rows, cx=whole.cx - x, cy=whole.cy - (height - y - rows))
+    return replace(
+        whole, width=columns, height=rows, cx=whole.cx - x, cy=whole.cy - (height - y - rows)
+    )
 
 
 def viewport_camera(region: Any, width: int, height: int) -> Camera:
@@ -69,7 +81,8 @@ def viewport_camera(region: Any, width: int, height: int) -> Camera:
 
 
 def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Camera:
-    """Camera from a camera-to-world matrix with OpenGL axes and an OpenGL perspective projection, both (4, 4)."""
+    """Camera from a camera-to-world matrix with OpenGL axes and an OpenGL perspective projection,
+    both (4, 4)."""
     p = np.array(projection, np.float64)
     return camera_from_gl(
         pose,
@@ -90,12 +103,14 @@ INTRINSICS_TOLERANCE = 1e-6  # pixels
 
 
 def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> list[Any]:
-    """One camera object for each of the capture's cameras, ascending by index, under `root` (from `capture_root`).
+    """One camera object for each of the capture's cameras, ascending by index, under `root` (from
+    `capture_root`).
 
-    Focal length, principal point and pose are the capture's; a pose that changes over time is keyframed. The images
-    are background images, one per timestep and visible on its frame (Blender's image sequences number frames by a file
-    name's last number, which in captures is the camera). Importing again replaces the last import. `warn` reports
-    missing images and cameras whose intrinsics change.
+    Focal length, principal point and pose are the capture's; a pose that changes over time is
+    keyframed. The images are background images, one per timestep and visible on its frame
+    (Blender's image sequences number frames by a file name's last number, which in captures is the
+    camera). Importing again replaces the last import. `warn` reports missing images and cameras
+    whose intrinsics change.
     """
     cameras = []
     old = {camera[tags.CAMERA_INDEX]: camera for camera in tags.find(tags.CAMERA, capture.root)}
@@ -108,9 +123,10 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
 def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_warning) -> None:
     """Make `scene` render the images of `camera`, one of `import_cameras`'.
 
-    Sets the active camera, the resolution, the pixel aspect, the frame range (the capture's timesteps), the frame rate
-    where the capture has one, and the view transform: splat colors are trained in sRGB, so it has to be Standard.
-    `warn` reports cameras whose images have another size, since a Blender scene has only one.
+    Sets the active camera, the resolution, the pixel aspect, the frame range (the capture's
+    timesteps), the frame rate where the capture has one, and the view transform: splat colors are
+    trained in sRGB, so it has to be Standard. `warn` reports cameras whose images have another
+    size, since a Blender scene has only one.
     """
     if camera.get(tags.KIND) != tags.CAMERA:
         raise StgaError(f"{camera.name}: is not a camera imported from a capture")
@@ -129,11 +145,14 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
     for other in tags.find(tags.CAMERA, capture.root):
         same_size = tuple(other[tags.IMAGE_SIZE]) == (width, height)
         if not same_size or abs(other[tags.PIXEL_ASPECT] - aspect) > INTRINSICS_TOLERANCE:
-            warn(f"{other.name}: its images have another size or pixel aspect than the scene, set from {camera.name}")
+            warn(
+                f"{other.name}: its images have another size or pixel aspect than the scene, set from {camera.name}"
+            )
 
 
 def central(cameras: list[Any]) -> Any:
-    """The camera object, of `import_cameras`, that sees the face (`capture.camera.central_camera`); None of none."""
+    """The camera object, of `import_cameras`, that sees the face (`capture.camera.central_camera`);
+    None of none."""
     if not cameras:
         return None
     bpy.context.view_layer.update()  # world matrices
@@ -147,7 +166,10 @@ def _views_by_camera(capture: Capture) -> dict[int, list[View]]:
     for views in capture.views.values():
         for view in views:
             cameras.setdefault(view.camera_index, {}).setdefault(view.timestep, view)
-    return {index: [cameras[index][timestep] for timestep in sorted(cameras[index])] for index in sorted(cameras)}
+    return {
+        index: [cameras[index][timestep] for timestep in sorted(cameras[index])]
+        for index in sorted(cameras)
+    }
 
 
 def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn) -> Any:
@@ -161,7 +183,9 @@ def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn
     camera[tags.IMAGE_SIZE] = [first.width, first.height]
     camera[tags.PIXEL_ASPECT] = first.fl_x / first.fl_y
     if any(not _same_intrinsics(view.camera, first) for view in views):
-        warn(f"{title}: its intrinsics change with the timestep; those of timestep {views[0].timestep} are used")
+        warn(
+            f"{title}: its intrinsics change with the timestep; those of timestep {views[0].timestep} are used"
+        )
     _set_pose(camera, views)
     _set_backgrounds(data, views, warn)
     return camera
@@ -170,7 +194,8 @@ def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn
 def set_intrinsics(data: Any, camera: Camera) -> None:
     """Give a Blender camera's data the focal lengths and principal point of `camera`.
 
-    Blender's shift is in image widths, right and up; a pixel's height is fl_x / fl_y times its width.
+    Blender's shift is in image widths, right and up; a pixel's height is fl_x / fl_y times its
+    width.
     """
     data.sensor_fit = "HORIZONTAL"
     data.sensor_width = SENSOR_WIDTH_MM
@@ -205,7 +230,9 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
     found = [view for view in views if view.image.is_file()]
     if len(found) < len(views):
         missing = next(view.image for view in views if not view.image.is_file())
-        warn(f"{missing}: is missing, and {len(views) - len(found) - 1} other images of {data.name}")
+        warn(
+            f"{missing}: is missing, and {len(views) - len(found) - 1} other images of {data.name}"
+        )
     if not found:
         return
     curves = compat.action_curves(data)
@@ -217,7 +244,8 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
         except RuntimeError as error:
             raise StgaError(f"{view.image}: cannot be read as an image") from error
         background.show_background_image = row == 0
-        # Visible from its own frame until the next image's; the first also before, the last also after.
+        # Visible from its own frame until the next image's; the first also before, the last also
+        # after.
         near = np.arange(max(row - 1, 0), min(row + 2, len(found)))
         path = f"background_images[{row}].show_background_image"
         write_curve(curves, path, 0, frames[near], (near == row).astype(float), "CONSTANT")
@@ -227,16 +255,19 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
 def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
     """Write the cameras at the current frame as transforms.json with pinholes; how many.
 
-    cameras: camera objects. Each is named after its object: footage has a folder, a video or an image of that name.
-    Axes are those of captures, y up, and the file says that a capture keeps this world: imported, it lies among the
-    cameras. Image size: the scene's resolution, or that of the capture that the camera was imported from.
-    Raises StgaError for a camera that is not perspective, is mirrored, or where there are none.
+    cameras: camera objects. Each is named after its object: footage has a folder, a video or an
+    image of that name. Axes are those of captures, y up, and the file says that a capture keeps
+    this world: imported, it lies among the cameras. Image size: the scene's resolution, or that of
+    the capture that the camera was imported from. Raises StgaError for a camera that is not
+    perspective, is mirrored, or where there are none.
     """
     entries = []
     for thing in cameras:
         if np.linalg.det(np.array(thing.evaluated_get(depsgraph).matrix_world.to_3x3())) < 0:
             raise StgaError(f"{thing.name}: is mirrored by a negative scale; apply the scale")
-        width, height = (int(n) for n in thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render))
+        width, height = (
+            int(n) for n in thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
+        )
         camera = render_camera(thing.evaluated_get(depsgraph), depsgraph, width, height)
         intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}
         entries.append(
@@ -256,7 +287,8 @@ def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
 
 
 def scene_camera(depsgraph: Any) -> Camera:
-    """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is perspective."""
+    """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is
+    perspective."""
     scene = depsgraph.scene
     camera = scene.camera.evaluated_get(depsgraph) if scene.camera else None
     return render_camera(camera, depsgraph, *image_size(scene.render))
@@ -265,7 +297,8 @@ def scene_camera(depsgraph: Any) -> Camera:
 def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
     """`count` cameras that start as the scene's and orbit the object `subject`, a head or splats.
 
-    angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there are none.
+    angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there
+    are none.
     """
     start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
     if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
@@ -277,7 +310,13 @@ def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) ->
     angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)
     # The cameras of the capture that it belongs to, for their positions.
     children = () if subject.parent is None else subject.parent.children_recursive
-    poses = [np.array(child.matrix_world, np.float64) for child in children if child.get(tags.KIND) == tags.CAMERA]
+    poses = [
+        np.array(child.matrix_world, np.float64)
+        for child in children
+        if child.get(tags.KIND) == tags.CAMERA
+    ]
     if not angle and poses:
-        angles = covered_angles([camera_from_gl(pose, 1, 1, 1, 1, 0, 0) for pose in poses], start, center, UP)
+        angles = covered_angles(
+            [camera_from_gl(pose, 1, 1, 1, 1, 0, 0) for pose in poses], start, center, UP
+        )
     return turntable(start, center, count, angles, UP)

@@ -1,4 +1,5 @@
-"""Visible splat objects as plain values: what both renderers, GPU and CPU, are given; numpy only."""
+"""Visible splat objects as plain values: what both renderers, GPU and CPU, are given; numpy
+only."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +18,8 @@ FROZEN_COLOR_SRGB = tuple(float(channel) for channel in linear_to_srgb(np.array(
 
 @dataclass(frozen=True)
 class DisplaySettings:
-    """A splat object's display settings, as the inputs of its modifier of the same names (`display.splat_nodes`)."""
+    """A splat object's display settings, as the inputs of its modifier of the same names
+    (`display.splat_nodes`)."""
 
     size: float = 1.0
     opacity_threshold: float = 0.0
@@ -29,7 +31,8 @@ class DisplaySettings:
 
 @dataclass(frozen=True, eq=False)
 class Relit:
-    """How a scene lights an avatar: its mesh (V, 3) as posed, light and casters, all in the avatar's space."""
+    """How a scene lights an avatar: its mesh (V, 3) as posed, light and casters, all in the
+    avatar's space."""
 
     relighter: Relighter
     mesh: np.ndarray
@@ -37,7 +40,8 @@ class Relit:
     casters: tuple[Caster, ...] = ()
 
     def splats(self, eye: np.ndarray) -> Splats:
-        """The avatar's splats in the colors of this light, seen from eye (3,) in the avatar's space."""
+        """The avatar's splats in the colors of this light, seen from eye (3,) in the avatar's
+        space."""
         splats = self.relighter.avatar.splats
         color = self.relighter.colors(self.mesh, eye, self.lighting, self.casters)
         sh = ((color - np.float32(0.5)) / np.float32(SH_C0))[:, None]
@@ -48,9 +52,9 @@ class Relit:
 class SceneLayer:
     """One visible splat object: its splats as stored, and how they are posed and displayed.
 
-    frames, to_world, antialiased: as in `PosedSplats`. frozen (F,) bool: triangles that the current frame does not
-    train; None where the settings do not ask for it, or where the frame has no selection. relit: None where colors are
-    as recorded.
+    frames, to_world, antialiased: as in `PosedSplats`. frozen (F,) bool: triangles that the current
+    frame does not train; None where the settings do not ask for it, or where the frame has no
+    selection. relit: None where colors are as recorded.
     """
 
     splats: Splats
@@ -62,8 +66,8 @@ class SceneLayer:
     relit: Relit | None = None
 
     def posed(self, eye: np.ndarray | None = None) -> PosedSplats:
-        """The same with the settings applied to the splats; eye (3,): the camera in the scene, which relit splats
-        need."""
+        """The same with the settings applied to the splats; eye (3,): the camera in the scene,
+        which relit splats need."""
         splats, settings = self.splats, self.settings
         if self.relit is not None:
             assert eye is not None
@@ -82,7 +86,9 @@ class SceneLayer:
             splats = replace(splats, sh=splats.sh[:, :1])
         if settings.size != 1:
             visible &= settings.size > 0
-            splats = replace(splats, log_scale=splats.log_scale + np.float32(np.log(max(settings.size, 1e-6))))
+            splats = replace(
+                splats, log_scale=splats.log_scale + np.float32(np.log(max(settings.size, 1e-6)))
+            )
         splats = splats if visible.all() else splats.rows(visible)
         return PosedSplats(splats, self.frames, self.to_world, self.antialiased)
 
@@ -92,5 +98,6 @@ class SceneLayer:
 
 
 def random_percentage(count: int) -> np.ndarray:
-    """(N,) in 0…100, the same in every call: a splat is shown where it is less than `DisplaySettings.percentage`."""
+    """(N,) in 0…100, the same in every call: a splat is shown where it is less than
+    `DisplaySettings.percentage`."""
     return np.random.default_rng(0).random(count) * 100

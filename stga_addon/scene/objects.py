@@ -16,10 +16,12 @@ log_warning: Warn = logging.getLogger(__name__).warning
 
 
 def capture_root(source: Path) -> Any:
-    """The Empty that is the parent of all imported from the folder or file `source`; created where there is none.
+    """The Empty that is the parent of all imported from the folder or file `source`; created where
+    there is none.
 
-    Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so that its children keep the capture's
-    own coordinates. It is in a collection of its own; both are called like the source.
+    Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so that its
+    children keep the capture's own coordinates. It is in a collection of its own; both are called
+    like the source.
     """
     existing = tags.find(tags.ROOT, source)
     if existing:
@@ -48,7 +50,8 @@ def collection_of(root: Any, kind: str) -> Any:
 
 
 def show_kind(root: Any, kind: str, view_layer: Any, show: bool) -> None:
-    """Show or hide the root's objects of this kind in viewports; renders and animation stay as they are."""
+    """Show or hide the root's objects of this kind in viewports; renders and animation stay as they
+    are."""
     for layer in layers_of(root, kind, view_layer):
         layer.hide_viewport = not show
 
@@ -67,8 +70,9 @@ def layers_of(root: Any, kind: str, view_layer: Any) -> list[Any]:
 def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> Any:
     """An object of this kind under `root`, with new `data`; returns it.
 
-    An object that exists from an earlier import is kept and given the new data, so that modifiers, parents and
-    constraints which refer to it go on working; its old data, keyframes and drivers are removed.
+    An object that exists from an earlier import is kept and given the new data, so that modifiers,
+    parents and constraints which refer to it go on working; its old data, keyframes and drivers are
+    removed.
     """
     obj = existing
     if obj is None:
@@ -125,7 +129,15 @@ def _purge(datas: Iterable[Any], actions: Iterable[Any]) -> None:
     for data in datas:
         if data is None or data.users:
             continue
-        left += [action for action in (_action(data), _action(getattr(data, "shape_keys", None))) if action]
-        left += [background.image for background in getattr(data, "background_images", ()) if background.image]
+        left += [
+            action
+            for action in (_action(data), _action(getattr(data, "shape_keys", None)))
+            if action
+        ]
+        left += [
+            background.image
+            for background in getattr(data, "background_images", ())
+            if background.image
+        ]
         bpy.data.batch_remove([data])
     bpy.data.batch_remove({block for block in left if not block.users})

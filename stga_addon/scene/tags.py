@@ -8,19 +8,24 @@ import bpy
 # Custom properties on objects.
 KIND = "stga_kind"  # one of the kinds below
 CAPTURE = "stga_capture"  # the capture's folder (or a motion's file), absolute
-FLAME_MODEL = "stga_flame_model"  # on the head: the FLAME model file the capture was opened with, or ""
+# on the head: the FLAME model file the capture was opened with, or ""
+FLAME_MODEL = "stga_flame_model"
 PRINCIPAL_POINT = "stga_principal_point"  # on the head: how cx and cy of the capture were read
 TIMESTEPS = "stga_timesteps"  # on the head: ints, ascending
-KEY_REGIONS = "stga_key_regions"  # on the head: names of the regions selected as a whole, one per line
-TRACKED = "stga_tracked"  # on the head: its capture can be solved again (`tracking.folder.is_tracked`)
-TRACKING_KEYS = "stga_tracking_keys"  # on the head: JSON, timestep -> parameters of the head posed by hand
+# on the head: names of the regions selected as a whole, one per line
+KEY_REGIONS = "stga_key_regions"
+# on the head: its capture can be solved again (`tracking.folder.is_tracked`)
+TRACKED = "stga_tracked"
+# on the head: JSON, timestep -> parameters of the head posed by hand
+TRACKING_KEYS = "stga_tracking_keys"
 CAMERA_INDEX = "stga_camera_index"  # on a camera
 IMAGE_SIZE = "stga_image_size"  # on a camera: width, height in pixels
 PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a pixel over its width
 CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
-RELIT_FRAME = "stga_relit_frame"  # on a splat object's mesh: the frame in whose light EEVEE and Cycles show it
+# on a splat object's mesh: the frame in whose light EEVEE and Cycles show it
+RELIT_FRAME = "stga_relit_frame"
 AVATAR = "stga_avatar"  # on splats that were made without the panel: the avatar's file
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
 WORLD = "stga_world"  # on splats of a run's world: their file
@@ -31,12 +36,14 @@ ROOT, HEAD, RIG, CAMERA, SPLATS = "root", "head", "rig", "camera", "splats"
 # Boolean face attributes of the head mesh, one per region.
 REGION_PREFIX = "stga_region_"
 
-# Vertex groups of the head, one per timestep; a vertex is selected from a weight of `region.SELECTED_WEIGHT` on.
+# Vertex groups of the head, one per timestep; a vertex is selected from a weight of
+# `region.SELECTED_WEIGHT` on.
 GROUP_PREFIX = "stga_"
 
 
 def group_name(timestep: int) -> str:
-    """Vertex group of a timestep's selection; unpadded, so that nodes can build the name from the frame."""
+    """Vertex group of a timestep's selection; unpadded, so that nodes can build the name from the
+    frame."""
     return f"{GROUP_PREFIX}{timestep}"
 
 
@@ -55,7 +62,8 @@ def mark(obj: Any, kind: str, capture: Path) -> None:
 
 
 def find(kind: str, capture: Path) -> list[Any]:
-    """All objects of a kind in the current scene that were made from the capture in folder `capture`.
+    """All objects of a kind in the current scene that were made from the capture in folder
+    `capture`.
 
     Objects linked from other files are left out: they cannot be edited here.
     """

@@ -1,8 +1,8 @@
 """Per-frame selections as vertex groups, which an artist can view, paint and scrub through.
 
-A vertex group holds vertices and a selection holds triangles: a triangle counts as selected when all three of its
-vertices are in the group. Writing a selection and reading it back therefore keeps every selected triangle and adds
-those whose three corners all belong to selected ones.
+A vertex group holds vertices and a selection holds triangles: a triangle counts as selected when
+all three of its vertices are in the group. Writing a selection and reading it back therefore keeps
+every selected triangle and adds those whose three corners all belong to selected ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,10 +19,12 @@ from .display.splat_attributes import FACE
 
 
 def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
-    """Replace the head's selection groups by one vertex group `stga_<timestep>` per timestep, weight 1 on its vertices.
+    """Replace the head's selection groups by one vertex group `stga_<timestep>` per timestep,
+    weight 1 on its vertices.
 
-    selection: timestep -> (F,) bool. A timestep that selects nothing gets no group. Other vertex groups stay. Raises
-    StgaError where the head is in edit mode or a selection does not have one entry per triangle.
+    selection: timestep -> (F,) bool. A timestep that selects nothing gets no group. Other vertex
+    groups stay. Raises StgaError where the head is in edit mode or a selection does not have one
+    entry per triangle.
     """
     if head.mode == "EDIT":
         raise StgaError(f"{head.name}: is in edit mode; leave it before the selection is written")
@@ -33,7 +35,8 @@ def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
                 f"{head.name}: the selection of timestep {timestep} has shape {selected.shape},"
                 f" expected ({len(faces)},), one entry per triangle"
             )
-    for group in reversed(list(head.vertex_groups)):  # last first: removing a group renumbers those after it
+    # last first: removing a group renumbers those after it
+    for group in reversed(list(head.vertex_groups)):
         if tags.group_timestep(group.name) is not None:
             head.vertex_groups.remove(group)
     vertices = {timestep: np.unique(faces[selection[timestep]]) for timestep in sorted(selection)}
@@ -48,7 +51,8 @@ def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
 def _fill_groups(mesh: Any, groups: Mapping[int, np.ndarray]) -> None:
     """Give the vertices of each group, by its index, a weight of 1.
 
-    For every vertex, `VertexGroup.add` looks for the group in the list of all: seconds for 1,000 groups.
+    For every vertex, `VertexGroup.add` looks for the group in the list of all: seconds for 1,000
+    groups.
     """
     whole = bmesh.new()
     try:
@@ -66,8 +70,8 @@ def _fill_groups(mesh: Any, groups: Mapping[int, np.ndarray]) -> None:
 def read_selection(head: Any) -> dict[int, np.ndarray]:
     """timestep -> (F,) bool of every timestep of the head, from its current selection groups.
 
-    A triangle is selected where each of its vertices has a weight of at least 0.5 in the timestep's group; a timestep
-    without a group selects nothing.
+    A triangle is selected where each of its vertices has a weight of at least 0.5 in the timestep's
+    group; a timestep without a group selects nothing.
     """
     head.update_from_editmode()
     by_timestep = {
@@ -83,16 +87,24 @@ def read_selection(head: Any) -> dict[int, np.ndarray]:
 
 
 def training_selection(head: Any) -> dict[int, np.ndarray] | None:
-    """`read_selection` for training; None where the head has no selection group, so that the trainer selects itself."""
+    """`read_selection` for training; None where the head has no selection group, so that the
+    trainer selects itself."""
     if any(tags.group_timestep(group.name) is not None for group in head.vertex_groups):
         return read_selection(head)
     return None
 
 
 def read_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """name -> (F,) bool of vertex groups of the head: the triangles whose corners all have a weight of 0.5 or more."""
+    """name -> (F,) bool of vertex groups of the head: the triangles whose corners all have a weight
+    of 0.5 or more."""
     head.update_from_editmode()
-    return dict(zip(names, _read_faces(head, [head.vertex_groups[name].index for name in names]), strict=True))
+    return dict(
+        zip(
+            names,
+            _read_faces(head, [head.vertex_groups[name].index for name in names]),
+            strict=True,
+        )
+    )
 
 
 def read_triangle_weights(head: Any, name: str) -> np.ndarray:
@@ -121,7 +133,8 @@ def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
 
 
 def splats_per_face(splat_object: Any, head: Any) -> np.ndarray | None:
-    """(F,) how many splats of the object each triangle of the head carries; None where it shows no avatar."""
+    """(F,) how many splats of the object each triangle of the head carries; None where it shows no
+    avatar."""
     attribute = splat_object.data.attributes.get(FACE) if splat_object is not None else None
     if attribute is None:
         return None
@@ -131,13 +144,18 @@ def splats_per_face(splat_object: Any, head: Any) -> np.ndarray | None:
 
 
 def _read_faces(head: Any, groups: list[int]) -> list[np.ndarray]:
-    """(F,) bool per group index: the triangles whose three vertices have the weight of a selected one."""
+    """(F,) bool per group index: the triangles whose three vertices have the weight of a selected
+    one."""
     faces = mesh_triangles(head.data)
-    return [vertices[faces].all(1) for vertices in _read_vertices(head.data, len(head.vertex_groups), groups)]
+    return [
+        vertices[faces].all(1)
+        for vertices in _read_vertices(head.data, len(head.vertex_groups), groups)
+    ]
 
 
 def _read_vertices(mesh: Any, group_count: int, groups: list[int]) -> np.ndarray:
-    """(len(groups), V) bool: which vertices have the weight of a selected one in the groups of these indices."""
+    """(len(groups), V) bool: which vertices have the weight of a selected one in the groups of
+    these indices."""
     members = [vertex.groups for vertex in mesh.vertices]
     counts = np.array([len(each) for each in members], np.int64)
     indices, weights = np.empty(counts.sum(), np.int32), np.empty(counts.sum(), np.float32)

@@ -42,22 +42,26 @@ def write_contact_sheet(
     errors: Errors,
     misfit: Errors | None = None,
 ) -> None:
-    """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views with the mesh. What
-    lies outside a view's mask is green.
+    """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views
+    with the mesh. What lies outside a view's mask is green.
 
-    cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3). misfit: region of the
-    face -> timestep -> share of the images that is not explained; it is charted below, and counts as much as the
-    reprojection error in which views are the worst.
-    Raises StgaError where the file cannot be written or a frame cannot be read.
+    cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3).
+    misfit: region of the face -> timestep -> share of the images that is not explained; it is
+    charted below, and counts as much as the reprojection error in which views are the worst. Raises
+    StgaError where the file cannot be written or a frame cannot be read.
     """
     misfit = misfit or {}
     every = {(name, t): px for name, own in errors.items() for t, px in own.items()}
-    unexplained = {t: max(own.get(t, 0.0) for own in misfit.values()) for _, t in every} if misfit else {}
+    unexplained = (
+        {t: max(own.get(t, 0.0) for own in misfit.values()) for _, t in every} if misfit else {}
+    )
     median = float(np.median(list(every.values()))) if every else 0.0
     usual = float(np.median(list(unexplained.values()))) if unexplained else 0.0
 
     def rank(view: tuple[str, int]) -> tuple[float, str, int]:
-        return every[view] / max(median, 1e-9) + unexplained.get(view[1], 0.0) / max(usual, 1e-9), *view
+        return every[view] / max(median, 1e-9) + unexplained.get(view[1], 0.0) / max(
+            usual, 1e-9
+        ), *view
 
     shown = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
     by_name = {camera.name: camera for camera in footage.cameras}
@@ -66,7 +70,13 @@ def write_contact_sheet(
         return _without_outside(camera.image(timestep), camera.mask(timestep))
 
     tiles = [
-        _tile(picture(by_name[name], t), cameras[name], mesh(t), faces, _caption(name, t, every, unexplained))
+        _tile(
+            picture(by_name[name], t),
+            cameras[name],
+            mesh(t),
+            faces,
+            _caption(name, t, every, unexplained),
+        )
         for name, t in shown
     ]
     rows = [(errors, median), (misfit, usual)] if misfit else [(errors, median)]
@@ -74,7 +84,9 @@ def write_contact_sheet(
         _sheet(_chart(rows, footage.timesteps), tiles, median).save(partial, format="PNG")
 
 
-def _caption(name: str, timestep: int, errors: Mapping[tuple[str, int], float], misfit: Mapping[int, float]) -> str:
+def _caption(
+    name: str, timestep: int, errors: Mapping[tuple[str, int], float], misfit: Mapping[int, float]
+) -> str:
     text = f"{name}, timestep {timestep}: {errors[name, timestep]:.1f} px"
     return f"{text}, {misfit[timestep]:.0%} unexplained" if timestep in misfit else text
 
@@ -102,45 +114,57 @@ def _tile_size() -> tuple[int, int]:
 
 
 def _chart(groups: Sequence[tuple[Errors, float]], timesteps: tuple[int, ...]) -> Image.Image:
-    """A row a camera or region (of many, those with the largest errors), and a column a timestep; groups: errors and
-    their median."""
+    """A row a camera or region (of many, those with the largest errors), and a column a timestep;
+    groups: errors and their median."""
     rows = [(name, own[name], median) for own, median in groups for name in _worst_rows(own)]
     width = COLUMNS * (_tile_size()[0] + GAP) - GAP
     chart = Image.new("RGB", (width, CELL_HEIGHT * len(rows)), BACKGROUND)
     for row, (name, errors, median) in enumerate(rows):
         _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
         cells = np.array([_error_color(errors.get(t), median) for t in timesteps], np.uint8)[None]
-        strip = Image.fromarray(cells).resize((width - NAME_WIDTH, CELL_HEIGHT - 1), Image.Resampling.NEAREST)
+        strip = Image.fromarray(cells).resize(
+            (width - NAME_WIDTH, CELL_HEIGHT - 1), Image.Resampling.NEAREST
+        )
         chart.paste(strip, (NAME_WIDTH, row * CELL_HEIGHT))
     return chart
 
 
 def _worst_rows(errors: Errors) -> list[str]:
     worst = {name: max(own.values(), default=0.0) for name, own in errors.items()}
-    return sorted(sorted(worst, key=lambda name: -worst[name])[:MAX_CHART_ROWS], key=list(errors).index)
+    return sorted(
+        sorted(worst, key=lambda name: -worst[name])[:MAX_CHART_ROWS], key=list(errors).index
+    )
 
 
 def _error_color(error: float | None, median: float) -> np.ndarray:
     if error is None:
         return np.array(NO_FACE)
     place = min(error / max(COLOR_SCALE_END * median, 1e-9), 1.0) * (len(ERROR_COLORS) - 1)
-    return np.array([np.interp(place, range(len(ERROR_COLORS)), channel) for channel in ERROR_COLORS.T])
+    return np.array(
+        [np.interp(place, range(len(ERROR_COLORS)), channel) for channel in ERROR_COLORS.T]
+    )
 
 
 # Views
 
 
-def _tile(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, caption: str) -> Image.Image:
+def _tile(
+    image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, caption: str
+) -> Image.Image:
     """The head in the image, beside it the same with the mesh; below, the caption."""
     left, top, right, bottom = head_box(camera, vertices)
     scale = min(PICTURE[0] / (right - left), PICTURE[1] / (bottom - top))
-    cropped = replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
+    cropped = replace(
+        camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top
+    )
     small = cropped.scaled(scale)
     size, box = (small.width, small.height), (left, top, right, bottom)
     picture = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC, box=box)
     tile = Image.new("RGB", _tile_size(), BACKGROUND)
     tile.paste(picture, (0, 0))
-    tile.paste(Image.fromarray(with_mesh(np.asarray(picture), vertices, faces, small)), (PICTURE[0], 0))
+    tile.paste(
+        Image.fromarray(with_mesh(np.asarray(picture), vertices, faces, small)), (PICTURE[0], 0)
+    )
     _write(tile, (0, PICTURE[1] + 2), caption)
     return tile
 
@@ -154,7 +178,8 @@ def _without_outside(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
 
 
 def head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the head in the image; the whole image where it lies outside."""
+    """Left, top, right and bottom of the head in the image; the whole image where it lies
+    outside."""
     pixels, depth = camera.project(vertices)
     whole = 0, 0, camera.width, camera.height
     if not (depth > 0).all():
@@ -162,11 +187,15 @@ def head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     margin = HEAD_MARGIN * (high - low)
     left, top = np.floor(np.maximum(low - margin, 0)).astype(int).tolist()
-    right, bottom = np.ceil(np.minimum(high + margin, [camera.width, camera.height])).astype(int).tolist()
+    right, bottom = (
+        np.ceil(np.minimum(high + margin, [camera.width, camera.height])).astype(int).tolist()
+    )
     return (left, top, right, bottom) if right > left and bottom > top else whole
 
 
-def with_mesh(picture: np.ndarray, vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+def with_mesh(
+    picture: np.ndarray, vertices: np.ndarray, faces: np.ndarray, camera: Camera
+) -> np.ndarray:
     """The mesh over the picture, colored by the direction of its surface."""
     triangle, weights = rasterize(vertices, faces, camera)
     seen = triangle >= 0

@@ -37,11 +37,13 @@ def correct_capture(
     span: int = DEFAULT_SPAN,
     report: Report = lambda stage, done, total: None,
 ) -> None:
-    """Solve a tracked FLAME capture again around timesteps whose parameters (E + 18,) are given: `keys`.
+    """Solve a tracked FLAME capture again around timesteps whose parameters (E + 18,) are given:
+    `keys`.
 
-    Always from what was tracked: a key that is no longer given leaves no trace. The timesteps' parameter files, the
-    report's errors and the contact sheet are replaced. Raises StgaError where `out` was not tracked here, or a file
-    that the correction starts from is damaged; nothing is written then.
+    Always from what was tracked: a key that is no longer given leaves no trace. The timesteps'
+    parameter files, the report's errors and the contact sheet are replaced. Raises StgaError where
+    `out` was not tracked here, or a file that the correction starts from is damaged; nothing is
+    written then.
     """
     capture = open_capture(out, model)
     if capture.flame is None:
@@ -51,7 +53,9 @@ def correct_capture(
     rows = _rows(out, timesteps, keys, solved.shape[1])
     seen = _with_landmarks(out, timesteps)
     footage = open_footage(out)
-    footage = replace(footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name)))
+    footage = replace(
+        footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name))
+    )
     found = _landmarks(out, footage, places, used)
     report("Solve", 0, 1)
     person = with_identity(capture.flame).model
@@ -75,11 +79,13 @@ def corrected(
     keys: Mapping[int, np.ndarray],
     span: int,
 ) -> np.ndarray:
-    """Parameters (T, E + 18) that pass through the keys (row -> (E + 18,)) and return to `solved` within `span` rows.
+    """Parameters (T, E + 18) that pass through the keys (row -> (E + 18,)) and return to `solved`
+    within `span` rows.
 
-    model: of the person, with expressions alone; trust (T,) from 0 to 1: in the rows as they were solved. The
-    change is smooth, and moves the surface points of rows that are trusted as little as possible; less and less so
-    towards a key, whose neighbors are likely to be wrong in the same way.
+    model: of the person, with expressions alone; trust (T,) from 0 to 1: in the rows as they were
+    solved. The change is smooth, and moves the surface points of rows that are trusted as little as
+    possible; less and less so towards a key, whose neighbors are likely to be wrong in the same
+    way.
     """
     from scipy.sparse import block_diag, csc_matrix, diags, kron
     from scipy.sparse.linalg import spsolve
@@ -94,9 +100,11 @@ def corrected(
         change[row] = values - solved[row]
     near = np.flatnonzero(distance <= span + 2)
     shares = trust[near] * (distance[near] / (span + 1)) ** 2
-    # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter for translation.
+    # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter
+    # for translation.
     blocks = [
-        share * _stiffness(model, points, solved[row]) + np.eye(size) for row, share in zip(near, shares, strict=True)
+        share * _stiffness(model, points, solved[row]) + np.eye(size)
+        for row, share in zip(near, shares, strict=True)
     ]
     matrix = block_diag(blocks)
     second = _second_differences(near)
@@ -112,25 +120,32 @@ def corrected(
 
 
 def _second_differences(rows: np.ndarray) -> Any:
-    """Sparse (D, N): the second differences of values at N ascending rows, of which three follow each other."""
+    """Sparse (D, N): the second differences of values at N ascending rows, of which three follow
+    each other."""
     from scipy.sparse import csc_matrix
 
     middle = 1 + np.flatnonzero((np.diff(rows)[:-1] == 1) & (np.diff(rows)[1:] == 1))
     number = np.arange(len(middle))
     at = np.tile(number, 3), np.concatenate([middle - 1, middle, middle + 1])
-    return csc_matrix((np.repeat([1.0, -2.0, 1.0], len(middle)), at), shape=(len(middle), len(rows)))
+    return csc_matrix(
+        (np.repeat([1.0, -2.0, 1.0], len(middle)), at), shape=(len(middle), len(rows))
+    )
 
 
 def _stiffness(model: FlameModel, points: SurfacePoints, parameters: np.ndarray) -> np.ndarray:
-    """(E + 18, E + 18): how much a change of each parameter moves the points, in standard deviations of a landmark."""
-    _, jacobian = PosedPoints(model, points).linearized(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+    """(E + 18, E + 18): how much a change of each parameter moves the points, in standard
+    deviations of a landmark."""
+    _, jacobian = PosedPoints(model, points).linearized(
+        parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
+    )
     flat = jacobian.reshape(-1, jacobian.shape[2]) / LANDMARK_SIGMA_M
     return np.asarray(flat.T @ flat)
 
 
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
-    """Timesteps and parameters (T, E + 18) as they were tracked: those of the file that the first correction writes,
-    or of the capture where there is none. Raises StgaError where the file is not of the capture's timesteps."""
+    """Timesteps and parameters (T, E + 18) as they were tracked: those of the file that the first
+    correction writes, or of the capture where there is none. Raises StgaError where the file is not
+    of the capture's timesteps."""
     path, timesteps = out / SOLVED_FILE, list(sequence.timesteps)
     if not os.path.lexists(path):
         return timesteps, np.stack([sequence.frame(timestep).parameters for timestep in timesteps])
@@ -150,29 +165,41 @@ def _are_parameters(values: np.ndarray | None, shape: tuple[int, ...]) -> bool:
     return bool((np.abs(values.astype(np.float64)) <= MAX_PARAMETER).all())  # not where one is NaN
 
 
-def _rows(out: Path, timesteps: list[int], keys: Mapping[int, np.ndarray], size: int) -> dict[int, np.ndarray]:
-    """The keys by row instead of timestep. Raises StgaError for one of no timestep, or that poses no head."""
+def _rows(
+    out: Path, timesteps: list[int], keys: Mapping[int, np.ndarray], size: int
+) -> dict[int, np.ndarray]:
+    """The keys by row instead of timestep. Raises StgaError for one of no timestep, or that poses
+    no head."""
     unknown = sorted(set(keys) - set(timesteps))
     if unknown:
         raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
     for timestep, values in keys.items():
         if not _are_parameters(values, (size,)):
             raise StgaError(f"key at timestep {timestep}: expected {(size,)} finite numbers")
-    return {timesteps.index(timestep): values.astype(np.float64) for timestep, values in keys.items()}
+    return {
+        timesteps.index(timestep): values.astype(np.float64) for timestep, values in keys.items()
+    }
 
 
 def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
     """(T,) bool. Raises StgaError where the report does not list the timesteps without."""
     report = read_json(out / REPORT_FILE)
     interpolated = report.get("interpolated") if isinstance(report, dict) else None
-    if not isinstance(interpolated, list) or not all(type(timestep) is int for timestep in interpolated):
-        raise StgaError(f"{out / REPORT_FILE}: interpolated: expected timesteps, got {shorten(interpolated)}")
+    if not isinstance(interpolated, list) or not all(
+        type(timestep) is int for timestep in interpolated
+    ):
+        raise StgaError(
+            f"{out / REPORT_FILE}: interpolated: expected timesteps, got {shorten(interpolated)}"
+        )
     without = set(interpolated)
     return np.array([timestep not in without for timestep in timesteps])
 
 
-def _landmarks(out: Path, footage: Footage, places: SurfacePoints, used: np.ndarray) -> dict[str, CameraLandmarks]:
-    """What the capture was tracked from. Raises StgaError where it fits neither the head model's file nor a face."""
+def _landmarks(
+    out: Path, footage: Footage, places: SurfacePoints, used: np.ndarray
+) -> dict[str, CameraLandmarks]:
+    """What the capture was tracked from. Raises StgaError where it fits neither the head model's
+    file nor a face."""
     found = read_landmarks(footage, out / LANDMARKS_FOLDER)
     check_count(found, places)
     if not any(own.confidence.any() and own.confidence[:, used].any() for own in found.values()):
@@ -181,21 +208,26 @@ def _landmarks(out: Path, footage: Footage, places: SurfacePoints, used: np.ndar
 
 
 def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
-    """Region -> timestep -> share of the images that is not explained, of a report; empty where it has none."""
+    """Region -> timestep -> share of the images that is not explained, of a report; empty where it
+    has none."""
     return {
-        name: {int(t): float(value) for t, value in own.items()} for name, own in report.get("image_misfit", {}).items()
+        name: {int(t): float(value) for t, value in own.items()}
+        for name, own in report.get("image_misfit", {}).items()
     }
 
 
 def _explained(out: Path, timesteps: Sequence[int]) -> np.ndarray:
-    """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain; 1 where that is not known."""
+    """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain; 1 where that
+    is not known."""
     try:
         misfit = _misfit(read_json(out / REPORT_FILE))
         worst = [max((own.get(t, 0.0) for own in misfit.values()), default=0.0) for t in timesteps]
         if not np.isfinite(worst).all():
             raise ValueError
     except (ValueError, TypeError, AttributeError) as error:
-        raise StgaError(f"{out / REPORT_FILE}: image_misfit: expected shares by region and timestep") from error
+        raise StgaError(
+            f"{out / REPORT_FILE}: image_misfit: expected shares by region and timestep"
+        ) from error
     return 1 - np.clip(worst, 0.0, 1.0)
 
 
@@ -211,17 +243,27 @@ def _report_errors(
     errors: dict[str, dict[int, float]] = {camera.name: {} for camera in footage.cameras}
     cameras = {camera.name: camera.camera for camera in footage.cameras}
     for name, own in found.items():
-        for timestep, pixels, confidence in zip(own.timesteps.tolist(), own.points, own.confidence, strict=True):
+        for timestep, pixels, confidence in zip(
+            own.timesteps.tolist(), own.points, own.confidence, strict=True
+        ):
             use = used & (confidence > 0)
             if use.any():
                 head = places.on(capture.mesh(timestep), capture.faces)
                 distance = np.linalg.norm(cameras[name].project(head[use])[0] - pixels[use], axis=1)
                 errors[name][timestep] = float(np.median(distance))
     report = read_json(out / REPORT_FILE)
-    rounded = {name: {str(t): round(px, 3) for t, px in own.items()} for name, own in errors.items()}
+    rounded = {
+        name: {str(t): round(px, 3) for t, px in own.items()} for name, own in errors.items()
+    }
     every = [px for own in errors.values() for px in own.values()]
     write_json(
         out / REPORT_FILE,
-        {**report, "median_reprojection_px": round(float(np.median(every)), 3), "reprojection_px": rounded},
+        {
+            **report,
+            "median_reprojection_px": round(float(np.median(every)), 3),
+            "reprojection_px": rounded,
+        },
     )
-    write_contact_sheet(out / SHEET_FILE, footage, cameras, capture.mesh, capture.faces, errors, _misfit(report))
+    write_contact_sheet(
+        out / SHEET_FILE, footage, cameras, capture.mesh, capture.faces, errors, _misfit(report)
+    )

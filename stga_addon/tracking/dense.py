@@ -1,8 +1,9 @@
-"""Dense tracking: expression and pose that explain the images by the head's own texture (analysis by synthesis).
+"""Dense tracking: expression and pose that explain the images by the head's own texture (analysis
+by synthesis).
 
-Landmarks fail where faces do most; the skin between them does not. As in Face2Face (Thies et al. 2016), the texture is
-averaged over cameras and timesteps of the fit so far, and every timestep is moved by Gauss–Newton until the texture,
-under that view's lighting, looks like the images.
+Landmarks fail where faces do most; the skin between them does not. As in Face2Face (Thies et al.
+2016), the texture is averaged over cameras and timesteps of the fit so far, and every timestep is
+moved by Gauss–Newton until the texture, under that view's lighting, looks like the images.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,47 +28,55 @@ MIN_TIMESTEPS = 6
 SETTLED_WEIGHT = 0.1
 """Least weight of a timestep in the texture of a settled take."""
 TEXTURE_TIMESTEPS, MAX_CAMERAS = 32, 8
-"""Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are compared."""
+"""Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are
+compared."""
 TEXTURE_PART_TIMESTEPS, PART_TIMESTEPS = 12, 24
 """At most, of the parts in which a texture's timesteps, and then the whole take, are worked on."""
 LANDMARK_SHARE, INNER_SHARE = 0.01, 0.3
-"""Weight of landmarks beside the images; of those on eyeballs, whose reflections no texture shows."""
+"""Weight of landmarks beside the images; of those on eyeballs, whose reflections no texture
+shows."""
 REGION_SCALE_M = 0.004
-"""Median distance of a region's landmarks from the head at which the region's weight has fallen to a quarter."""
+"""Median distance of a region's landmarks from the head at which the region's weight has fallen to
+a quarter."""
 DISAGREEMENT_M = 0.0015
-"""The same, of the distance beyond that at most timesteps, for landmarks of which a fit begins again."""
+"""The same, of the distance beyond that at most timesteps, for landmarks of which a fit begins
+again."""
 START_STEPS, START_LEVEL = ((3, 2), (2, 2)), 2
-"""Levels of the pyramid and Gauss–Newton steps in each, for every start; and the level in which starts are compared."""
+"""Levels of the pyramid and Gauss–Newton steps in each, for every start; and the level in which
+starts are compared."""
 FINE_STEPS, EVIDENCE_LEVEL = ((2, 3), (1, 16), (0, 3)), 1
-"""The same for the best start; and the level in which points that were not fitted tell whether it is better."""
+"""The same for the best start; and the level in which points that were not fitted tell whether it
+is better."""
 LAST_STEPS, LAST_ROUNDS = ((1, 12), (0, 4)), 2
-"""The same for its result where other points are visible than at the start, as in a mouth that opens."""
+"""The same for its result where other points are visible than at the start, as in a mouth that
+opens."""
 OPENINGS_M = 0.008, 0.016
 """By which the chin is moved for further starts."""
 USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
-"""Other starts are tried where the first leaves a region of the face worse explained, by this factor, than it is at
-this share of the texture's timesteps."""
+"""Other starts are tried where the first leaves a region of the face worse explained, by this
+factor, than it is at this share of the texture's timesteps."""
 DAMPING = 1e-3
 CONVERGED_STEP_M = 1e-4
 """Root mean square of the points' motion in a step, after which a level is done."""
 MAX_TURN = 0.3
 """Of a joint in one step, in radians."""
 SETTLED_GAIN = 0.01
-"""By which a region's misfit has to fall for a settled timestep to be changed: below it, the surface that several
-cameras see is the better evidence."""
+"""By which a region's misfit has to fall for a settled timestep to be changed: below it, the
+surface that several cameras see is the better evidence."""
 KEPT_STIFFNESS = 100.0
 """Of a timestep that keeps what it had, in the stiffness of the smoothness over time."""
 MAX_GROWTH, SMALL_MISS_M, MIN_REGION_GAIN = 1.5, 0.001, 0.1
-"""Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it: beyond, landmarks are
-the better evidence there. A forehead in wrinkles looks a little more like lowered brows than like raised ones."""
+"""Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it:
+beyond, landmarks are the better evidence there. A forehead in wrinkles looks a little more like
+lowered brows than like raised ones."""
 MAX_UPPER_MISS_M = 0.01
 """By which landmarks of the upper face may be missed at most: no brow is raised by more."""
 
 
 @dataclass(frozen=True)
 class DenseFit:
-    """fit; landmarks, of which those in regions that disagree are moved to the fit; how badly the regions (R,) are
-    explained at each timestep."""
+    """fit; landmarks, of which those in regions that disagree are moved to the fit; how badly the
+    regions (R,) are explained at each timestep."""
 
     fit: HeadFit
     landmarks: Mapping[int, TimestepLandmarks]
@@ -76,7 +85,8 @@ class DenseFit:
 
 @dataclass(frozen=True)
 class _Shot:
-    """What is known of a timestep: views, triangulated landmarks, where the fit so far is, and in which regions of the
+    """What is known of a timestep: views, triangulated landmarks, where the fit so far is, and in
+    which regions of the
     face (R,) landmarks are the better evidence."""
 
     views: Sequence[PyramidView]
@@ -87,8 +97,8 @@ class _Shot:
 
 @dataclass(frozen=True)
 class _Solved:
-    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit, distances of the landmarks (L,), and
-    whether it is better than the start."""
+    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit, distances of the
+    landmarks (L,), and whether it is better than the start."""
 
     values: np.ndarray
     visible: np.ndarray
@@ -105,13 +115,15 @@ def fit_dense(
     settled: bool = False,
     report: Report = lambda stage, done, total: None,
 ) -> DenseFit | None:
-    """Expression and pose of every timestep from the images; None where the take is too short for it.
+    """Expression and pose of every timestep from the images; None where the take is too short for
+    it.
 
-    Each timestep starts where the fit is, and where that explains the images badly, where optical flow carries its
-    neighbor and with the mouth opened wider. It keeps what it had unless points are explained better that were not
-    fitted. Parts of the take are solved at once, by helping processes; no timestep has a neighbor in another part.
-    settled: the fit is one of images already; every timestep counts in the texture, not only those at rest, and the
-    take is followed backwards.
+    Each timestep starts where the fit is, and where that explains the images badly, where optical
+    flow carries its neighbor and with the mouth opened wider. It keeps what it had unless points
+    are explained better that were not fitted. Parts of the take are solved at once, by helping
+    processes; no timestep has a neighbor in another part.
+    settled: the fit is one of images already; every timestep counts in the texture, not only those
+    at rest, and the take is followed backwards.
     """
     timesteps = sorted(take.landmarks)
     if len(timesteps) < MIN_TIMESTEPS:
@@ -119,44 +131,60 @@ def fit_dense(
     chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
     head, total = DenseHead(fit.head, take.places, take.reliable), 2 * len(chosen) + len(timesteps)
 
-    def in_parts(work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False) -> list:
+    def in_parts(
+        work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False
+    ) -> list:
         every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
         stage = "Refinement" if settled else "Dense tracking"
         return helpers.map(work, every, lambda steps: report(stage, before + steps, total), keep)
 
-    weights = np.maximum(head.rest([head.reduced(fit.parameters[t]) for t in chosen]), SETTLED_WEIGHT if settled else 0)
+    weights = np.maximum(
+        head.rest([head.reduced(fit.parameters[t]) for t in chosen]),
+        SETTLED_WEIGHT if settled else 0,
+    )
     some = parts_of(chosen, TEXTURE_PART_TIMESTEPS)
     rows = np.split(weights, np.cumsum([len(part) for part in some])[:-1])
     sampled = in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0)
     texture = average_texture([sample for part in sampled for sample in part])
-    coarse = np.concatenate(in_parts(_started_part, [(part, texture) for part in some], len(chosen)))
+    coarse = np.concatenate(
+        in_parts(_started_part, [(part, texture) for part in some], len(chosen))
+    )
     usual = np.quantile(coarse, USUAL_QUANTILE, axis=0)
     parts = [(part, texture, usual, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
     found = in_parts(_solved_part, parts, 2 * len(chosen), keep=True)
     solved = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
     terms = list(zip(solved["matrix"], solved["right"], strict=True))
     smooth = smooth_take(head.head, solved["values"], terms, fit.ordered)
-    moved = replace(fit, parameters={t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)})
+    moved = replace(
+        fit, parameters={t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)}
+    )
     landmarks = _agreeing(head, moved, take, solved["missed"], solved["better"])
     return DenseFit(moved, landmarks, dict(zip(timesteps, solved["misfit"], strict=True)))
 
 
-def _sampled_part(fit: HeadFit, take: RecordedTake, weights: np.ndarray, step: Step) -> list[Sample]:
+def _sampled_part(
+    fit: HeadFit, take: RecordedTake, weights: np.ndarray, step: Step
+) -> list[Sample]:
     """What the views of a part's timesteps show; weights (T, N) of the points at each."""
     solver, found = _Solver(fit, take), []
     for timestep, weight in zip(sorted(take.landmarks), weights, strict=True):
         shot = solver.shot(timestep)
-        found += samples(solver.head, shot.views, shot.start, weight * solver.visible(shot, shot.start))
+        found += samples(
+            solver.head, shot.views, shot.start, weight * solver.visible(shot, shot.start)
+        )
         step()
     return found
 
 
 def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> np.ndarray:
-    """(T, R) how badly the regions are explained in coarse images from where the fit is, at the timesteps of a part."""
+    """(T, R) how badly the regions are explained in coarse images from where the fit is, at the
+    timesteps of a part."""
     solver, found = _Solver(fit, take), []
     for timestep in sorted(take.landmarks):
         shot = solver.shot(timestep)
-        found.append(solver.started(shot, texture, shot.start, solver.visible(shot, shot.start))[1].regions)
+        found.append(
+            solver.started(shot, texture, shot.start, solver.visible(shot, shot.start))[1].regions
+        )
         step()
     return np.stack(found)
 
@@ -164,7 +192,8 @@ def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step
 def _solved_part(
     fit: HeadFit, take: RecordedTake, texture: Texture, usual: np.ndarray, settled: bool, step: Step
 ) -> dict[str, np.ndarray]:
-    """The timesteps of a part, solved one from the other; by name, T of what `_Solved` has of each."""
+    """The timesteps of a part, solved one from the other; by name, T of what `_Solved` has of
+    each."""
     solver = _Solver(fit, take, SETTLED_GAIN if settled else 0.0)
     before: tuple[_Shot, _Solved] | None = None
     solved: list[_Solved] = []
@@ -200,24 +229,34 @@ class _Solver:
         center, views = self.head.positions(start).mean(0), []
         for camera, image in self._take.images(timestep, MAX_CAMERAS):
             own = world.camera(camera)
-            views.append(PyramidView(camera.world_to_camera.tobytes(), own, pyramid(own, image, center)))
+            views.append(
+                PyramidView(camera.world_to_camera.tobytes(), own, pyramid(own, image, center))
+            )
         model, places, reliable = self._fit.head.model, self._take.places, self._take.reliable
         seen = self._visibility.weighted(self._take.landmarks[timestep], parameters, world)
         found = triangulated(seen, reliable, places.on(model.v_template, model.faces), world.scale)
-        return _Shot(views, observed_landmarks(found, world, reliable), start, np.zeros(len(REGIONS), bool))
+        return _Shot(
+            views, observed_landmarks(found, world, reliable), start, np.zeros(len(REGIONS), bool)
+        )
 
     def visible(self, shot: _Shot, values: np.ndarray) -> np.ndarray:
         """Visibility (C, N) from the cameras of a timestep, of a head with these parameters."""
         return self.head.visibility(values, [view.camera for view in shot.views])
 
-    def solve(self, shot: _Shot, texture: Texture, before: tuple[_Shot, _Solved] | None, usual: np.ndarray) -> _Solved:
+    def solve(
+        self, shot: _Shot, texture: Texture, before: tuple[_Shot, _Solved] | None, usual: np.ndarray
+    ) -> _Solved:
         """The parameters that explain a timestep best; before: another timestep and its result."""
         visible = self.visible(shot, shot.start)
         best, error = self.started(shot, texture, shot.start, visible)
         if (error.regions > USUAL_FACTOR * usual).any():
             others = [self.head.opened(shot.start, distance) for distance in OPENINGS_M]
             if before is not None:
-                others.append(flow_start(self.head, before[0].views, before[1].visible, before[1].values, shot.views))
+                others.append(
+                    flow_start(
+                        self.head, before[0].views, before[1].visible, before[1].values, shot.views
+                    )
+                )
             for other in others:
                 values, found = self.started(shot, texture, other, visible)
                 if found.all < error.all:
@@ -229,7 +268,9 @@ class _Solver:
             best, visible = self._refined(shot, texture, best)
         return self._judged(shot, texture, best, visible)
 
-    def _judged(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray) -> _Solved:
+    def _judged(
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
+    ) -> _Solved:
         """The result, or the start where the result is not better."""
         by_images = self._by_images(shot, visible)
         old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, values))
@@ -240,21 +281,32 @@ class _Solver:
             values = shot.start
             stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
             terms = stiff, -prior_terms(self.head.head, values)[1]  # which the prior does not move
-        found, missed = self._evidence(shot, texture, values, visible), self._missed(shot.landmarks, values)
+        found, missed = (
+            self._evidence(shot, texture, values, visible),
+            self._missed(shot.landmarks, values),
+        )
         return _Solved(values, visible, terms, found, missed, better)
 
-    def _evidence(self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray) -> Misfit:
+    def _evidence(
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
+    ) -> Misfit:
         """How badly the points that are not fitted are explained."""
-        return misfit(self.head, shot.views, visible, texture, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
+        return misfit(
+            self.head, shot.views, visible, texture, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL
+        )
 
     def _by_images(self, shot: _Shot, visible: np.ndarray) -> np.ndarray:
         """Visibility (C, N), 0 for points in regions where landmarks are the better evidence."""
         return np.where(shot.by_landmarks[self.head.region], 0.0, visible)
 
-    def _astray(self, shot: _Shot, texture: Texture, visible: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """(R,) bool: regions whose landmarks are missed by much more, though they are not explained clearly better; and
-        those of the upper face that went farther from them than it moves."""
-        old, new = (self._evidence(shot, texture, own, visible).regions for own in (shot.start, values))
+    def _astray(
+        self, shot: _Shot, texture: Texture, visible: np.ndarray, values: np.ndarray
+    ) -> np.ndarray:
+        """(R,) bool: regions whose landmarks are missed by much more, though they are not explained
+        clearly better; and those of the upper face that went farther from them than it moves."""
+        old, new = (
+            self._evidence(shot, texture, own, visible).regions for own in (shot.start, values)
+        )
         was, now = (self._missed(shot.landmarks, own) for own in (shot.start, values))
         astray = np.zeros(len(REGIONS), bool)
         for region in range(len(REGIONS)):
@@ -265,8 +317,11 @@ class _Solver:
             astray[region] |= region >= UPPER_FACE and after > before + MAX_UPPER_MISS_M
         return astray
 
-    def _refined(self, shot: _Shot, texture: Texture, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters after the steps in fine images, and the visibility (C, N) of which they are."""
+    def _refined(
+        self, shot: _Shot, texture: Texture, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters after the steps in fine images, and the visibility (C, N) of which they
+        are."""
         visible = self.visible(shot, values)
         values = self._descended(shot, texture, values, visible, FINE_STEPS)
         for _ in range(LAST_ROUNDS):
@@ -281,10 +336,17 @@ class _Solver:
     ) -> tuple[np.ndarray, Misfit]:
         """Parameters after the steps in coarse images, and how badly these are explained."""
         values = self._descended(shot, texture, values, visible, START_STEPS)
-        return values, misfit(self.head, shot.views, visible, texture, values, START_LEVEL, START_LEVEL)
+        return values, misfit(
+            self.head, shot.views, visible, texture, values, START_LEVEL, START_LEVEL
+        )
 
     def _descended(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, plan: Sequence[tuple[int, int]]
+        self,
+        shot: _Shot,
+        texture: Texture,
+        values: np.ndarray,
+        visible: np.ndarray,
+        plan: Sequence[tuple[int, int]],
     ) -> np.ndarray:
         """Parameters after up to so many steps in each level of the plan."""
         for level, steps in plan:
@@ -298,7 +360,8 @@ class _Solver:
     def _step(
         self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int
     ) -> tuple[np.ndarray, float]:
-        """A damped Gauss–Newton step, and the root mean square in meters of what it moves the points by."""
+        """A damped Gauss–Newton step, and the root mean square in meters of what it moves the
+        points by."""
         at, jacobian = self.head.linearized(values, level)
         matrix, right = self._terms(shot, texture, values, visible, level, at, jacobian)
         precision, pull = prior_terms(self.head.head, values)
@@ -316,7 +379,9 @@ class _Solver:
 
         at (M, 3), jacobian (M, 3, K + 18): of the level's points.
         """
-        curvature, slope = photo_term(self.head, shot.views, self._by_images(shot, visible), texture, values, at, level)
+        curvature, slope = photo_term(
+            self.head, shot.views, self._by_images(shot, visible), texture, values, at, level
+        )
         share = len(self.head.rows[0]) / len(at)  # a level weighs the same with fewer points
         flat = jacobian.reshape(-1, len(values))
         weighted = replace(shot.landmarks, weight=self._landmark_weight(shot, values))
@@ -326,8 +391,8 @@ class _Solver:
         ), right + share * flat.T @ slope.ravel()
 
     def _landmark_weight(self, shot: _Shot, values: np.ndarray) -> np.ndarray:
-        """(L,): whole where landmarks are the better evidence; of other regions whose landmarks are far from the head,
-        less."""
+        """(L,): whole where landmarks are the better evidence; of other regions whose landmarks are
+        far from the head, less."""
         missed, weight = self._missed(shot.landmarks, values), shot.landmarks.weight.copy()
         for region in np.flatnonzero(~shot.by_landmarks):
             own = self.head.landmark_region == region
@@ -337,20 +402,27 @@ class _Solver:
         return np.asarray(weight)
 
     def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
-        """(L,) distance in meters of the landmarks from the head, as far as the cameras determine it."""
-        away = self.head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:]) - landmarks.position
+        """(L,) distance in meters of the landmarks from the head, as far as the cameras determine
+        it."""
+        away = (
+            self.head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+            - landmarks.position
+        )
         return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", landmarks.root, away), axis=1))
 
 
 def _agreeing(
     head: DenseHead, fit: HeadFit, take: RecordedTake, missed: np.ndarray, better: np.ndarray
 ) -> dict[int, TimestepLandmarks]:
-    """The take's landmarks, moved towards the fit in regions where they miss it by more than they mostly do.
+    """The take's landmarks, moved towards the fit in regions where they miss it by more than they
+    mostly do.
 
     missed (T, L), better (T,): of `_Solved` at the take's timesteps.
     """
     regions = [(head.landmark_region == number) & take.reliable for number in range(len(REGIONS))]
-    medians = [np.median(missed[:, use], axis=1) if use.any() else np.zeros(len(missed)) for use in regions]
+    medians = [
+        np.median(missed[:, use], axis=1) if use.any() else np.zeros(len(missed)) for use in regions
+    ]
     by_region = np.stack(medians, axis=1)
     beyond = np.maximum(by_region - np.median(by_region, axis=0), 0) * better[:, None]
     moved = {}

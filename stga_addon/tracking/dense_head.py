@@ -1,4 +1,5 @@
-"""The points of a person's face that dense tracking compares with images: positions, normals, visibility, regions."""
+"""The points of a person's face that dense tracking compares with images: positions, normals,
+visibility, regions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,8 +17,8 @@ from .seen_surface import large_parts, surface_points
 from .solve import prior_terms
 
 HEAD_POINTS = 5000
-"""Points over the whole head, of which those near landmarks are used; the landmarks' places come on top, because they
-are dense at eyes and lips."""
+"""Points over the whole head, of which those near landmarks are used; the landmarks' places come on
+top, because they are dense at eyes and lips."""
 FACE_RADIUS_M = 0.035
 """Distance from the landmarks beyond which there is hair and clothes."""
 HELD_OUT = 8
@@ -39,21 +40,26 @@ MIN_COSINE = 0.25
 VISIBILITY_SIDE_PX = 110
 """Size of the depth image that hidden points are found in."""
 DIRECTIONS, OPENING_STEP_M = 8, 0.008
-"""Steps of a direction's coordinates, and of the chin's height, within which a head hides the same of itself."""
+"""Steps of a direction's coordinates, and of the chin's height, within which a head hides the same
+of itself."""
 REST_QUANTILE, REST_SCALE_M = 0.2, 0.002
-"""A region is at rest when it moves as little as at this share of the timesteps, within that distance."""
+"""A region is at rest when it moves as little as at this share of the timesteps, within that
+distance."""
 HELD_OUT_LEVEL = len(LEVELS_M)
 """Stands for the points that are not fitted, where a level is asked for."""
 
 
 class DenseHead:
-    """N points on a person's face. Parameters (K + 18,) are those of `HeadFit` without components that move nothing."""
+    """N points on a person's face. Parameters (K + 18,) are those of `HeadFit` without components
+    that move nothing."""
 
     def __init__(self, person: HeadModel, places: SurfacePoints, reliable: np.ndarray) -> None:
         model = person.model
         self.active = np.flatnonzero(np.abs(model.shapedirs).max(axis=(0, 1)) > 0)
         dirs = np.ascontiguousarray(model.shapedirs[:, :, self.active])
-        names = tuple(model.expression_names[k] for k in self.active) if model.expression_names else ()
+        names = (
+            tuple(model.expression_names[k] for k in self.active) if model.expression_names else ()
+        )
         self.head = replace(person, model=replace(model, shapedirs=dirs, expression_names=names))
         self.count = model.n_expression
         self.landmarks = PosedPoints(self.head.model, places)
@@ -111,8 +117,8 @@ class DenseHead:
         return light_basis(_unit(posed.triangle_normals(*split(values)) + bend))
 
     def visibility(self, values: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-        """(C, N) squared cosine at which each camera sees each point, 0 where the head hides it; kept by direction and
-        by how far the mouth is open."""
+        """(C, N) squared cosine at which each camera sees each point, 0 where the head hides it;
+        kept by direction and by how far the mouth is open."""
         at, turn = self.positions(values), head_rotation(values)
         opening = round(self.opening(values) / OPENING_STEP_M)
         seen = []
@@ -130,17 +136,25 @@ class DenseHead:
         vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
         cosine = facing(camera, at, _unit(self.points.on(vertex_normals(vertices, faces), faces)))
         small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
-        return np.where((cosine > MIN_COSINE) & in_sight(small, vertices, faces, at), cosine**2, 0.0)
+        return np.where(
+            (cosine > MIN_COSINE) & in_sight(small, vertices, faces, at), cosine**2, 0.0
+        )
 
     def opening(self, values: np.ndarray) -> float:
         """Height in meters of the upper face above the chin."""
         height = (self.landmarks.positions(*split(values)) @ head_rotation(values))[:, 1]
-        return float(height[self._fixed].mean() - height[self._chin].mean()) if self._fixed.any() else 0.0
+        return (
+            float(height[self._fixed].mean() - height[self._chin].mean())
+            if self._fixed.any()
+            else 0.0
+        )
 
     def opened(self, values: np.ndarray, distance: float) -> np.ndarray:
         """Parameters whose chin lies so many meters lower, with the upper face where it is."""
         _, jacobian = self.landmarks.linearized(*split(values))
-        wanted = np.where(self._chin[:, None], distance * CHIN_DIRECTION @ head_rotation(values).T, 0.0)
+        wanted = np.where(
+            self._chin[:, None], distance * CHIN_DIRECTION @ head_rotation(values).T, 0.0
+        )
         use = self._chin | self._fixed
         moving = jacobian[use].reshape(-1, len(values)) / OPENING_SIGMA_M
         moving[:, -RIGID_SIZE : -RIGID_SIZE + 3] = moving[:, -3:] = 0  # the head stays
@@ -148,14 +162,19 @@ class DenseHead:
         return values + np.linalg.solve(matrix, moving.T @ wanted[use].ravel() / OPENING_SIGMA_M)
 
     def rest(self, take: Sequence[np.ndarray]) -> np.ndarray:
-        """(T, N) weights of the timesteps' parameters for a point's texture: 1 where its region is at rest, where
-        detectors are mostly right, and low where it is moved far."""
+        """(T, N) weights of the timesteps' parameters for a point's texture: 1 where its region is
+        at rest, where detectors are mostly right, and low where it is moved far."""
         moved = []
         for values in take:
             still = values.copy()
             still[:-RIGID_SIZE], still[-RIGID_SIZE + 3 : -3] = 0, 0
             distance = ((self.positions(values) - self.positions(still)) ** 2).sum(1)
-            moved.append([np.sqrt(distance[self.region == number].mean()) for number in np.unique(self.region)])
+            moved.append(
+                [
+                    np.sqrt(distance[self.region == number].mean())
+                    for number in np.unique(self.region)
+                ]
+            )
         beyond = np.maximum(moved - np.quantile(moved, REST_QUANTILE, axis=0), 0)
         return robust(beyond, REST_SCALE_M)[:, np.searchsorted(np.unique(self.region), self.region)]
 
@@ -173,7 +192,9 @@ def _face_points(head: HeadModel, places: SurfacePoints, used: np.ndarray) -> Su
     points, own = surface_points(head, HEAD_POINTS), _some(places, np.flatnonzero(used))
     distance, _ = cKDTree(own.on(template, faces)).query(points.on(template, faces))
     near = _some(points, np.flatnonzero(distance < FACE_RADIUS_M))
-    return SurfacePoints(np.concatenate([near.face, own.face]), np.concatenate([near.barycentric, own.barycentric]))
+    return SurfacePoints(
+        np.concatenate([near.face, own.face]), np.concatenate([near.barycentric, own.barycentric])
+    )
 
 
 def _some(points: SurfacePoints, rows: np.ndarray) -> SurfacePoints:

@@ -1,4 +1,5 @@
-"""What dense tracking minimizes at one timestep: the difference of images from the texture, and optical flow."""
+"""What dense tracking minimizes at one timestep: the difference of images from the texture, and
+optical flow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +8,17 @@ from typing import Any
 import numpy as np
 
 from ..capture.camera import Camera
-from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, Level, Sample, Texture, fitted_light, robust, sampled, shading
+from .appearance import (
+    CHANNEL_WEIGHTS,
+    NOISE_LEVELS,
+    Level,
+    Sample,
+    Texture,
+    fitted_light,
+    robust,
+    sampled,
+    shading,
+)
 from .dense_head import REGIONS, DenseHead
 from .solve import prior_terms
 
@@ -16,14 +27,16 @@ POINT_SHARE = 0.25
 OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
 """By level: squared difference in NOISE_LEVELS at which a point is explained by half."""
 FLOW_LEVEL, FLOW_POINTS, FLOW_ITERATIONS = 1, 2, 4
-"""Pyramid level of the images of optical flow, level of the points that it moves, and Gauss–Newton steps."""
+"""Pyramid level of the images of optical flow, level of the points that it moves, and Gauss–Newton
+steps."""
 FLOW_SHARE, FLOW_SCALE_PX = 0.3, 2.0
 """Weight of a point's flow of 1 pixel, and the distance in pixels beyond which it is an outlier."""
 
 
 @dataclass(frozen=True)
 class PyramidView:
-    """One camera's image at a timestep: key and pose of the camera in the capture's world, and pyramid."""
+    """One camera's image at a timestep: key and pose of the camera in the capture's world, and
+    pyramid."""
 
     key: bytes
     camera: Camera
@@ -32,13 +45,16 @@ class PyramidView:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How badly points are explained, from 0 to 1: over all, and by region (R,); 0 where no point is seen."""
+    """How badly points are explained, from 0 to 1: over all, and by region (R,); 0 where no point
+    is seen."""
 
     all: float
     regions: np.ndarray
 
 
-def samples(head: DenseHead, views: Sequence[PyramidView], values: np.ndarray, weight: np.ndarray) -> list[Sample]:
+def samples(
+    head: DenseHead, views: Sequence[PyramidView], values: np.ndarray, weight: np.ndarray
+) -> list[Sample]:
     """What the views show of the head's points; weight (C, N)."""
     at, basis = head.positions(values), head.light_basis(values)
     found = []
@@ -48,7 +64,9 @@ def samples(head: DenseHead, views: Sequence[PyramidView], values: np.ndarray, w
             sampled([level.channels], pixels)[0].astype(np.float64)
             for level, (pixels, _) in zip(view.levels, projected, strict=True)
         ]
-        found.append(Sample(view.key, levels, basis, own * inside(view.levels[0].camera, *projected[0])))
+        found.append(
+            Sample(view.key, levels, basis, own * inside(view.levels[0].camera, *projected[0]))
+        )
     return found
 
 
@@ -56,7 +74,8 @@ def photo_term(
     head: DenseHead, views: Sequence[PyramidView], visible: np.ndarray, texture: Texture, values: np.ndarray,
     at: np.ndarray, level: int,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Gauss–Newton terms of the points `at` (M, 3) of a level: H (M, 3, 3) and b (M, 3) by their positions."""
+    """Gauss–Newton terms of the points `at` (M, 3) of a level: H (M, 3, 3) and b (M, 3) by their
+    positions."""
     matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
     basis, rows = head.light_basis(values, level), head.rows[level]
     for view, seen in zip(views, visible, strict=True):
@@ -68,12 +87,23 @@ def photo_term(
             continue
         shown, by_x, by_y = sampled([own.channels, *own.gradient], pixels[near])
         residual = _residual(view, texture, shown, basis[near], weight[near], rows[near], level)
-        used = POINT_SHARE * weight[near] / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
+        used = (
+            POINT_SHARE
+            * weight[near]
+            / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
+        )
         by_x, by_y = by_x / NOISE_LEVELS, by_y / NOISE_LEVELS
-        # The channels' slopes along x and y, multiplied and summed, before they become those by position.
+        # The channels' slopes along x and y, multiplied and summed, before they become those by
+        # position.
         xx, xy, yy, x, y = (
             (used * ((one * other) @ CHANNEL_WEIGHTS))[:, None]
-            for one, other in ((by_x, by_x), (by_x, by_y), (by_y, by_y), (by_x, residual), (by_y, residual))
+            for one, other in (
+                (by_x, by_x),
+                (by_x, by_y),
+                (by_y, by_y),
+                (by_x, residual),
+                (by_y, residual),
+            )
         )
         of_x, of_y = projection_derivative(own.camera, at[near]).swapaxes(0, 1)
         along_x, along_y = xx * of_x + xy * of_y, xy * of_x + yy * of_y
@@ -87,14 +117,21 @@ def misfit(
     points: int, level: int,
 ) -> Misfit:  # fmt: skip
     """How badly a level's images are explained at the points of a level."""
-    at, basis, rows = head.level_positions(values, points), head.light_basis(values, points), head.rows[points]
+    at, basis, rows = (
+        head.level_positions(values, points),
+        head.light_basis(values, points),
+        head.rows[points],
+    )
     total, weights = np.zeros(len(REGIONS)), np.zeros(len(REGIONS))
     for view, seen in zip(views, visible, strict=True):
         weight, own = seen[rows] * texture.trust[rows], view.levels[level]
         pixels, depth = own.camera.project(at)
         shown = inside(own.camera, pixels, depth)
         (found,) = sampled([own.channels], pixels)
-        squared = _residual(view, texture, found, basis, weight * shown, rows, level) ** 2 @ CHANNEL_WEIGHTS
+        squared = (
+            _residual(view, texture, found, basis, weight * shown, rows, level) ** 2
+            @ CHANNEL_WEIGHTS
+        )
         share = np.where(shown, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
         total += np.bincount(head.region[rows], weight * share, len(REGIONS))
         weights += np.bincount(head.region[rows], weight, len(REGIONS))
@@ -122,14 +159,21 @@ def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def flow_start(
-    head: DenseHead, before: Sequence[PyramidView], visible: np.ndarray, values: np.ndarray, now: Sequence[PyramidView]
+    head: DenseHead,
+    before: Sequence[PyramidView],
+    visible: np.ndarray,
+    values: np.ndarray,
+    now: Sequence[PyramidView],
 ) -> np.ndarray:
-    """Parameters at a timestep to which optical flow (DIS, Kroeger et al. 2016) carries the head of another one.
+    """Parameters at a timestep to which optical flow (DIS, Kroeger et al. 2016) carries the head of
+    another one.
 
     before, visible (C, N), values: of the other timestep.
     """
     targets = list(flow_targets(head.level_positions(values, FLOW_POINTS), before, now))
-    weights = {view.key: own[head.rows[FLOW_POINTS]] for view, own in zip(before, visible, strict=True)}
+    weights = {
+        view.key: own[head.rows[FLOW_POINTS]] for view, own in zip(before, visible, strict=True)
+    }
     moved = values
     for _ in range(FLOW_ITERATIONS):
         at, jacobian = head.linearized(moved, FLOW_POINTS)
@@ -137,15 +181,21 @@ def flow_start(
         matrix = np.diag(precision)
         for key, camera, target in targets:
             miss = camera.project(at)[0] - target
-            weight = np.repeat(FLOW_SHARE * weights[key] * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX), 2)
+            weight = np.repeat(
+                FLOW_SHARE * weights[key] * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX), 2
+            )
             flat = (projection_derivative(camera, at) @ jacobian).reshape(len(weight), -1)
-            matrix, right = matrix + (flat.T * weight) @ flat, right - flat.T @ (weight * miss.ravel())
+            matrix, right = (
+                matrix + (flat.T * weight) @ flat,
+                right - flat.T @ (weight * miss.ravel()),
+            )
         moved = moved + np.linalg.solve(matrix, right)
     return moved
 
 
 def flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[PyramidView]) -> Any:
-    """(key, camera, pixels (M, 2) that points at `at` have moved to) of each camera that saw both timesteps."""
+    """(key, camera, pixels (M, 2) that points at `at` have moved to) of each camera that saw both
+    timesteps."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS
@@ -153,7 +203,11 @@ def flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[Py
     first = {view.key: view.levels[FLOW_LEVEL] for view in before}
     for view in now:
         level, old = view.levels[FLOW_LEVEL], first.get(view.key)
-        if old is None or old.channels.shape != level.channels.shape or min(old.channels.shape[:2]) < MIN_FLOW_SIDE_PX:
+        if (
+            old is None
+            or old.channels.shape != level.channels.shape
+            or min(old.channels.shape[:2]) < MIN_FLOW_SIDE_PX
+        ):
             continue
         pictures = [np.clip(own.channels[..., 0], 0, 255).astype(np.uint8) for own in (old, level)]
         pixels, _ = old.camera.project(at)
@@ -165,5 +219,8 @@ MIN_FLOW_SIDE_PX = 32
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """(N,) bool: pixels (N, 2) in the image, a pixel from its border, at a depth (N,) before the camera."""
-    return np.asarray((pixels > 1).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1) & (depth > 0))
+    """(N,) bool: pixels (N, 2) in the image, a pixel from its border, at a depth (N,) before the
+    camera."""
+    return np.asarray(
+        (pixels > 1).all(1) & (pixels < [camera.width - 1, camera.height - 1]).all(1) & (depth > 0)
+    )

@@ -1,4 +1,5 @@
-"""Google's face and person networks (Apache-2.0), run by OpenCV: landmarks, ARKit scores, segmentation.
+"""Google's face and person networks (Apache-2.0), run by OpenCV: landmarks, ARKit scores,
+segmentation.
 
 What stands around the networks follows the graphs that MediaPipe publishes: anchors and decoding of
 the detector, the crop of the landmarks' network.
@@ -29,7 +30,8 @@ CROP_SCALE = 1.5
 """Side of the landmarks' crop, in sides of the detected box."""
 DETECTOR_SIZE_PX, CROP_SIZE_PX, PERSON_SIZE_PX = 128, 256, 256
 ANCHOR_GRIDS = ((16, 2), (8, 6))
-"""Cells along a side of the detector's grids, and anchors of a cell; an anchor is its cell's center."""
+"""Cells along a side of the detector's grids, and anchors of a cell; an anchor is its cell's
+center."""
 IRIS_CENTERS = (468, 473)
 FIRST_IRIS_POINT, MESH_POINTS = 468, 478
 """Landmarks: 468 of the skin, and five an iris of which the first is its center."""
@@ -245,7 +247,8 @@ class Detector(Protocol):
     """Finds faces in an image; every face has the same N landmarks."""
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
-        """Landmarks (N, 2) in pixels of each face in an image (H, W, 3) uint8; centers lie at .5."""
+        """Landmarks (N, 2) in pixels of each face in an image (H, W, 3) uint8; centers lie at
+        .5."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +264,8 @@ class FaceScores:
 
 @dataclass(frozen=True)
 class _Crop:
-    """A square of an image: center (2,) and side in pixels, turned by an angle, clockwise as seen."""
+    """A square of an image: center (2,) and side in pixels, turned by an angle, clockwise as
+    seen."""
 
     center: np.ndarray
     side: float
@@ -343,7 +347,8 @@ class PersonNetwork:
     """Segmentation of people, in 256×256 pixels of the whole image."""
 
     def probability(self, image: np.ndarray) -> np.ndarray:
-        """(H, W) float32 in 0…1 of an image (H, W, 3) uint8: how likely each pixel shows a person."""
+        """(H, W) float32 in 0…1 of an image (H, W, 3) uint8: how likely each pixel shows a
+        person."""
         import cv2
 
         size = PERSON_SIZE_PX, PERSON_SIZE_PX
@@ -371,7 +376,9 @@ def _face_part(name: str) -> bytes:
         raise StgaError(f"{FACE_FILE}: {name} cannot be read ({error}); install again") from error
 
 
-def _resampled(image: np.ndarray, matrix: np.ndarray, size: int, black_border: bool = False) -> np.ndarray:
+def _resampled(
+    image: np.ndarray, matrix: np.ndarray, size: int, black_border: bool = False
+) -> np.ndarray:
     """(size, size, 3) of an image by the matrix (2, 3) from its pixels to the image's.
 
     Pixels are sampled at their upper left corners, as MediaPipe does: at their centers, landmarks
@@ -392,7 +399,8 @@ def _blob(image: np.ndarray, low: float = 0.0) -> np.ndarray:
 
 
 def _faces_of(boxes: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
-    """Detected faces, the clearest first: (16,) center, size and six points, in the detector's pixels.
+    """Detected faces, the clearest first: (16,) center, size and six points, in the detector's
+    pixels.
 
     Boxes that overlap are one face, their mean weighted by score.
     """

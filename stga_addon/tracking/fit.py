@@ -1,4 +1,5 @@
-"""From landmarks of all cameras and timesteps to a head in meters: scale, identity, expression and pose."""
+"""From landmarks of all cameras and timesteps to a head in meters: scale, identity, expression and
+pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,23 +20,28 @@ IDENTITY_TIMESTEPS = 12
 """Timesteps, spread over the take, that identity is solved from."""
 ROUNDS = 3
 MAX_HEAD_SCALE = 1.25
-"""Size of a head, or its inverse, relative to the average one, beyond which the cameras' world is not in meters."""
+"""Size of a head, or its inverse, relative to the average one, beyond which the cameras' world is
+not in meters."""
 MIN_VISIBILITY = 1e-3
-"""Weight of a landmark that a camera cannot see; what no camera sees is still better guessed than left open."""
+"""Weight of a landmark that a camera cannot see; what no camera sees is still better guessed than
+left open."""
 RESIDUAL_SCALE_M = 0.004
 """Landmarks whose rays miss each other by much more are not used."""
 MAX_RESIDUALS = 25.0
-"""In RESIDUAL_SCALE_M, beyond which a landmark's weight no longer falls: it would vanish below the smallest number."""
+"""In RESIDUAL_SCALE_M, beyond which a landmark's weight no longer falls: it would vanish below the
+smallest number."""
 MIN_LANDMARKS = 4
 """Of a timestep that the head is fitted to: fewer do not determine a pose."""
 MIN_FACE_PIXELS, MIN_FACE_M = 1.0, 0.01
-"""Extents of the landmarks in an image and on the head, below which they are no face but a point."""
+"""Extents of the landmarks in an image and on the head, below which they are no face but a
+point."""
 POSIT_ITERATIONS = 20
 
 
 @dataclass(frozen=True)
 class TimestepLandmarks:
-    """What the cameras that found a face at one timestep found: points (C, N, 2) pixels and confidence (C, N)."""
+    """What the cameras that found a face at one timestep found: points (C, N, 2) pixels and
+    confidence (C, N)."""
 
     cameras: tuple[Camera, ...]
     points: np.ndarray
@@ -63,7 +69,8 @@ class HeadFit:
 
 
 def in_cameras_world(fit: HeadFit) -> HeadFit:
-    """The same fit with the cameras where they are: only the scale of their world changes, about its origin.
+    """The same fit with the cameras where they are: only the scale of their world changes, about
+    its origin.
 
     The head is turned and moved by its root joint, whose place depends on the expression.
     """
@@ -83,16 +90,22 @@ def in_cameras_world(fit: HeadFit) -> HeadFit:
         rigid[:3] = Rotation.from_matrix(turned).as_rotvec()
         rigid[POSE_SIZE:] = (root + rigid[POSE_SIZE:] - world.translation) @ world.rotation - root
         moved[timestep] = np.concatenate([parameters[:-RIGID_SIZE], rigid])
-    return replace(fit, parameters=moved, to_capture=Similarity(world.scale, np.eye(3), np.zeros(3)))
+    return replace(
+        fit, parameters=moved, to_capture=Similarity(world.scale, np.eye(3), np.zeros(3))
+    )
 
 
 def is_face(pixels: np.ndarray) -> bool:
-    """Whether one camera's landmarks (N, 2) pixels have an extent, in place of all being one point."""
+    """Whether one camera's landmarks (N, 2) pixels have an extent, in place of all being one
+    point."""
     return len(pixels) > 0 and bool((np.ptp(pixels, axis=0) >= MIN_FACE_PIXELS).all())
 
 
-def determines_pose(landmarks: TimestepLandmarks, reliable: np.ndarray, neutral: np.ndarray) -> bool:
-    """Whether `fit_head` can use the timestep: enough reliable landmarks are seen by two cameras, or by the only one.
+def determines_pose(
+    landmarks: TimestepLandmarks, reliable: np.ndarray, neutral: np.ndarray
+) -> bool:
+    """Whether `fit_head` can use the timestep: enough reliable landmarks are seen by two cameras,
+    or by the only one.
 
     neutral (N, 3) meters: the landmarks' places on the neutral head.
     """
@@ -113,9 +126,10 @@ def fit_head(
 ) -> HeadFit:
     """Fit the model to the landmarks of the timesteps of `take`, each of which `determines_pose`.
 
-    Rounds of triangulation, identity and scale from timesteps spread over the take, then all timesteps; from the second
-    round on, a camera's landmarks count by the angle at which it sees the surface. metric: the world of the cameras is
-    in meters, and the size of the head is the person's. step: follows each of ROUNDS.
+    Rounds of triangulation, identity and scale from timesteps spread over the take, then all
+    timesteps; from the second round on, a camera's landmarks count by the angle at which it sees
+    the surface. metric: the world of the cameras is in meters, and the size of the head is the
+    person's. step: follows each of ROUNDS.
     """
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
@@ -132,40 +146,60 @@ def fit_head(
         observed = {t: observed_landmarks(found[t], world, reliable) for t in spread}
         starts = np.stack([rigid_start(at, observed[t]) for t in spread])
         # Of one camera's rays, a head shrunk into the camera itself misses all by the least.
-        identity = solve_identity(head, places, [observed[t] for t in spread], starts, metric or not several)
-        world = replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale)
+        identity = solve_identity(
+            head, places, [observed[t] for t in spread], starts, metric or not several
+        )
+        world = replace(
+            world,
+            scale=world.scale / identity.scale,
+            translation=world.translation / identity.scale,
+        )
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
-            solved[:, -RIGID_SIZE:] = [rigid_start(at, observation) for observation in take_observed]
+            solved[:, -RIGID_SIZE:] = [
+                rigid_start(at, observation) for observation in take_observed
+            ]
             alone = solve_take(subject, places, take_observed, solved, ordered=False)
             ordered = in_order(subject, places, take_observed, alone)
         solved = solve_take(subject, places, take_observed, solved, ordered)
         visibility = LandmarkVisibility(subject, places)
-        seen = {t: visibility.weighted(take[t], values, world) for t, values in zip(timesteps, solved, strict=True)}
+        seen = {
+            t: visibility.weighted(take[t], values, world)
+            for t, values in zip(timesteps, solved, strict=True)
+        }
         step()
-    return HeadFit(subject, shape, dict(zip(timesteps, solved, strict=True)), world, ordered=ordered)
+    return HeadFit(
+        subject, shape, dict(zip(timesteps, solved, strict=True)), world, ordered=ordered
+    )
 
 
 def is_metric(
-    head: HeadModel, places: SurfacePoints, reliable: np.ndarray, take: Mapping[int, TimestepLandmarks]
+    head: HeadModel,
+    places: SurfacePoints,
+    reliable: np.ndarray,
+    take: Mapping[int, TimestepLandmarks],
 ) -> bool:
-    """Whether the face is as large in the cameras' world as a person's in meters; True of one camera, which does not
-    see size."""
+    """Whether the face is as large in the cameras' world as a person's in meters; True of one
+    camera, which does not see size."""
     several = [t for t in sorted(take) if len(take[t].cameras) > 1]
     neutral = places.on(head.model.v_template, head.model.faces)
     scales = [
-        _aligned(triangulated(take[t], reliable, neutral, 1.0), neutral, reliable, metric=False).scale
+        _aligned(
+            triangulated(take[t], reliable, neutral, 1.0), neutral, reliable, metric=False
+        ).scale
         for t in evenly_spread(several, IDENTITY_TIMESTEPS)
     ]
     return not scales or 1 / MAX_HEAD_SCALE <= float(np.median(scales)) <= MAX_HEAD_SCALE
 
 
 def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of a rigid object in the camera's world, from where they are seen: pixels (N, 2).
+    """Points (N, 3) of a rigid object in the camera's world, from where they are seen: pixels (N,
+    2).
 
-    POSIT (DeMenthon and Davis 1995): scaled orthographic pose, corrected for perspective until it no longer changes.
+    POSIT (DeMenthon and Davis 1995): scaled orthographic pose, corrected for perspective until it
+    no longer changes.
     """
     seen = (pixels - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
     center = points.mean(0)
@@ -185,8 +219,11 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
     return np.asarray((local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3])
 
 
-def triangulated(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float) -> Triangulation:
-    """The landmarks in the cameras' world; `head` (N, 3) meters and `scale` tell how far away a single camera's are."""
+def triangulated(
+    landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.ndarray, scale: float
+) -> Triangulation:
+    """The landmarks in the cameras' world; `head` (N, 3) meters and `scale` tell how far away a
+    single camera's are."""
     if len(landmarks.cameras) > 1:
         return triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
     camera, pixels = landmarks.cameras[0], landmarks.points[0]
@@ -199,15 +236,23 @@ def triangulated(landmarks: TimestepLandmarks, reliable: np.ndarray, head: np.nd
     return Triangulation(origin + depth * directions, across, np.zeros(len(head)), seen)
 
 
-def observed_landmarks(found: Triangulation, world: Similarity, reliable: np.ndarray) -> Observation:
+def observed_landmarks(
+    found: Triangulation, world: Similarity, reliable: np.ndarray
+) -> Observation:
     """The triangulation in the capture's world."""
     values, vectors = np.linalg.eigh(world.rotation @ found.information @ world.rotation.T)
     root = (vectors * np.sqrt(np.maximum(values, 0))[:, None, :]) @ vectors.swapaxes(1, 2)
-    certain = np.exp(-(np.minimum(found.residual * world.scale / RESIDUAL_SCALE_M, MAX_RESIDUALS) ** 2))
-    return Observation(world.apply(found.position), root, np.where(found.seen & reliable, certain, 0.0))
+    certain = np.exp(
+        -(np.minimum(found.residual * world.scale / RESIDUAL_SCALE_M, MAX_RESIDUALS) ** 2)
+    )
+    return Observation(
+        world.apply(found.position), root, np.where(found.seen & reliable, certain, 0.0)
+    )
 
 
-def _aligned(found: Triangulation, neutral: np.ndarray, reliable: np.ndarray, metric: bool) -> Similarity:
+def _aligned(
+    found: Triangulation, neutral: np.ndarray, reliable: np.ndarray, metric: bool
+) -> Similarity:
     """The similarity that brings the landmarks onto the neutral head."""
     use = found.seen & reliable
     return similarity(found.position[use], neutral[use], metric)
@@ -226,9 +271,12 @@ def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     use = observed.weight > np.exp(-(MAX_RESIDUALS**2))
-    if use.sum() < MIN_LANDMARKS:  # no cameras agree: all of them, and the fit will show by how much they do not
+    # no cameras agree: all of them, and the fit will show by how much they do not
+    if use.sum() < MIN_LANDMARKS:
         use = observed.weight > 0
-    rotation, translation = weighted_procrustes(neutral[use], observed.position[use], np.ones(use.sum()))
+    rotation, translation = weighted_procrustes(
+        neutral[use], observed.position[use], np.ones(use.sum())
+    )
     rigid = np.zeros(RIGID_SIZE)
     rigid[:3] = Rotation.from_matrix(rotation).as_rotvec()
     rigid[POSE_SIZE:] = translation
@@ -243,14 +291,20 @@ class LandmarkVisibility:
         self._points = PosedPoints(model, places)
         self._normals = places.on(vertex_normals(model.v_template, model.faces), model.faces)
 
-    def weighted(self, landmarks: TimestepLandmarks, parameters: np.ndarray, world: Similarity) -> TimestepLandmarks:
-        """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY where it faces away."""
-        _, squared = self.seen(parameters, np.stack([world.apply(camera.position) for camera in landmarks.cameras]))
+    def weighted(
+        self, landmarks: TimestepLandmarks, parameters: np.ndarray, world: Similarity
+    ) -> TimestepLandmarks:
+        """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY
+        where it faces away."""
+        _, squared = self.seen(
+            parameters, np.stack([world.apply(camera.position) for camera in landmarks.cameras])
+        )
         return replace(landmarks, confidence=landmarks.confidence * (squared + MIN_VISIBILITY))
 
     def seen(self, parameters: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3) of the landmarks, and squared cosines (C, N) of the angles between their normals and cameras
-        at `eyes` (C, 3), in the head's world; 0 where the surface faces away."""
+        """Positions (N, 3) of the landmarks, and squared cosines (C, N) of the angles between their
+        normals and cameras at `eyes` (C, 3), in the head's world; 0 where the surface faces
+        away."""
         at = self._points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
         normals, towards = self._normals @ head_rotation(parameters).T, eyes[:, None] - at
         length = np.linalg.norm(towards, axis=2) * np.maximum(np.linalg.norm(normals, axis=1), 1e-9)

@@ -1,4 +1,5 @@
-"""Focal length of a single camera, from landmarks of a head that turns: a near head changes its shape in the image."""
+"""Focal length of a single camera, from landmarks of a head that turns: a near head changes its
+shape in the image."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -8,36 +9,50 @@ import numpy as np
 from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE
-from .fit import LandmarkVisibility, TimestepLandmarks, observed_landmarks, rigid_start, triangulated
+from .fit import (
+    LandmarkVisibility,
+    TimestepLandmarks,
+    observed_landmarks,
+    rigid_start,
+    triangulated,
+)
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
 
 CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
-"""Timesteps among which those of the most different turns are chosen, and how many; landmarks that are used."""
+"""Timesteps among which those of the most different turns are chosen, and how many; landmarks that
+are used."""
 MIN_TURN_DEG = 20.0
-"""Between two timesteps, below which the head does not turn: what lies nearer cannot be told from what is larger."""
+"""Between two timesteps, below which the head does not turn: what lies nearer cannot be told from
+what is larger."""
 USUAL_SIGMA = 0.35
 """Standard deviation of the inverse focal length about that of a phone, relative."""
 NEAREST, FARTHEST = 2.0, 0.2
-"""Largest and smallest inverse focal length, relative to that of a phone: 104° and 15° over the diagonal."""
+"""Largest and smallest inverse focal length, relative to that of a phone: 104° and 15° over the
+diagonal."""
 OWN_SIGMA_M, NOISE_SIGMA_M = LANDMARK_SIGMA_M, 0.0006
-"""Standard deviations of what a landmark misses the head by in all timesteps alike, which says nothing of focal
-lengths, and beyond that in one of them."""
+"""Standard deviations of what a landmark misses the head by in all timesteps alike, which says
+nothing of focal lengths, and beyond that in one of them."""
 SOLVES, ROUNDS, CONVERGED = 6, 2, 0.01
-"""Inverse focal lengths that are tried; fits of the head for each, as its depth is that of the fit before; and the
-relative change after which no more are tried."""
+"""Inverse focal lengths that are tried; fits of the head for each, as its depth is that of the fit
+before; and the relative change after which no more are tried."""
 HERE = Similarity(1.0, np.eye(3), np.zeros(3))
 """The head is fitted in the camera's own world, in meters."""
 
 
 def solved_focal(
-    head: HeadModel, places: SurfacePoints, reliable: np.ndarray, take: Mapping[int, TimestepLandmarks]
+    head: HeadModel,
+    places: SurfacePoints,
+    reliable: np.ndarray,
+    take: Mapping[int, TimestepLandmarks],
 ) -> float | None:
-    """Focal length in pixels of the only camera of `take`, whose own is that of a phone (`open.usual_focal`).
+    """Focal length in pixels of the only camera of `take`, whose own is that of a phone
+    (`open.usual_focal`).
 
-    The maximum of its posterior, by the secant method; the inverse has a normal prior about the camera's own. None
-    where the head turns too little, or where landmarks say less of it than the prior.
+    The maximum of its posterior, by the secant method; the inverse has a normal prior about the
+    camera's own. None where the head turns too little, or where landmarks say less of it than the
+    prior.
     """
     rows = np.array(evenly_spread(np.flatnonzero(reliable).tolist(), LANDMARKS))
     seen = {
@@ -45,7 +60,9 @@ def solved_focal(
         for t, own in take.items()
         if (own.confidence[:, rows] > 0).all()
     }
-    own_head, own_places = _with_own_places(head, SurfacePoints(places.face[rows], places.barycentric[rows]))
+    own_head, own_places = _with_own_places(
+        head, SurfacePoints(places.face[rows], places.barycentric[rows])
+    )
     timesteps = _turned(own_head, own_places, seen)
     if not timesteps:
         return None
@@ -69,7 +86,8 @@ def solved_focal(
 
 
 def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
-    """The head at its landmarks alone, with components of identity that move each of them by OWN_SIGMA_M."""
+    """The head at its landmarks alone, with components of identity that move each of them by
+    OWN_SIGMA_M."""
     model, count = head.model, len(places)
     corners = model.faces[places.face].ravel()
     own = OWN_SIGMA_M * np.eye(3 * count).reshape(count, 1, 3, 3 * count).repeat(3, axis=1)
@@ -88,7 +106,9 @@ def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel,
     return replace(head, model=small), SurfacePoints(np.arange(count), places.barycentric)
 
 
-def _turned(head: HeadModel, places: SurfacePoints, take: Mapping[int, TimestepLandmarks]) -> list[int]:
+def _turned(
+    head: HeadModel, places: SurfacePoints, take: Mapping[int, TimestepLandmarks]
+) -> list[int]:
     """Timesteps at which the head is turned most differently; none where it does not turn."""
     timesteps = evenly_spread(sorted(take), CANDIDATES)
     if len(timesteps) < 2:
@@ -108,14 +128,20 @@ def _turned(head: HeadModel, places: SurfacePoints, take: Mapping[int, TimestepL
 def _observed(
     head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
 ) -> tuple[list[Observation], np.ndarray]:
-    """Landmarks in the camera's world at the depth of the head, and the poses (T, 18) that bring it there."""
+    """Landmarks in the camera's world at the depth of the head, and the poses (T, 18) that bring it
+    there."""
     neutral, used = places.on(head.model.v_template, head.model.faces), np.ones(len(places), bool)
-    found = [observed_landmarks(triangulated(view, used, neutral, 1.0), HERE, used) for view in views]
+    found = [
+        observed_landmarks(triangulated(view, used, neutral, 1.0), HERE, used) for view in views
+    ]
     return found, np.stack([rigid_start(neutral, own) for own in found])
 
 
-def _slope(head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks], inverse: float) -> float:
-    """Derivative of the negative log-likelihood by the inverse focal length; both are relative to the cameras' own.
+def _slope(
+    head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks], inverse: float
+) -> float:
+    """Derivative of the negative log-likelihood by the inverse focal length; both are relative to
+    the cameras' own.
 
     At the best fit of the head it is that with a head that stays: rays turn away from its points.
     """
@@ -128,9 +154,15 @@ def _slope(head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandm
         seen, starts = _observed(subject, places, views)
         frames = frames if len(frames) else np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
         visibility = LandmarkVisibility(subject, places)
-        sides = (visibility.weighted(view, own, HERE) for view, own in zip(views, frames, strict=True))
+        sides = (
+            visibility.weighted(view, own, HERE) for view, own in zip(views, frames, strict=True)
+        )
         observed = [
-            replace(own, root=own.root * (LANDMARK_SIGMA_M / NOISE_SIGMA_M), weight=own.weight * side.confidence[0])
+            replace(
+                own,
+                root=own.root * (LANDMARK_SIGMA_M / NOISE_SIGMA_M),
+                weight=own.weight * side.confidence[0],
+            )
             for own, side in zip(seen, sides, strict=True)
         ]
         identity = solve_identity(head, places, observed, starts, metric=True)
@@ -141,7 +173,9 @@ def _slope(head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandm
         at = points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         residual = np.einsum("nij,nj->ni", own.root, at - own.position) / LANDMARK_SIGMA_M
         _, depth = camera.project(at)
-        flat = (view.points[0] - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y] * depth[:, None]
+        flat = (
+            (view.points[0] - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y] * depth[:, None]
+        )
         away = np.einsum("nij,nj->ni", own.root, flat @ rotation[:2]) / LANDMARK_SIGMA_M
         weight = own.weight / np.sqrt(1 + (residual**2).sum(1))
         total -= float((weight * (residual * away).sum(1)).sum())

@@ -12,7 +12,8 @@ REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER, PLACES_FILE, MATTES_FILE = (
     "mattes.json",
 )
 KEPT_FOLDER = "unfinished"
-"""Of results of parts, with which an interrupted tracking goes on; removed once the capture is written."""
+"""Of results of parts, with which an interrupted tracking goes on; removed once the capture is
+written."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 
 

@@ -16,8 +16,9 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
 TRIANGLES = 4
 MIN_NUMBERS_ALLOWANCE, MAX_NUMBERS_PER_BYTE = 1 << 20, 8
-"""Numbers that the joined mesh may hold: any file's, and more for each byte. Accessors without data promise as many
-zeros as they like, and nodes repeat meshes; sparse morph targets of a real head reach 4 a byte."""
+"""Numbers that the joined mesh may hold: any file's, and more for each byte. Accessors without data
+promise as many zeros as they like, and nodes repeat meshes; sparse morph targets of a real head
+reach 4 a byte."""
 PRIMITIVE_NUMBERS = 100
 """That each primitive counts for besides its own: it takes time even where it is small."""
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
@@ -25,7 +26,8 @@ READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_text
 
 @dataclass(frozen=True)
 class MorphMesh:
-    """positions (V, 3) in meters, y up; faces (F, 3); names of K morph targets and their displacements (V, 3, K)."""
+    """positions (V, 3) in meters, y up; faces (F, 3); names of K morph targets and their
+    displacements (V, 3, K)."""
 
     positions: np.ndarray
     faces: np.ndarray
@@ -36,8 +38,9 @@ class MorphMesh:
 def read_glb(path: Path) -> MorphMesh:
     """All triangle meshes of the scene of a .glb file, as one; targets of the same name are one.
 
-    Vertices that are split at seams of normals and texture coordinates are merged. Skins are left in their bind pose.
-    Raises StgaError naming the file and what is missing or not supported. Source: Khronos, glTF 2.0.
+    Vertices that are split at seams of normals and texture coordinates are merged. Skins are left
+    in their bind pose. Raises StgaError naming the file and what is missing or not supported.
+    Source: Khronos, glTF 2.0.
     """
     content = read_bytes(path)
     try:
@@ -45,10 +48,23 @@ def read_glb(path: Path) -> MorphMesh:
             document, data = glb_chunks(content)
             _require_readable(path, document)
             nodes = list(_mesh_nodes(document))
-            _require_bounded(path, document, nodes, MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * len(content))
-            parts = [part for node, matrix in nodes for part in _placed(document, data, node, matrix)]
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
-        raise StgaError(f"{path}: is not a readable GLB ({type(error).__name__}: {error!s:.100})") from error
+            _require_bounded(
+                path, document, nodes, MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * len(content)
+            )
+            parts = [
+                part for node, matrix in nodes for part in _placed(document, data, node, matrix)
+            ]
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
+        raise StgaError(
+            f"{path}: is not a readable GLB ({type(error).__name__}: {error!s:.100})"
+        ) from error
     if not parts:
         raise StgaError(f"{path}: its scene has no triangle mesh")
     return _merged(_joined(parts))
@@ -57,13 +73,18 @@ def read_glb(path: Path) -> MorphMesh:
 def _require_readable(path: Path, document: dict[str, Any]) -> None:
     unknown = set(document.get("extensionsRequired", ())) - READABLE_EXTENSIONS
     if unknown:
-        raise StgaError(f"{path}: needs {', '.join(sorted(map(str, unknown)))}; export it without compression")
+        raise StgaError(
+            f"{path}: needs {', '.join(sorted(map(str, unknown)))}; export it without compression"
+        )
     if any("uri" in buffer for buffer in document.get("buffers", ())):
         raise StgaError(f"{path}: refers to other files; export a GLB that holds its buffers")
 
 
 def _require_bounded(
-    path: Path, document: dict[str, Any], nodes: list[tuple[dict[str, Any], np.ndarray]], allowed: int
+    path: Path,
+    document: dict[str, Any],
+    nodes: list[tuple[dict[str, Any], np.ndarray]],
+    allowed: int,
 ) -> None:
     """Raise StgaError where the joined mesh of all nodes would hold more numbers than allowed."""
     vertices = corners = 0
@@ -72,7 +93,9 @@ def _require_bounded(
         for primitive, targets in _primitives(document, node):
             vertices += _count(document["accessors"][primitive["attributes"]["POSITION"]])
             corners += PRIMITIVE_NUMBERS
-            corners += _count(document["accessors"][primitive["indices"]]) if "indices" in primitive else 0
+            corners += (
+                _count(document["accessors"][primitive["indices"]]) if "indices" in primitive else 0
+            )
             names.update(name for name, _ in targets)
             numbers = 3 * vertices * (1 + len(names)) + corners
             if numbers > allowed:
@@ -92,13 +115,22 @@ def _primitives(
         if primitive.get("mode", TRIANGLES) == TRIANGLES:
             targets = primitive.get("targets", ())
             named = len(names) == len(targets)
-            yield primitive, [(str(names[k]) if named else f"target {k}", target) for k, target in enumerate(targets)]
+            yield (
+                primitive,
+                [
+                    (str(names[k]) if named else f"target {k}", target)
+                    for k, target in enumerate(targets)
+                ],
+            )
 
 
 def _mesh_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Nodes of the scene that have a mesh, and their transforms (4, 4)."""
     nodes = document.get("nodes", [])
-    waiting = [(int(row), np.eye(4)) for row in document["scenes"][document.get("scene", 0)].get("nodes", ())]
+    waiting = [
+        (int(row), np.eye(4))
+        for row in document["scenes"][document.get("scene", 0)].get("nodes", ())
+    ]
     for _ in range(len(nodes)):  # each node has one parent: more would be a loop
         if not waiting:
             return
@@ -120,7 +152,9 @@ def _transform(node: dict[str, Any]) -> np.ndarray:
     return result
 
 
-def _placed(document: dict[str, Any], data: bytes, node: dict[str, Any], matrix: np.ndarray) -> list[MorphMesh]:
+def _placed(
+    document: dict[str, Any], data: bytes, node: dict[str, Any], matrix: np.ndarray
+) -> list[MorphMesh]:
     """The triangle primitives of a node's mesh, in the scene's axes."""
     parts = []
     for primitive, morphs in _primitives(document, node):
@@ -132,7 +166,9 @@ def _placed(document: dict[str, Any], data: bytes, node: dict[str, Any], matrix:
                 targets[:, :, column] = _accessor(document, data, morph["POSITION"], count)
         corners = np.arange(count, dtype=np.int64)
         if "indices" in primitive:
-            corners = _accessor(document, data, primitive["indices"], width=1)[:, 0].astype(np.int64)
+            corners = _accessor(document, data, primitive["indices"], width=1)[:, 0].astype(
+                np.int64
+            )
         if corners.min(initial=0) < 0 or corners.max(initial=0) >= count:
             raise ValueError("a primitive's indices do not fit its vertices")
         parts.append(
@@ -156,7 +192,8 @@ def _count(accessor: dict[str, Any]) -> int:
 def _accessor(
     document: dict[str, Any], data: bytes, number: int, expected: int | None = None, width: int = 3
 ) -> np.ndarray:
-    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where that is given."""
+    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where that is
+    given."""
     accessor = document["accessors"][number]
     count = _count(accessor)
     if WIDTHS[accessor["type"]] != width or count != (expected or count):
@@ -168,7 +205,9 @@ def _accessor(
     sparse = accessor.get("sparse")
     if sparse:
         changed = _count(sparse)
-        rows = _view(document, data, sparse["indices"], sparse["indices"]["componentType"], changed, 1)[:, 0]
+        rows = _view(
+            document, data, sparse["indices"], sparse["indices"]["componentType"], changed, 1
+        )[:, 0]
         values[rows.astype(np.int64)] = _view(
             document, data, sparse["values"], accessor["componentType"], changed, width
         )
@@ -179,7 +218,12 @@ def _accessor(
 
 
 def _view(
-    document: dict[str, Any], data: bytes, source: dict[str, Any], component: int, count: int, width: int
+    document: dict[str, Any],
+    data: bytes,
+    source: dict[str, Any],
+    component: int,
+    count: int,
+    width: int,
 ) -> np.ndarray:
     """(count, width) float64 copies of a buffer view's values."""
     view, dtype = document["bufferViews"][source["bufferView"]], np.dtype(COMPONENTS[component])
@@ -202,15 +246,21 @@ def _joined(parts: list[MorphMesh]) -> MorphMesh:
     targets = np.zeros((starts[-1], 3, len(names)))
     for start, part in zip(starts, parts, strict=False):
         for own, name in enumerate(part.names):
-            targets[start : start + len(part.positions), :, columns[name]] += part.targets[:, :, own]
+            targets[start : start + len(part.positions), :, columns[name]] += part.targets[
+                :, :, own
+            ]
     faces = np.concatenate([part.faces + start for start, part in zip(starts, parts, strict=False)])
     return MorphMesh(np.concatenate([part.positions for part in parts]), faces, names, targets)
 
 
 def _merged(mesh: MorphMesh) -> MorphMesh:
-    """The mesh with vertices merged that no target parts, and without triangles that collapse by it."""
-    rows = np.column_stack([mesh.positions, mesh.targets.reshape(len(mesh.positions), -1)]) + 0.0  # no -0
-    keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1])))[:, 0]
+    """The mesh with vertices merged that no target parts, and without triangles that collapse by
+    it."""
+    # no -0
+    rows = np.column_stack([mesh.positions, mesh.targets.reshape(len(mesh.positions), -1)]) + 0.0
+    keys = np.ascontiguousarray(rows).view(
+        np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))
+    )[:, 0]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)  # vertices in the order of the file
     rank = np.empty(len(order), np.int64)

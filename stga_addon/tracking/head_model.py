@@ -1,4 +1,5 @@
-"""Head models that can be tracked: FLAME, any linear model in an npz, or a GLB with morph targets."""
+"""Head models that can be tracked: FLAME, any linear model in an npz, or a GLB with morph
+targets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +20,8 @@ LINEAR_KEYS = ("mean", "faces")
 MIN_EXTENT_M, MAX_EXTENT_M = 0.1, 2.0
 """Extent of a head model along its longest axis; outside of it, the file is in other units."""
 MAX_COMPONENT_M = 100.0
-"""Displacement of a vertex by a component at coefficient 1; scales of components differ from model to model."""
+"""Displacement of a vertex by a component at coefficient 1; scales of components differ from model
+to model."""
 MAX_JOINT_SHARE = 100.0
 """Of a vertex in a joint's position, and of a joint in a vertex's motion."""
 MIN_JOINT_WEIGHT = 0.5
@@ -45,12 +47,14 @@ class HeadModel:
 
 
 def read_head_model(path: Path | None) -> HeadModel:
-    """Read a FLAME model (.pkl or .npz), a linear model from an .npz, or morph targets from a .glb (`shape_arrays`);
+    """Read a FLAME model (.pkl or .npz), a linear model from an .npz, or morph targets from a .glb
+    (`shape_arrays`);
     None: the bundled head.
 
-    A linear model has `mean` (V, 3) meters and `faces` (F, 3), and optionally `identity` (V, 3, I), `expression`
-    (V, 3, E), and `J_regressor` (5, V) with `weights` (V, 5) for the joints root, neck, jaw, left and right eye.
-    Components are scaled so that a coefficient is of the order of 1. Raises StgaError naming the file and the field.
+    A linear model has `mean` (V, 3) meters and `faces` (F, 3), and optionally `identity` (V, 3, I),
+    `expression` (V, 3, E), and `J_regressor` (5, V) with `weights` (V, 5) for the joints root,
+    neck, jaw, left and right eye. Components are scaled so that a coefficient is of the order of 1.
+    Raises StgaError naming the file and the field.
     """
     if path is None:
         return HeadModel(flame_model(None), "flame")
@@ -68,7 +72,8 @@ def read_head_model(path: Path | None) -> HeadModel:
 def shape_arrays(
     mean: np.ndarray, faces: np.ndarray, names: Sequence[str], shapes: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The arrays of a linear model from K named displacements: mean (V, 3), faces (F, 3), shapes (V, 3, K)."""
+    """The arrays of a linear model from K named displacements: mean (V, 3), faces (F, 3), shapes
+    (V, 3, K)."""
     identity = np.array([name.lower().startswith(IDENTITY_PREFIX) for name in names], bool)
     return {
         "mean": mean,
@@ -79,15 +84,21 @@ def shape_arrays(
 
 
 def write_linear_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write a linear model as an npz. Raises StgaError where it is none that `read_head_model` would take."""
+    """Write a linear model as an npz. Raises StgaError where it is none that `read_head_model`
+    would take."""
     checked(path, HeadModel(linear_model(path, arrays), "mesh"))
     write_npz(
-        path, {name: array.astype(np.float32) if array.dtype.kind == "f" else array for name, array in arrays.items()}
+        path,
+        {
+            name: array.astype(np.float32) if array.dtype.kind == "f" else array
+            for name, array in arrays.items()
+        },
     )
 
 
 def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
-    """The linear model with these arrays (`read_head_model`) in FLAME's form; `path` is named in errors."""
+    """The linear model with these arrays (`read_head_model`) in FLAME's form; `path` is named in
+    errors."""
     for key in LINEAR_KEYS:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}, which a linear head model needs")
@@ -98,12 +109,18 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
         for key in ("identity", "expression")
     ]
     if not sum(base.shape[2] for base in bases):
-        raise StgaError(f"{path}: has neither identity nor expression, the components that a head is fitted with")
+        raise StgaError(
+            f"{path}: has neither identity nor expression, the components that a head is fitted with"
+        )
     faces = arrays["faces"]
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu" or not len(faces):
-        raise StgaError(f"{path}: faces is {faces.dtype} of shape {faces.shape}, expected whole numbers (any, 3)")
+        raise StgaError(
+            f"{path}: faces is {faces.dtype} of shape {faces.shape}, expected whole numbers (any, 3)"
+        )
     if faces.min() < 0 or faces.max() >= count:
-        raise StgaError(f"{path}: faces names vertices {faces.min()} to {faces.max()}, expected 0 to {count - 1}")
+        raise StgaError(
+            f"{path}: faces names vertices {faces.min()} to {faces.max()}, expected 0 to {count - 1}"
+        )
     regressor, weights = _skeleton(path, arrays, count)
     return FlameModel(
         v_template=mean,
@@ -118,14 +135,17 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
 
 
 def checked(path: Path, head: HeadModel) -> HeadModel:
-    """The head model. Raises StgaError where it is not of a head's size in meters, or holds numbers that none has."""
+    """The head model. Raises StgaError where it is not of a head's size in meters, or holds numbers
+    that none has."""
     for name, (array, limit) in _bounds(head).items():
         largest = float(np.abs(array).max(initial=0))
         if largest > limit:
             raise StgaError(f"{path}: {name} reaches {largest:.3g}, expected at most {limit:.0f}")
     extent = float(np.ptp(head.model.v_template, axis=0).max())
     if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
-        raise StgaError(f"{path}: the head measures {extent:.3g}, expected {MIN_EXTENT_M} to {MAX_EXTENT_M} meters")
+        raise StgaError(
+            f"{path}: the head measures {extent:.3g}, expected {MIN_EXTENT_M} to {MAX_EXTENT_M} meters"
+        )
     return head
 
 
@@ -147,7 +167,9 @@ def _bounds(head: HeadModel) -> dict[str, tuple[np.ndarray, float]]:
     }
 
 
-def _skeleton(path: Path, arrays: dict[str, np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
+def _skeleton(
+    path: Path, arrays: dict[str, np.ndarray], count: int
+) -> tuple[np.ndarray, np.ndarray]:
     given = [key for key in ("J_regressor", "weights") if key in arrays]
     if len(given) == 1:
         raise StgaError(f"{path}: has {given[0]} alone; joints need both J_regressor and weights")
@@ -159,7 +181,9 @@ def _skeleton(path: Path, arrays: dict[str, np.ndarray], count: int) -> tuple[np
     return np.full((len(JOINTS), count), 1 / count), weights
 
 
-def _floats(path: Path, arrays: dict[str, np.ndarray], key: str, expected: tuple[int | None, ...]) -> np.ndarray:
+def _floats(
+    path: Path, arrays: dict[str, np.ndarray], key: str, expected: tuple[int | None, ...]
+) -> np.ndarray:
     array = arrays[key]
     fits = array.ndim == len(expected) and all(
         want in (None, size) for size, want in zip(array.shape, expected, strict=True)

@@ -20,23 +20,25 @@ from .posed_points import SurfacePoints
 
 MIN_BARYCENTRIC, MAX_SUM_ERROR = -1e-3, 1e-3
 MAX_PIXELS, MAX_CONFIDENCE = 1e5, 1e6
-"""Bounds of landmarks, three times as far as the largest image reaches, and of their confidence: some detectors write
-scores in place of shares."""
+"""Bounds of landmarks, three times as far as the largest image reaches, and of their confidence:
+some detectors write scores in place of shares."""
 MAX_TWO_FACES_SHARE = 0.34
 """Share of a camera's frames with a second face, beyond which the footage is not of one person."""
 MIN_PART_TIMESTEPS = 50
-"""Of a camera's parts, which are worked on at once, and as many as there may be helpers: each decodes a video from the
-key frame before it, or from the beginning."""
+"""Of a camera's parts, which are worked on at once, and as many as there may be helpers: each
+decodes a video from the key frame before it, or from the beginning."""
 MIN_OVERLAP = 0.3
 """Two faces whose boxes share this much of their area are one, found twice."""
 
 Report = Callable[[str, int, int], None]
-"""Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not detected again."""
+"""Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not
+detected again."""
 
 
 @dataclass(frozen=True)
 class CameraLandmarks:
-    """What one camera sees of N landmarks: timesteps (T,), points (T, N, 2) pixels, confidence (T, N); 0: not seen."""
+    """What one camera sees of N landmarks: timesteps (T,), points (T, N, 2) pixels, confidence (T,
+    N); 0: not seen."""
 
     timesteps: np.ndarray
     points: np.ndarray
@@ -44,18 +46,25 @@ class CameraLandmarks:
 
 
 def landmark_file(folder: Path, camera: str) -> Path:
-    """The file of a camera; characters that not all file systems allow are percent-encoded, as in `walk%2F1.npz`."""
-    name = re.sub(r"[^\w.-]", lambda found: "".join(f"%{byte:02X}" for byte in found[0].encode()), camera) + ".npz"
+    """The file of a camera; characters that not all file systems allow are percent-encoded, as in
+    `walk%2F1.npz`."""
+    name = (
+        re.sub(
+            r"[^\w.-]", lambda found: "".join(f"%{byte:02X}" for byte in found[0].encode()), camera
+        )
+        + ".npz"
+    )
     return folder / (name if name != PLACES_FILE else name.replace("h", "%68", 1))
 
 
 def detect_landmarks(
     footage: Footage, detector: Detector, folder: Path, helpers: Helpers, report: Report
 ) -> dict[str, CameraLandmarks]:
-    """Landmarks by camera; each camera's are written to `folder`, and read from there where they are already.
+    """Landmarks by camera; each camera's are written to `folder`, and read from there where they
+    are already.
 
-    detector: can be handed to helping processes. A frame with several faces counts as one without a face.
-    Raises StgaError for a camera that often sees several.
+    detector: can be handed to helping processes. A frame with several faces counts as one without a
+    face. Raises StgaError for a camera that often sees several.
     """
     total = sum(len(camera.timesteps) for camera in footage.cameras)
     found: dict[str, CameraLandmarks] = {}
@@ -66,15 +75,19 @@ def detect_landmarks(
             limit = max(MIN_PART_TIMESTEPS, -(-len(camera.timesteps) // MAX_HELPERS))
             parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
             detected = helpers.map(_detect, parts, partial(_count, report, done, total))
-            write_camera(path, _of_one_person(camera, [faces for part in detected for faces in part]))
-        found[camera.name] = read_camera(path, camera)  # in the file's precision, whether it was detected now or before
+            write_camera(
+                path, _of_one_person(camera, [faces for part in detected for faces in part])
+            )
+        # in the file's precision, whether it was detected now or before
+        found[camera.name] = read_camera(path, camera)
         done += len(camera.timesteps)
         report("Landmarks", done, total)
     return found
 
 
 def read_landmarks(footage: Footage, folder: Path) -> dict[str, CameraLandmarks]:
-    """Landmarks by camera from files of any detector; cameras without a file are not used. Raises StgaError."""
+    """Landmarks by camera from files of any detector; cameras without a file are not used. Raises
+    StgaError."""
     files = {camera.name: landmark_file(folder, camera.name) for camera in footage.cameras}
     found = {
         camera.name: read_camera(files[camera.name], camera)
@@ -83,7 +96,9 @@ def read_landmarks(footage: Footage, folder: Path) -> dict[str, CameraLandmarks]
     }
     if not found:
         first = next(iter(files.values()))
-        raise StgaError(f"{folder}: has landmarks of no camera; expected files such as {first.name}")
+        raise StgaError(
+            f"{folder}: has landmarks of no camera; expected files such as {first.name}"
+        )
     counts = {name: landmarks.points.shape[1] for name, landmarks in found.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{files[name].name} {count}" for name, count in counts.items())
@@ -103,13 +118,19 @@ def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
         expected = f"timesteps of camera {camera.name}, each once, whole numbers (any,)"
         raise StgaError(f"{path}: timesteps: expected {expected}")
     points = _pixels(path, arrays["points"], len(timesteps))
-    confidence = _confidence(path, arrays.get("confidence", np.isfinite(points).all(2)), points.shape[:2])
+    confidence = _confidence(
+        path, arrays.get("confidence", np.isfinite(points).all(2)), points.shape[:2]
+    )
     seen = points[confidence > 0]
     if not np.isfinite(seen).all():
         raise StgaError(f"{path}: points: expected finite pixels where confidence is not 0")
     if not (np.abs(seen) <= MAX_PIXELS).all():
-        raise StgaError(f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, as far as no image reaches")
-    return CameraLandmarks(timesteps.astype(np.int64), np.where(confidence[..., None] > 0, points, 0.0), confidence)
+        raise StgaError(
+            f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, as far as no image reaches"
+        )
+    return CameraLandmarks(
+        timesteps.astype(np.int64), np.where(confidence[..., None] > 0, points, 0.0), confidence
+    )
 
 
 def _pixels(path: Path, points: np.ndarray, count: int) -> np.ndarray:
@@ -128,7 +149,8 @@ def _confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> n
         raise StgaError(f"{path}: confidence has shape {confidence.shape}, expected {shape}")
     if confidence.dtype.kind not in "biuf":
         raise StgaError(f"{path}: confidence holds {confidence.dtype}, expected numbers")
-    if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():  # also where it is not a number
+    # also where it is not a number
+    if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():
         raise StgaError(f"{path}: confidence: expected numbers from 0 to {MAX_CONFIDENCE:g}")
     return confidence.astype(np.float64)
 
@@ -143,7 +165,8 @@ def write_camera(path: Path, landmarks: CameraLandmarks) -> None:
 
 
 def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
-    """Where landmarks lie on the head model: `face` (N,), −1 for an unused one, and `barycentric` (N, 3).
+    """Where landmarks lie on the head model: `face` (N,), −1 for an unused one, and `barycentric`
+    (N, 3).
 
     Returns the places and (N,) bool which are used. Raises StgaError naming the file and the field.
     """
@@ -152,26 +175,41 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}")
     face, barycentric = arrays["face"], arrays["barycentric"]
-    if face.ndim != 1 or face.dtype.kind not in "iu" or not ((face >= -1) & (face < triangles)).all():
-        raise StgaError(f"{path}: face: expected triangles from 0 to {triangles - 1}, or -1, of shape (any,)")
+    if (
+        face.ndim != 1
+        or face.dtype.kind not in "iu"
+        or not ((face >= -1) & (face < triangles)).all()
+    ):
+        raise StgaError(
+            f"{path}: face: expected triangles from 0 to {triangles - 1}, or -1, of shape (any,)"
+        )
     used = face >= 0
     if used.sum() < MIN_LANDMARKS:
-        raise StgaError(f"{path}: face: uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}")
-    return SurfacePoints(np.maximum(face, 0).astype(np.int64), _barycentric(path, barycentric, used)), used
+        raise StgaError(
+            f"{path}: face: uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}"
+        )
+    return SurfacePoints(
+        np.maximum(face, 0).astype(np.int64), _barycentric(path, barycentric, used)
+    ), used
 
 
 def check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> None:
-    """Raise StgaError for a camera that sees a face and has another number of landmarks than the head model's file."""
+    """Raise StgaError for a camera that sees a face and has another number of landmarks than the
+    head model's file."""
     for name, camera in found.items():
         count = camera.points.shape[1]
         if camera.confidence.any() and count != len(places):
-            raise StgaError(f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}")
+            raise StgaError(
+                f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}"
+            )
 
 
 def _barycentric(path: Path, barycentric: np.ndarray, used: np.ndarray) -> np.ndarray:
     """(N, 3) float64; thirds where a landmark is not used."""
     if barycentric.shape != (len(used), 3):
-        raise StgaError(f"{path}: barycentric has shape {barycentric.shape}, expected ({len(used)}, 3)")
+        raise StgaError(
+            f"{path}: barycentric has shape {barycentric.shape}, expected ({len(used)}, 3)"
+        )
     if barycentric.dtype.kind not in "biuf":
         raise StgaError(f"{path}: barycentric holds {barycentric.dtype}, expected numbers")
     if not np.isfinite(barycentric).all():
@@ -203,7 +241,9 @@ def _count(report: Report, done: int, total: int, number: int) -> None:
     report("Landmarks", done + number, total)
 
 
-def _detect(camera: FootageCamera, timesteps: list[int], detector: Detector, step: Step) -> list[list[np.ndarray]]:
+def _detect(
+    camera: FootageCamera, timesteps: list[int], detector: Detector, step: Step
+) -> list[list[np.ndarray]]:
     """The faces (N, 2) of each timestep."""
     found = []
     for timestep in timesteps:
@@ -214,7 +254,9 @@ def _detect(camera: FootageCamera, timesteps: list[int], detector: Detector, ste
 
 def _of_one_person(camera: FootageCamera, seen: list[list[np.ndarray]]) -> CameraLandmarks:
     """Raises StgaError where too many of the timesteps show several faces."""
-    several = [timestep for timestep, faces in zip(camera.timesteps, seen, strict=True) if len(faces) > 1]
+    several = [
+        timestep for timestep, faces in zip(camera.timesteps, seen, strict=True) if len(faces) > 1
+    ]
     faces = [own[0] if len(own) == 1 else None for own in seen]
     if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
         raise StgaError(
@@ -229,7 +271,11 @@ def _of_one_person(camera: FootageCamera, seen: list[list[np.ndarray]]) -> Camer
 
 def _distinct(faces: list[np.ndarray]) -> list[np.ndarray]:
     """The faces without those that are the first one found again."""
-    return [face for number, face in enumerate(faces) if number == 0 or _overlap(faces[0], face) < MIN_OVERLAP]
+    return [
+        face
+        for number, face in enumerate(faces)
+        if number == 0 or _overlap(faces[0], face) < MIN_OVERLAP
+    ]
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:

@@ -23,15 +23,20 @@ def outline_offsets(
     camera: Camera, mask: np.ndarray, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, normals: np.ndarray,
     reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Meters (N,) by which points would have to move along their normals for the mesh to fill the mask; and (N,) bool
-    for which points this is known: those near the outline of the mesh, with one edge of the mask near them.
+    """Meters (N,) by which points would have to move along their normals for the mesh to fill the
+    mask; and (N,) bool for which points this is known: those near the outline of the mesh, with one
+    edge of the mask near them.
 
-    mask (H, W) uint8, 255 inside; points on the mesh and unit normals (N, 3); reach: the largest move, in meters.
-    Both outlines are crossed along the projected normal, so that a point need not lie on the outline itself.
+    mask (H, W) uint8, 255 inside; points on the mesh and unit normals (N, 3); reach: the largest
+    move, in meters. Both outlines are crossed along the projected normal, so that a point need not
+    lie on the outline itself.
     """
     found, known = np.zeros(len(points)), np.zeros(len(points), bool)
     rows = np.flatnonzero(np.abs(facing(camera, points, normals)) < MAX_COSINE)
-    (begin, depth), (end, _) = camera.project(points[rows]), camera.project(points[rows] + 1e-3 * normals[rows])
+    (begin, depth), (end, _) = (
+        camera.project(points[rows]),
+        camera.project(points[rows] + 1e-3 * normals[rows]),
+    )
     along = 1e3 * (end - begin)  # pixels per meter
     length = np.linalg.norm(along, axis=1)
     usable = (depth > 0) & (length * reach > 1)
@@ -51,8 +56,11 @@ def outline_offsets(
     return found, known
 
 
-def _rim(camera: Camera, vertices: np.ndarray, faces: np.ndarray, around: np.ndarray, pixels: float) -> np.ndarray:
-    """The triangles (R, 3) of the outline near the pixels `around` (N, 2): most of the mesh need not be drawn."""
+def _rim(
+    camera: Camera, vertices: np.ndarray, faces: np.ndarray, around: np.ndarray, pixels: float
+) -> np.ndarray:
+    """The triangles (R, 3) of the outline near the pixels `around` (N, 2): most of the mesh need
+    not be drawn."""
     from scipy.spatial import cKDTree
 
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -67,14 +75,16 @@ def _rim(camera: Camera, vertices: np.ndarray, faces: np.ndarray, around: np.nda
 
 
 def _edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Step (N,) at which lines of pixels `at` (N, S, 2) leave a mask (H, W) from 0 to 1; NaN unless they do so once."""
+    """Step (N,) at which lines of pixels `at` (N, S, 2) leave a mask (H, W) from 0 to 1; NaN unless
+    they do so once."""
     level = _sampled(mask, at)
     crossings = (level[:, :-1] > 0) != (level[:, 1:] > 0)
     return _crossed(level, crossings.argmax(1), steps, (crossings.sum(1) == 1) & (level[:, 0] > 0))
 
 
 def _last_edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """As `_edge`, of a mask with holes: the last step at which a line leaves it; NaN where it ends inside."""
+    """As `_edge`, of a mask with holes: the last step at which a line leaves it; NaN where it ends
+    inside."""
     level = _sampled(mask, at)
     leaves = (level[:, :-1] > 0) & (level[:, 1:] <= 0)
     last = leaves.shape[1] - 1 - leaves[:, ::-1].argmax(1)
@@ -85,12 +95,17 @@ def _sampled(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Mask (H, W) at pixels (N, S, 2), minus a half."""
     from scipy.ndimage import map_coordinates
 
-    found = map_coordinates(mask, [at[..., 1] - 0.5, at[..., 0] - 0.5], np.float32, order=1, mode="nearest")
+    found = map_coordinates(
+        mask, [at[..., 1] - 0.5, at[..., 0] - 0.5], np.float32, order=1, mode="nearest"
+    )
     return np.asarray(found - 0.5)
 
 
-def _crossed(level: np.ndarray, last: np.ndarray, steps: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Step (N,) at which levels (N, S) pass zero between `last` (N,) and the next; NaN where not valid."""
+def _crossed(
+    level: np.ndarray, last: np.ndarray, steps: np.ndarray, valid: np.ndarray
+) -> np.ndarray:
+    """Step (N,) at which levels (N, S) pass zero between `last` (N,) and the next; NaN where not
+    valid."""
     row = np.arange(len(level))
     before, after = level[row, last], level[row, last + 1]
     share = before / np.where(valid, before - after, 1)

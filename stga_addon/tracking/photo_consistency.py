@@ -1,4 +1,5 @@
-"""Where a surface lies along its normals, from patches of calibrated images that agree (multi-view stereo)."""
+"""Where a surface lies along its normals, from patches of calibrated images that agree (multi-view
+stereo)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +14,12 @@ PATCH_SAMPLES = 9
 MAX_CAMERAS = 6
 """Cameras that a patch is compared in: those that see it most squarely."""
 MIN_COSINE = 0.35
-"""Of the angle between normal and camera: 70°, beyond which a patch is too foreshortened to compare."""
+"""Of the angle between normal and camera: 70°, beyond which a patch is too foreshortened to
+compare."""
 MIN_CORRELATION = 0.5
 NOISE_LEVELS = 2.0
-"""Standard deviation of image noise, of 255: patches with less contrast than this do not correlate."""
+"""Standard deviation of image noise, of 255: patches with less contrast than this do not
+correlate."""
 OCCLUSION_M = 0.004
 """A point this far behind the nearest surface is hidden."""
 DEPTH_IMAGE_SIDE = 300
@@ -25,7 +28,8 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 @dataclass(frozen=True)
 class Sweep:
-    """Offsets to try, in meters: from −reach to +reach, a step apart; samples of a patch are `spacing` apart."""
+    """Offsets to try, in meters: from −reach to +reach, a step apart; samples of a patch are
+    `spacing` apart."""
 
     reach: float
     step: float
@@ -46,12 +50,17 @@ class GrayView:
 
 
 def gray_view(camera: Camera, image: np.ndarray, center: np.ndarray, spacing: float) -> GrayView:
-    """The image (H, W, 3) uint8, reduced as far as its pixels at `center` (3,) stay smaller than `spacing` meters."""
+    """The image (H, W, 3) uint8, reduced as far as its pixels at `center` (3,) stay smaller than
+    `spacing` meters."""
     pixel = float(camera.project(center[None])[1][0]) / camera.fl_x
     factor = int(np.clip(spacing / max(pixel, 1e-9), 1, min(image.shape[:2])))
     gray = image.astype(np.float32) @ LUMA
     height, width = (side // factor * factor for side in gray.shape)
-    reduced = gray[:height, :width].reshape(height // factor, factor, width // factor, factor).mean((1, 3))
+    reduced = (
+        gray[:height, :width]
+        .reshape(height // factor, factor, width // factor, factor)
+        .mean((1, 3))
+    )
     scaled = Camera(
         width // factor,
         height // factor,
@@ -70,13 +79,18 @@ def facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarra
     return np.asarray((towards * normals).sum(1) / np.linalg.norm(towards, axis=1))
 
 
-def in_sight(camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 3) that the mesh does not hide, tested in a depth image of reduced size."""
+def in_sight(
+    camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """(N,) bool: points (N, 3) that the mesh does not hide, tested in a depth image of reduced
+    size."""
     small = camera.scaled(min(1.0, DEPTH_IMAGE_SIDE / max(camera.width, camera.height)))
     triangle, inside = rasterize(vertices, faces, small)
     covered = triangle >= 0
     closeness = np.zeros(triangle.shape)
-    closeness[covered] = (inside[covered] / small.project(vertices)[1][faces[triangle[covered]]]).sum(1)
+    closeness[covered] = (
+        inside[covered] / small.project(vertices)[1][faces[triangle[covered]]]
+    ).sum(1)
     flat, depth = small.project(points)
     x, y = np.clip(np.nan_to_num(flat), -1, [small.width, small.height]).astype(np.int64).T
     within = (flat >= 0).all(1) & (x < small.width) & (y < small.height) & (depth > 0)
@@ -86,12 +100,18 @@ def in_sight(camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np
 
 
 def surface_offsets(
-    views: Sequence[GrayView], cosines: np.ndarray, points: np.ndarray, normals: np.ndarray, sweep: Sweep
+    views: Sequence[GrayView],
+    cosines: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    sweep: Sweep,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Offset (N,) in meters along the normals at which the images agree best, and their correlation (N,) there.
+    """Offset (N,) in meters along the normals at which the images agree best, and their correlation
+    (N,) there.
 
-    points, normals (N, 3); cosines (C, N) as `facing` gives them, 0 for what a camera does not see. The correlation is
-    0 where fewer than two cameras see a point, where they agree too little, and where no offset is a maximum.
+    points, normals (N, 3); cosines (C, N) as `facing` gives them, 0 for what a camera does not see.
+    The correlation is 0 where fewer than two cameras see a point, where they agree too little, and
+    where no offset is a maximum.
     """
     correlation = _correlations(views, cosines, points, normals, sweep)
     offsets, rows = sweep.offsets, np.arange(len(points))
@@ -104,16 +124,25 @@ def surface_offsets(
 
 
 def _correlations(
-    views: Sequence[GrayView], cosines: np.ndarray, points: np.ndarray, normals: np.ndarray, sweep: Sweep
+    views: Sequence[GrayView],
+    cosines: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    sweep: Sweep,
 ) -> np.ndarray:
     """Mean correlation (N, D) of all pairs of patches, weighted by the cosines of both cameras."""
     usable = np.where(cosines > MIN_COSINE, cosines, 0.0)
-    worst = -np.sort(-usable, axis=0)[: MAX_CAMERAS + 1][-1] if len(views) > MAX_CAMERAS else np.zeros(len(points))
+    worst = (
+        -np.sort(-usable, axis=0)[: MAX_CAMERAS + 1][-1]
+        if len(views) > MAX_CAMERAS
+        else np.zeros(len(points))
+    )
     usable = np.where(usable > worst, usable, 0.0)
     patches, window = _patches(points, normals, sweep.spacing)
     offsets = sweep.offsets.astype(np.float32)
     total = np.zeros((len(points), len(offsets), len(window)), np.float32)
-    own = np.zeros((len(points), len(offsets)), np.float32)  # what a patch would add by agreeing with itself
+    # what a patch would add by agreeing with itself
+    own = np.zeros((len(points), len(offsets)), np.float32)
     for view, cosine in zip(views, usable, strict=True):
         rows = np.flatnonzero(cosine)
         if len(rows):
@@ -125,8 +154,11 @@ def _correlations(
     return np.asarray(((total**2).sum(2) - own) / np.maximum(pairs, 1e-6)[:, None])
 
 
-def _patches(points: np.ndarray, normals: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sample positions (N, P, 3) in the tangent planes, and weights (P,) that fall off from the center."""
+def _patches(
+    points: np.ndarray, normals: np.ndarray, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sample positions (N, P, 3) in the tangent planes, and weights (P,) that fall off from the
+    center."""
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(axis, normals)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
@@ -134,22 +166,32 @@ def _patches(points: np.ndarray, normals: np.ndarray, spacing: float) -> tuple[n
     steps = np.arange(PATCH_SAMPLES) - (PATCH_SAMPLES - 1) / 2
     u, v = (part.ravel() for part in np.meshgrid(steps, steps, indexing="ij"))
     weight = np.exp(-(u**2 + v**2) / (2 * (0.3 * PATCH_SAMPLES) ** 2))
-    positions = points[:, None] + spacing * (u[:, None] * across[:, None] + v[:, None] * along[:, None])
+    positions = points[:, None] + spacing * (
+        u[:, None] * across[:, None] + v[:, None] * along[:, None]
+    )
     return positions, (weight / weight.sum()).astype(np.float32)
 
 
-def _sampled(view: GrayView, patches: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Levels (M, D, P) of the patches (M, P, 3) moved along their normals by each of the offsets (D,)."""
+def _sampled(
+    view: GrayView, patches: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Levels (M, D, P) of the patches (M, P, 3) moved along their normals by each of the offsets
+    (D,)."""
     import cv2
 
     camera, turn = view.camera, view.camera.world_to_camera[:3, :3]
     local = (patches @ turn.T + view.camera.world_to_camera[:3, 3]).astype(np.float32)
     moved = offsets[None, :, None] * (normals @ turn.T).astype(np.float32)[:, None, :]  # (M, D, 3)
     depth = local[:, None, :, 2] + moved[..., 2:3]
-    x = (local[:, None, :, 0] + moved[..., 0:1]) / depth * np.float32(camera.fl_x) + np.float32(camera.cx - 0.5)
-    y = (local[:, None, :, 1] + moved[..., 1:2]) / depth * np.float32(camera.fl_y) + np.float32(camera.cy - 0.5)
+    x = (local[:, None, :, 0] + moved[..., 0:1]) / depth * np.float32(camera.fl_x) + np.float32(
+        camera.cx - 0.5
+    )
+    y = (local[:, None, :, 1] + moved[..., 1:2]) / depth * np.float32(camera.fl_y) + np.float32(
+        camera.cy - 0.5
+    )
     found = np.empty(x.shape, np.float32)
-    # Coordinates apart, unlike `appearance.sampled`: to pair them takes five times as long as to look them up.
+    # Coordinates apart, unlike `appearance.sampled`: to pair them takes five times as long as to
+    # look them up.
     for row in range(len(x)):
         cv2.remap(view.image, x[row], y[row], cv2.INTER_LINEAR, found[row], cv2.BORDER_REPLICATE)
     return found

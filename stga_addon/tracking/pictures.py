@@ -26,20 +26,29 @@ COLUMNS = 2
 """Most frames of a picture, in each direction."""
 
 Show = Callable[[Callable[[], np.ndarray | None], Mapping[str, float]], None]
-"""Called with what draws a picture (SIZE, SIZE, 3) uint8 for those who watch, None: there is nothing to see; and with
-figures of how well the head fits (`format.describe_figures`)."""
+"""Called with what draws a picture (SIZE, SIZE, 3) uint8 for those who watch, None: there is
+nothing to see; and with figures of how well the head fits (`format.describe_figures`)."""
 
 
 def picture_of_first_frame(
-    head: HeadModel, footage: Footage, detector: FaceNetworks, places: SurfacePoints, reliable: np.ndarray
+    head: HeadModel,
+    footage: Footage,
+    detector: FaceNetworks,
+    places: SurfacePoints,
+    reliable: np.ndarray,
 ) -> np.ndarray | None:
-    """The head on the first frame, found within seconds; None where no face, or several, are seen there."""
+    """The head on the first frame, found within seconds; None where no face, or several, are seen
+    there."""
     timestep = footage.timesteps[0]
-    seeing = evenly_spread([camera for camera in footage.cameras if timestep in camera.timesteps], FIRST_CAMERAS)
+    seeing = evenly_spread(
+        [camera for camera in footage.cameras if timestep in camera.timesteps], FIRST_CAMERAS
+    )
     found = [(camera, detector.detect(camera.image(timestep))) for camera in seeing]
     alone = [(camera.camera, faces[0]) for camera, faces in found if len(faces) == 1]
     points = np.array([face for _, face in alone]).reshape(-1, len(places), 2)
-    seen = TimestepLandmarks(tuple(camera for camera, _ in alone), points, np.ones(points.shape[:2]))
+    seen = TimestepLandmarks(
+        tuple(camera for camera, _ in alone), points, np.ones(points.shape[:2])
+    )
     if not determines_pose(seen, reliable, places.on(head.model.v_template, head.model.faces)):
         return None
     with suppress(StgaError):  # the whole take may still be tracked, and says what is wrong
@@ -66,12 +75,16 @@ def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
     return picture
 
 
-def _square(image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
+def _square(
+    image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, side: int
+) -> np.ndarray:
     """The head in the image with the mesh over it, (side, side, 3); black beyond the image."""
     left, top, right, bottom = head_box(camera, vertices)
     size = max(right - left, bottom - top)
     left, top = (left + right - size) // 2, (top + bottom - size) // 2
-    cut = replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top).scaled(side / size)
+    cut = replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top).scaled(
+        side / size
+    )
     cropped = Image.fromarray(image).crop((left, top, left + size, top + size))
     small = cropped.resize((cut.width, cut.height), Image.Resampling.BILINEAR)
     drawn = with_mesh(np.asarray(small), vertices, faces, cut)

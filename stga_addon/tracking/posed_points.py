@@ -26,7 +26,8 @@ class SurfacePoints:
         return len(self.face)
 
     def on(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Their positions (N, 3), or other values (N, …) interpolated, from those of the vertices (V, …)."""
+        """Their positions (N, 3), or other values (N, …) interpolated, from those of the vertices
+        (V, …)."""
         return np.asarray(np.einsum("nk,nk...->n...", self.barycentric, vertices[faces[self.face]]))
 
 
@@ -36,9 +37,11 @@ def head_rotation(parameters: np.ndarray) -> np.ndarray:
 
 
 class PosedPoints:
-    """The model's arrays at surface points; parameters are K coefficients and P = 18 numbers of pose and translation.
+    """The model's arrays at surface points; parameters are K coefficients and P = 18 numbers of
+    pose and translation.
 
-    Coefficients are those of `dirs`: identity and expression, or fewer. Pose is (5, 3) axis-angle, as in `FlameFrame`.
+    Coefficients are those of `dirs`: identity and expression, or fewer. Pose is (5, 3) axis-angle,
+    as in `FlameFrame`.
     """
 
     def __init__(self, model: FlameModel, points: SurfacePoints) -> None:
@@ -50,7 +53,9 @@ class PosedPoints:
         self.joints = model.j_regressor @ model.v_template
         self.joint_dirs = np.tensordot(model.j_regressor, model.shapedirs, 1)
         self._below = _below(self.parents)
-        self._corner_weights = (self.weights * self.barycentric.reshape(-1, 1)).T.reshape(len(self.parents), -1, 3)
+        self._corner_weights = (self.weights * self.barycentric.reshape(-1, 1)).T.reshape(
+            len(self.parents), -1, 3
+        )
         self._last: tuple[bytes, _Posed] | None = None
 
     def positions(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
@@ -61,9 +66,13 @@ class PosedPoints:
         """(N, 3) unit normals of the posed triangles that the points lie on."""
         a, b, c = self._posed(coefficients, rigid).corners.reshape(-1, 3, 3).swapaxes(0, 1)
         normals = np.cross(b - a, c - a)
-        return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20))
+        return np.asarray(
+            normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        )
 
-    def linearized(self, coefficients: np.ndarray, rigid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearized(
+        self, coefficients: np.ndarray, rigid: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
         posed, count = self._posed(coefficients, rigid), len(self.barycentric)
         turns = [left_jacobian(angles) for angles in posed.angles]
@@ -71,8 +80,12 @@ class PosedPoints:
         found = np.empty((count, 3, first + RIGID_SIZE))
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
-        moved = _moves(posed.rotations, self._placed(posed.rotations, self.joint_dirs), self.joint_dirs)
-        found[..., :first] = skin @ self.dirs.reshape(count, 9, first) + np.tensordot(share.T, moved, 1)
+        moved = _moves(
+            posed.rotations, self._placed(posed.rotations, self.joint_dirs), self.joint_dirs
+        )
+        found[..., :first] = skin @ self.dirs.reshape(count, 9, first) + np.tensordot(
+            share.T, moved, 1
+        )
         found[..., first:-TRANSLATION_SIZE] = self._by_joints(posed, turns)
         if self.posedirs is not None:
             bent = self._corrective_dirs(self.posedirs, posed, turns).reshape(count, 9, -1)
@@ -81,7 +94,8 @@ class PosedPoints:
         return posed.positions, found
 
     def _posed(self, coefficients: np.ndarray, rigid: np.ndarray) -> "_Posed":
-        """The last one is kept: positions, normals and derivatives are mostly asked for together."""
+        """The last one is kept: positions, normals and derivatives are mostly asked for
+        together."""
         key = np.concatenate([coefficients, rigid]).tobytes()
         if self._last is None or self._last[0] != key:
             self._last = key, self._posed_now(coefficients, rigid)
@@ -106,8 +120,11 @@ class PosedPoints:
         return _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
 
     @staticmethod
-    def _corrective_dirs(posedirs: np.ndarray, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (3 N, 3, 15) of the corners' correctives by the joints' axis-angles; the root has none."""
+    def _corrective_dirs(
+        posedirs: np.ndarray, posed: "_Posed", turns: list[np.ndarray]
+    ) -> np.ndarray:
+        """Derivatives (3 N, 3, 15) of the corners' correctives by the joints' axis-angles; the root
+        has none."""
         bent = np.zeros((posedirs.shape[2], POSE_SIZE))
         for joint in range(1, len(turns)):
             changes = cross_matrices(turns[joint].T) @ posed.local[joint]
@@ -115,9 +132,11 @@ class PosedPoints:
         return np.asarray((posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
 
     def _by_joints(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (N, 3, 15) by the axis-angles of the joints, whose `left_jacobian` is given; no correctives.
+        """Derivatives (N, 3, 15) by the axis-angles of the joints, whose `left_jacobian` is given;
+        no correctives.
 
-        Turning a joint turns about it what it and the joints below it carry, each with its share of the skin.
+        Turning a joint turns about it what it and the joints below it carry, each with its share of
+        the skin.
         """
         turned = posed.corrected @ posed.rotations.swapaxes(1, 2) + posed.moved[:, None]
         corners = turned.reshape(*self._corner_weights.shape, 3)
@@ -125,12 +144,15 @@ class PosedPoints:
         share = self._below @ self._corner_weights.sum(2)
         arms = np.tensordot(self._below, carried, 1) - share[..., None] * posed.places[:, None]
         parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
-        across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ np.stack(turns)).reshape(-1, 3, 9)
+        across = np.einsum(
+            "yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ np.stack(turns)
+        ).reshape(-1, 3, 9)
         by_joint = (arms @ across).reshape(*arms.shape, 3)
         return np.asarray(by_joint.transpose(1, 2, 0, 3).reshape(len(by_joint[0]), 3, POSE_SIZE))
 
     def _placed(self, rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
-        """World positions (5, 3, K) of joints (5, 3, K), or their derivatives, in which the result is linear."""
+        """World positions (5, 3, K) of joints (5, 3, K), or their derivatives, in which the result
+        is linear."""
         place = joints.copy()
         for joint, parent in enumerate(self.parents):
             if parent >= 0:
@@ -138,16 +160,19 @@ class PosedPoints:
         return place
 
     def _weighted(self, values: np.ndarray) -> np.ndarray:
-        """Values (3 N, …) at the triangles' corners as (N, 3 corners, …), times the barycentric coordinates."""
+        """Values (3 N, …) at the triangles' corners as (N, 3 corners, …), times the barycentric
+        coordinates."""
         shaped = values.reshape(len(self.barycentric), 3, *values.shape[1:])
-        return np.asarray(shaped * self.barycentric.reshape(len(shaped), 3, *([1] * (values.ndim - 1))))
+        return np.asarray(
+            shaped * self.barycentric.reshape(len(shaped), 3, *([1] * (values.ndim - 1)))
+        )
 
 
 @dataclass(frozen=True)
 class _Posed:
-    """One evaluation: positions (N, 3); of J joints axis-angles (J, 3), local and world rotations (J, 3, 3), places in
-    the world (J, 3) and `_moves` (J, 3); of the 3 N corners, corrected positions, blended rotations (3 N, 3, 3) and
-    positions."""
+    """One evaluation: positions (N, 3); of J joints axis-angles (J, 3), local and world rotations
+    (J, 3, 3), places in the world (J, 3) and `_moves` (J, 3); of the 3 N corners, corrected
+    positions, blended rotations (3 N, 3, 3) and positions."""
 
     positions: np.ndarray
     angles: np.ndarray

@@ -19,23 +19,26 @@ from .write_capture import posed_mesh
 POINT_SHARE = 0.25
 """Weight of a surface point: patches of neighboring points share most of their pixels."""
 DIRECTIONS = 6
-"""Steps of a direction's coordinates, about 10°: from within one step, a head hides the same of itself."""
+"""Steps of a direction's coordinates, about 10°: from within one step, a head hides the same of
+itself."""
 MIN_PART_SHARE = 0.33
 """Connected parts smaller than this share of the head (eyeballs, teeth) have no surface points."""
 
 MAX_OUTLINE_DISTANCE_M = 0.0005
-"""Median distance of the masks' outlines from the surface in the images, beyond which they are not those of the skin:
-mattes are often a pixel or two too wide, and hair hangs over faces."""
+"""Median distance of the masks' outlines from the surface in the images, beyond which they are not
+those of the skin: mattes are often a pixel or two too wide, and hair hangs over faces."""
 MIN_OUTLINE_POINTS = 100
 OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
 
 
 class Images(Protocol):
-    """Gives, of a timestep, cameras in the footage's world and their images (H, W, 3) or masks (H, W), uint8; at most
-    so many, spread over the rig."""
+    """Gives, of a timestep, cameras in the footage's world and their images (H, W, 3) or masks (H,
+    W), uint8; at most so many, spread over the rig."""
 
-    def __call__(self, timestep: int, most: int | None = None) -> Sequence[tuple[Camera, np.ndarray]]: ...
+    def __call__(
+        self, timestep: int, most: int | None = None
+    ) -> Sequence[tuple[Camera, np.ndarray]]: ...
 
 
 VisiblePoints = dict[tuple[int, ...], np.ndarray]
@@ -49,7 +52,8 @@ def no_masks(timestep: int, most: int | None = None) -> Sequence[tuple[Camera, n
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """Where cameras see N points of a surface: positions (N, 3) in meters, unit normals (N, 3) and weights (N,)."""
+    """Where cameras see N points of a surface: positions (N, 3) in meters, unit normals (N, 3) and
+    weights (N,)."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -58,8 +62,8 @@ class SeenSurface:
 
 @dataclass(frozen=True)
 class RecordedTake:
-    """What was recorded: places of landmarks on the head, which are reliable, landmarks by timestep, images, masks, and
-    whether the world of the cameras is in meters."""
+    """What was recorded: places of landmarks on the head, which are reliable, landmarks by
+    timestep, images, masks, and whether the world of the cameras is in meters."""
 
     places: SurfacePoints
     reliable: np.ndarray
@@ -69,14 +73,17 @@ class RecordedTake:
     metric: bool = False
 
 
-def excerpt(fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]) -> tuple[HeadFit, RecordedTake]:
+def excerpt(
+    fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]
+) -> tuple[HeadFit, RecordedTake]:
     """The fit and the take at some timesteps."""
     own = replace(fit, parameters={t: fit.parameters[t] for t in timesteps})
     return own, replace(take, landmarks={t: take.landmarks[t] for t in timesteps})
 
 
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:
-    """Centers of about `count` triangles, spread evenly over the area of the head's large connected parts."""
+    """Centers of about `count` triangles, spread evenly over the area of the head's large connected
+    parts."""
     vertices, faces = head.model.v_template, head.model.faces
     large = large_parts(head.model)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -89,7 +96,9 @@ def large_parts(model: FlameModel) -> np.ndarray:
     """(F,) bool: triangles of connected parts larger than eyeballs and teeth."""
     vertices, faces = model.v_template, model.faces
     numbers, part = np.unique(connected_parts(len(vertices), faces), return_inverse=True)
-    extent = np.array([np.ptp(vertices[part == number], axis=0).max() for number in range(len(numbers))])
+    extent = np.array(
+        [np.ptp(vertices[part == number], axis=0).max() for number in range(len(numbers))]
+    )
     return np.asarray((extent > MIN_PART_SHARE * np.ptp(vertices, axis=0).max())[part[faces[:, 0]]])
 
 
@@ -101,9 +110,11 @@ def seen_surface(
     sweep: Sweep,
     visible: VisiblePoints,
 ) -> SeenSurface:
-    """Where the images show the surface near the fitted head, along its normals; weight 0 for what they do not show.
+    """Where the images show the surface near the fitted head, along its normals; weight 0 for what
+    they do not show.
 
-    `visible` is filled with what is in sight from where, and read for directions that are in it already.
+    `visible` is filled with what is in sight from where, and read for directions that are in it
+    already.
     """
     faces = fit.head.model.faces
     vertices = posed_mesh(fit, fit.parameters[timestep])
@@ -111,12 +122,15 @@ def seen_surface(
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     cameras = [fit.to_capture.camera(camera) for camera, _ in images]
     views = [
-        gray_view(camera, image, at.mean(0), sweep.spacing) for camera, (_, image) in zip(cameras, images, strict=True)
+        gray_view(camera, image, at.mean(0), sweep.spacing)
+        for camera, (_, image) in zip(cameras, images, strict=True)
     ]
     turn, cosines = head_rotation(fit.parameters[timestep]), []
     for camera in cameras:
         direction = (camera.position - at.mean(0)) @ turn
-        key = tuple(np.round(DIRECTIONS * direction / np.linalg.norm(direction)).astype(int).tolist())
+        key = tuple(
+            np.round(DIRECTIONS * direction / np.linalg.norm(direction)).astype(int).tolist()
+        )
         if key not in visible:
             visible[key] = in_sight(camera, vertices, faces, at)
         cosines.append(facing(camera, at, normals) * visible[key])
@@ -133,26 +147,33 @@ def with_outlines(
     near: np.ndarray,
     reach: float,
 ) -> SeenSurface:
-    """The surface with what masks say about points at the head's outline; near (N,) bool: points that this is for."""
+    """The surface with what masks say about points at the head's outline; near (N,) bool: points
+    that this is for."""
     vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
     at = points.on(vertices, faces)
     total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
     for camera, mask in masks:
         posed = fit.to_capture.camera(camera)
-        offset, known = outline_offsets(posed, mask, vertices, faces, at[near], seen.normal[near], reach)
+        offset, known = outline_offsets(
+            posed, mask, vertices, faces, at[near], seen.normal[near], reach
+        )
         total[near] += POINT_SHARE * known
         moved[near] += POINT_SHARE * offset
     mean = moved / np.maximum(total, 1e-9)
     return replace(seen, position=at + mean[:, None] * seen.normal, weight=total)
 
 
-def outlines_agree(fit: HeadFit, take: RecordedTake, points: SurfacePoints, near: np.ndarray, reach: float) -> bool:
-    """Whether the masks end where the surface in the images does; False without masks. reach: meters searched."""
+def outlines_agree(
+    fit: HeadFit, take: RecordedTake, points: SurfacePoints, near: np.ndarray, reach: float
+) -> bool:
+    """Whether the masks end where the surface in the images does; False without masks. reach:
+    meters searched."""
     model, distances = fit.head.model, [np.zeros(0)]
     for timestep, parameters in fit.parameters.items():
         vertices = posed_mesh(fit, parameters)
         at, normals = (
-            points.on(values, model.faces)[near] for values in (vertices, vertex_normals(vertices, model.faces))
+            points.on(values, model.faces)[near]
+            for values in (vertices, vertex_normals(vertices, model.faces))
         )
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         for camera, mask in take.masks(timestep):
@@ -168,5 +189,7 @@ def near_landmarks(head: HeadModel, points: SurfacePoints, take: RecordedTake) -
     from scipy.spatial import cKDTree
 
     template, faces = head.model.v_template, head.model.faces
-    distance, _ = cKDTree(take.places.on(template, faces)[take.reliable]).query(points.on(template, faces))
+    distance, _ = cKDTree(take.places.on(template, faces)[take.reliable]).query(
+        points.on(template, faces)
+    )
     return np.asarray(distance < OUTLINE_RADIUS_M)

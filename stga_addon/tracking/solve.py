@@ -11,7 +11,8 @@ from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation
 
 LANDMARK_SIGMA_M = 0.002
-"""Standard deviation of a landmark over people and views; coefficients have a standard deviation of 1."""
+"""Standard deviation of a landmark over people and views; coefficients have a standard deviation of
+1."""
 SCALE_SIGMA = 0.3
 """Of the capture's scale, relative: the first guess comes from the average head."""
 JOINT_SIGMA_RAD = {
@@ -21,7 +22,8 @@ JOINT_SIGMA_RAD = {
     "left_eye": (0.3, 0.3, 0.01),
     "right_eye": (0.3, 0.3, 0.01),
 }
-"""Landmarks of the face cannot tell the neck's rotation from the head's: nearly all of it becomes the root's."""
+"""Landmarks of the face cannot tell the neck's rotation from the head's: nearly all of it becomes
+the root's."""
 WEIGHT_EXCESS_SIGMA = 0.1
 """By which a coefficient that is a weight from 0 to 1 leaves that range."""
 LID_SHAPES = ("eyeBlinkLeft", "eyeLookDownLeft"), ("eyeBlinkRight", "eyeLookDownRight")
@@ -33,22 +35,26 @@ EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.
 JUMP_SCALE = 3.0
 """Standard deviations of a second difference beyond which it is a cut rather than a motion."""
 MAX_ORDERED_CHANGE = 0.7
-"""Mean squared change of expression and jaw from one timestep to the next, as a share of that between any two, up to
-which timesteps follow each other in time."""
+"""Mean squared change of expression and jaw from one timestep to the next, as a share of that
+between any two, up to which timesteps follow each other in time."""
 IDENTITY_ITERATIONS, TAKE_ITERATIONS = 12, 8
 CONVERGED_STEP = 1e-3
-"""Largest change of a parameter (standard deviations, radians, meters) after which iterations stop."""
+"""Largest change of a parameter (standard deviations, radians, meters) after which iterations
+stop."""
 WINDOW, OVERLAP = 192, 24
-"""Timesteps solved at once, and how many of them two windows share: memory does not grow with the take."""
+"""Timesteps solved at once, and how many of them two windows share: memory does not grow with the
+take."""
 
 
 Terms = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Timestep's number and parameters (E + 18,) -> its Gauss–Newton matrix and right-hand side, which are changed."""
+"""Timestep's number and parameters (E + 18,) -> its Gauss–Newton matrix and right-hand side, which
+are changed."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """Landmarks of one timestep in meters: position (N, 3), square root of the information (N, 3, 3), weight (N,)."""
+    """Landmarks of one timestep in meters: position (N, 3), square root of the information (N, 3,
+    3), weight (N,)."""
 
     position: np.ndarray
     root: np.ndarray
@@ -57,7 +63,8 @@ class Observation:
 
 @dataclass(frozen=True)
 class Identity:
-    """Result of `solve_identity`: coefficients (I,), relative scale, and (T, E + 18) parameters of its timesteps."""
+    """Result of `solve_identity`: coefficients (I,), relative scale, and (T, E + 18) parameters of
+    its timesteps."""
 
     shape: np.ndarray
     scale: float
@@ -71,16 +78,19 @@ def solve_identity(
     rigid: np.ndarray,
     metric: bool = False,
 ) -> Identity:
-    """Identity common to some timesteps, with their expressions and poses; rigid (T, 18) is where poses start.
+    """Identity common to some timesteps, with their expressions and poses; rigid (T, 18) is where
+    poses start.
 
-    The scale of the world is solved as a component: a head `scale` times as large as the model's fits best. Where the
-    world is `metric`, it is 1, and the size of the head is the person's.
+    The scale of the world is solved as a component: a head `scale` times as large as the model's
+    fits best. Where the world is `metric`, it is 1, and the size of the head is the person's.
     """
     model = head.model
     known, expressions = model.n_identity, model.n_expression
     columns = np.split(model.shapedirs, [known], axis=2)
     scale_sigma = 0.0 if metric else SCALE_SIGMA
-    sized = np.concatenate([columns[0], scale_sigma * model.v_template[..., None], columns[1]], axis=2)
+    sized = np.concatenate(
+        [columns[0], scale_sigma * model.v_template[..., None], columns[1]], axis=2
+    )
     points = PosedPoints(replace(model, shapedirs=sized), places)
     shared, own = known + 1, expressions + RIGID_SIZE
     state = np.zeros(shared + own * len(observations))
@@ -109,22 +119,37 @@ def solve_identity(
 
 
 def solve_take(
-    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], start: np.ndarray, ordered: bool
+    head: HeadModel,
+    places: SurfacePoints,
+    observations: Sequence[Observation],
+    start: np.ndarray,
+    ordered: bool,
 ) -> np.ndarray:
-    """Expression and pose (T, E + 18) of consecutive timesteps of a person whose identity is in the template.
+    """Expression and pose (T, E + 18) of consecutive timesteps of a person whose identity is in the
+    template.
 
-    start (T, E + 18). ordered: second differences over time are penalized, but for jumps, such as cuts; else every
-    timestep is solved for itself. Memory does not grow with the take beyond its observations.
+    start (T, E + 18). ordered: second differences over time are penalized, but for jumps, such as
+    cuts; else every timestep is solved for itself. Memory does not grow with the take beyond its
+    observations.
     """
     points = PosedPoints(head.model, places)
-    return _solve_windows(head, lambda row, values: normal_equations(points, values, observations[row]), start, ordered)
+    return _solve_windows(
+        head,
+        lambda row, values: normal_equations(points, values, observations[row]),
+        start,
+        ordered,
+    )
 
 
-def in_order(head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], alone: np.ndarray) -> bool:
-    """Whether a take's timesteps follow each other in time: captures of one expression per timestep do not.
+def in_order(
+    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], alone: np.ndarray
+) -> bool:
+    """Whether a take's timesteps follow each other in time: captures of one expression per timestep
+    do not.
 
-    alone (T, E + 18): each timestep solved for itself. By von Neumann's ratio (1941) over expression and jaw, in
-    standard deviations of the prior, without the variance that the noise of landmarks has in them.
+    alone (T, E + 18): each timestep solved for itself. By von Neumann's ratio (1941) over
+    expression and jaw, in standard deviations of the prior, without the variance that the noise of
+    landmarks has in them.
     """
     if len(alone) < 3:
         return True
@@ -141,7 +166,8 @@ def in_order(head: HeadModel, places: SurfacePoints, observations: Sequence[Obse
 def _landmark_noise(
     head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], alone: np.ndarray
 ) -> np.ndarray:
-    """(E + 18,) mean variance in a timestep's parameters of landmarks that move about their usual places."""
+    """(E + 18,) mean variance in a timestep's parameters of landmarks that move about their usual
+    places."""
     points, prior = PosedPoints(head.model, places), np.diag(parameter_precision(head))
     missed, variance = [], []
     for values, own in zip(alone, observations, strict=True):
@@ -156,10 +182,14 @@ def _landmark_noise(
 
 
 def smooth_take(
-    head: HeadModel, start: np.ndarray, terms: Sequence[tuple[np.ndarray, np.ndarray]], ordered: bool
+    head: HeadModel,
+    start: np.ndarray,
+    terms: Sequence[tuple[np.ndarray, np.ndarray]],
+    ordered: bool,
 ) -> np.ndarray:
-    """Parameters (T, E + 18) of consecutive timesteps from the Gauss–Newton matrix and right-hand side that each has at
-    `start`, with the prior and, of a take that is ordered, smoothness over time."""
+    """Parameters (T, E + 18) of consecutive timesteps from the Gauss–Newton matrix and right-hand
+    side that each has at `start`, with the prior and, of a take that is ordered, smoothness over
+    time."""
 
     def linear(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         matrix, right = terms[row]
@@ -169,7 +199,8 @@ def smooth_take(
 
 
 def person(head: HeadModel, shape: np.ndarray) -> HeadModel:
-    """The head model with identity coefficients (I,) in its template, and expression components alone."""
+    """The head model with identity coefficients (I,) in its template, and expression components
+    alone."""
     model = head.model
     template = model.v_template + model.shapedirs[:, :, : model.n_identity] @ shape
     shapes = np.ascontiguousarray(model.shapedirs[:, :, model.n_identity :])
@@ -181,7 +212,10 @@ def normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Jᵀ W J and −Jᵀ W r of one timestep by its parameters (K + 18,), with soft-L1 weights."""
     positions, jacobian = points.linearized(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
-    residual = np.einsum("nij,nj->ni", observation.root, positions - observation.position) / LANDMARK_SIGMA_M
+    residual = (
+        np.einsum("nij,nj->ni", observation.root, positions - observation.position)
+        / LANDMARK_SIGMA_M
+    )
     weight = observation.weight / np.sqrt(1 + (residual**2).sum(1))
     rows = (np.sqrt(weight)[:, None, None] / LANDMARK_SIGMA_M) * (observation.root @ jacobian)
     flat = rows.reshape(-1, rows.shape[2])
@@ -200,7 +234,9 @@ def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray, ordered: bo
     return solved
 
 
-def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray, ordered: bool) -> np.ndarray:
+def _solve_window(
+    head: HeadModel, terms: Terms, first: int, start: np.ndarray, ordered: bool
+) -> np.ndarray:
     stiffness = acceleration_precision(head.model)
     state, size = start.copy(), start.shape[1]
     blocks, right = np.zeros((len(state), size, size)), np.zeros_like(state)
@@ -220,7 +256,9 @@ def _solve_window(head: HeadModel, terms: Terms, first: int, start: np.ndarray, 
     return state
 
 
-def _smooth_step(blocks: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+def _smooth_step(
+    blocks: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray
+) -> np.ndarray:
     """(T, E + 18) Gauss–Newton step of all timesteps together."""
     from scipy.linalg import solveh_banded
 
@@ -233,12 +271,16 @@ def _smooth_step(blocks: np.ndarray, right: np.ndarray, state: np.ndarray, stiff
     return np.asarray(solveh_banded(band, right.ravel(), lower=True).reshape(count, size))
 
 
-def _add_smoothness(band: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray) -> None:
-    """Add the penalty of second differences to lower bands and right-hand side, with Geman-McClure weights."""
+def _add_smoothness(
+    band: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray
+) -> None:
+    """Add the penalty of second differences to lower bands and right-hand side, with Geman-McClure
+    weights."""
     size = state.shape[1]
     second = state[:-2] - 2 * state[1:-1] + state[2:]
     jump = second**2 * stiffness / JUMP_SCALE**2
-    weight = stiffness / ((1 + jump) * (1 + jump.mean(axis=1, keepdims=True))) ** 2  # a cut changes all parameters
+    # a cut changes all parameters
+    weight = stiffness / ((1 + jump) * (1 + jump.mean(axis=1, keepdims=True))) ** 2
     for number, (difference, share) in enumerate(zip(second, weight, strict=True)):
         for row, first in enumerate((1.0, -2.0, 1.0)):
             right[number + row] -= share * first * difference
@@ -258,10 +300,12 @@ def parameter_precision(head: HeadModel) -> np.ndarray:
 
 
 def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The prior's diagonal Gauss–Newton matrix and right-hand side at parameters (..., E + 18), of the same shape.
+    """The prior's diagonal Gauss–Newton matrix and right-hand side at parameters (..., E + 18), of
+    the same shape.
 
-    `parameter_precision`, and where expressions are weights from 0 to 1 a pull back into that range, also of the sum of
-    LID_SHAPES, whose matrix is replaced by a diagonal one that is never smaller.
+    `parameter_precision`, and where expressions are weights from 0 to 1 a pull back into that
+    range, also of the sum of LID_SHAPES, whose matrix is replaced by a diagonal one that is never
+    smaller.
     """
     precision = np.broadcast_to(parameter_precision(head), values.shape).copy()
     right = -precision * values
@@ -271,7 +315,11 @@ def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.nda
         precision[..., :-RIGID_SIZE] += (excess != 0) / WEIGHT_EXCESS_SIGMA**2
         right[..., :-RIGID_SIZE] -= excess / WEIGHT_EXCESS_SIGMA**2
         for lid in LID_SHAPES:
-            columns = [head.model.expression_names.index(name) for name in lid if name in head.model.expression_names]
+            columns = [
+                head.model.expression_names.index(name)
+                for name in lid
+                if name in head.model.expression_names
+            ]
             beyond = np.maximum(weights[..., columns].sum(-1, keepdims=True) - 1, 0)
             precision[..., columns] += len(lid) * (beyond > 0) / WEIGHT_EXCESS_SIGMA**2
             right[..., columns] -= beyond / WEIGHT_EXCESS_SIGMA**2

@@ -1,4 +1,5 @@
-"""From a head fitted to landmarks to one fitted to the skin that the cameras see, with the person's own offsets."""
+"""From a head fitted to landmarks to one fitted to the skin that the cameras see, with the person's
+own offsets."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -31,33 +32,40 @@ from .smooth_offsets import SURFACE_SIGMA_M, smooth_offsets
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
 from .write_capture import posed_mesh
 
-IDENTITY_SWEEPS = Sweep(0.010, 0.001, 0.0015), Sweep(0.004, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001)
+IDENTITY_SWEEPS = (
+    Sweep(0.010, 0.001, 0.0015),
+    Sweep(0.004, 0.0005, 0.001),
+    Sweep(0.003, 0.0005, 0.001),
+)
 OUTLINE_SWEEPS = Sweep(0.003, 0.0005, 0.001), Sweep(0.003, 0.0005, 0.001)
 """After the others, where the masks' outlines are those of the skin."""
 TAKE_SWEEPS = (Sweep(0.004, 0.0005, 0.001), 300), (Sweep(0.0015, 0.0005, 0.001), 1000)
-"""At every timestep, and how many of the points that are usually found are looked for. The first starts at the pose of
-the landmarks, from which patches do not lie on the skin that they are of yet."""
+"""At every timestep, and how many of the points that are usually found are looked for. The first
+starts at the pose of the landmarks, from which patches do not lie on the skin that they are of
+yet."""
 SURFACE_POINTS = 2000
 """Points over the whole head."""
 SURFACE_TIMESTEPS = 6
 """Timesteps, spread over the take, whose surfaces identity and offsets are solved from."""
 LANDMARK_SHARE = 0.1
-"""Weight of landmarks beside surface points: a detector's errors are the same in every frame and stay."""
+"""Weight of landmarks beside surface points: a detector's errors are the same in every frame and
+stay."""
 TAKE_LANDMARK_SHARE = 0.2
-"""The same once these errors are taken off, which takes several timesteps: where skin slides along itself, as brows do,
-only landmarks show it."""
+"""The same once these errors are taken off, which takes several timesteps: where skin slides along
+itself, as brows do, only landmarks show it."""
 LIPS_LANDMARK_SHARE = 1.0
 """Weight of the lips' landmarks, beside which the surface does not show whether lips touch."""
 MIN_SEEN_POINTS = 150
-"""Points of the surface that have to be found at a timestep; below it, landmarks are the better evidence."""
+"""Points of the surface that have to be found at a timestep; below it, landmarks are the better
+evidence."""
 MIN_SEEN_SHARE = 0.5
 """Share of the timesteps in which a point must be found to be looked for at every timestep."""
 
 PART_TIMESTEPS = 24
 """At most, of the parts of a take that are searched at once."""
 FEW_CAMERAS = 3
-"""Median over the timesteps of the cameras that see a face, up to which expressions and poses of dense tracking are
-nearer to the truth than those of the surface (docs/experiments.md)."""
+"""Median over the timesteps of the cameras that see a face, up to which expressions and poses of
+dense tracking are nearer to the truth than those of the surface (docs/experiments.md)."""
 MAX_OUTLINE_CAMERAS = 8
 """Cameras whose masks are compared at every timestep."""
 
@@ -70,14 +78,16 @@ def fit_surface(
     report: Report = lambda stage, done, total: None,
     dense: bool = False,
 ) -> HeadFit:
-    """The fit moved onto the surface that several cameras see; unchanged where no timestep has landmarks of several
-    cameras, or where the images do not show enough of it.
+    """The fit moved onto the surface that several cameras see; unchanged where no timestep has
+    landmarks of several cameras, or where the images do not show enough of it.
 
-    Rounds of finding the surface along the normals, and of solving scale, identity, expression and pose from it, then
-    the person's smooth offsets; at last expression and pose of every timestep. Landmarks stay in at a small weight.
-    Timesteps are searched at once, by helping processes. `fit` is what `fit_head` returns for `head`, or, with `dense`,
-    `fit_dense`: landmarks are then where that fit has them, because it knows how skin slides along itself, which the
-    surface does not show; with up to FEW_CAMERAS cameras, its expressions and poses are kept.
+    Rounds of finding the surface along the normals, and of solving scale, identity, expression and
+    pose from it, then the person's smooth offsets; at last expression and pose of every timestep.
+    Landmarks stay in at a small weight. Timesteps are searched at once, by helping processes. `fit`
+    is what `fit_head` returns for `head`, or, with `dense`,
+    `fit_dense`: landmarks are then where that fit has them, because it knows how skin slides along
+    itself, which the surface does not show; with up to FEW_CAMERAS cameras, its expressions and
+    poses are kept.
     """
     timesteps = sorted(take.landmarks)
     several = [t for t in timesteps if len(take.landmarks[t].cameras) > 1]
@@ -85,13 +95,19 @@ def fit_surface(
         return fit
     chosen = evenly_spread(several, SURFACE_TIMESTEPS)
     visibility = LandmarkVisibility(fit.head, take.places)
-    visible = {t: visibility.weighted(own, fit.parameters[t], fit.to_capture) for t, own in take.landmarks.items()}
+    visible = {
+        t: visibility.weighted(own, fit.parameters[t], fit.to_capture)
+        for t, own in take.landmarks.items()
+    }
     take = replace(take, landmarks=visible)
     early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
     steps = early + len(timesteps)
     points = surface_points(head, SURFACE_POINTS)
     near = near_landmarks(head, points, take)
-    start, without = replace(fit, parameters={t: fit.parameters[t] for t in chosen}), replace(take, masks=no_masks)
+    start, without = (
+        replace(fit, parameters={t: fit.parameters[t] for t in chosen}),
+        replace(take, masks=no_masks),
+    )
 
     def search(work: Callable[..., list], parts: Sequence[tuple], before: int) -> list:
         results = helpers.map(work, parts, lambda done: report("Surface", before + done, steps))
@@ -112,7 +128,9 @@ def fit_surface(
     else:
         observed = {t: _landmarks(solved[0], t, take) for t in timesteps}
     often = [_often_seen(points, solved[1], count) for _, count in TAKE_SWEEPS]
-    return _whole_take(solved[0], fit, take, observed, often, lambda work, parts: search(work, parts, early))
+    return _whole_take(
+        solved[0], fit, take, observed, often, lambda work, parts: search(work, parts, early)
+    )
 
 
 def _identity(
@@ -125,10 +143,11 @@ def _identity(
     search: Callable[..., list],
     before: int,
 ) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
-    """Identity, scale and offsets from the timesteps of `found`, and the surfaces that they were solved from.
+    """Identity, scale and offsets from the timesteps of `found`, and the surfaces that they were
+    solved from.
 
-    near: as of `with_outlines`. search(work, parts, steps before it): results of the helping processes. None where the
-    images do not show enough of the surface.
+    near: as of `with_outlines`. search(work, parts, steps before it): results of the helping
+    processes. None where the images do not show enough of the surface.
     """
     offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
     for number, sweep in enumerate(sweeps):
@@ -140,12 +159,19 @@ def _identity(
         found, seen = _solved(with_offset(head, offset), found, take, points, seen)
         if number:
             offset = offset + _offsets(found, points, seen)
-            found = replace(found, head=person(with_offset(head, offset), found.shape), static_offset=offset)
+            found = replace(
+                found, head=person(with_offset(head, offset), found.shape), static_offset=offset
+            )
     return found, seen
 
 
 def _seen_part(
-    fit: HeadFit, take: RecordedTake, points: SurfacePoints, near: np.ndarray, sweep: Sweep, step: Step
+    fit: HeadFit,
+    take: RecordedTake,
+    points: SurfacePoints,
+    near: np.ndarray,
+    sweep: Sweep,
+    step: Step,
 ) -> list[SeenSurface]:
     """The surface at each of the fit's timesteps, from images and masks."""
     seen = []
@@ -162,9 +188,14 @@ def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
 
 
 def _solved(
-    base: HeadModel, fit: HeadFit, take: RecordedTake, points: SurfacePoints, seen: Mapping[int, SeenSurface]
+    base: HeadModel,
+    fit: HeadFit,
+    take: RecordedTake,
+    points: SurfacePoints,
+    seen: Mapping[int, SeenSurface],
 ) -> tuple[HeadFit, dict[int, SeenSurface]]:
-    """Scale, identity, expressions and poses that fit surface and landmarks; and the surface in the new scale."""
+    """Scale, identity, expressions and poses that fit surface and landmarks; and the surface in the
+    new scale."""
     share = _landmark_shares(base, take.places)
     together = [_joined(_landmarks(fit, t, take), share, own) for t, own in seen.items()]
     starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
@@ -175,34 +206,53 @@ def _solved(
         head=person(base, identity.shape),
         shape=identity.shape,
         parameters=dict(zip(seen, identity.frames, strict=True)),
-        to_capture=replace(world, scale=world.scale / identity.scale, translation=world.translation / identity.scale),
+        to_capture=replace(
+            world,
+            scale=world.scale / identity.scale,
+            translation=world.translation / identity.scale,
+        ),
     )
-    return moved, {t: replace(own, position=own.position / identity.scale) for t, own in seen.items()}
+    return moved, {
+        t: replace(own, position=own.position / identity.scale) for t, own in seen.items()
+    }
 
 
 def _offsets(fit: HeadFit, points: SurfacePoints, seen: Mapping[int, SeenSurface]) -> np.ndarray:
-    """(V, 3) along the normals of the person's template, from what is left between it and the surfaces."""
+    """(V, 3) along the normals of the person's template, from what is left between it and the
+    surfaces."""
     model = fit.head.model
     missing = [
-        ((own.position - points.on(posed_mesh(fit, fit.parameters[t]), model.faces)) * own.normal).sum(1)
+        (
+            (own.position - points.on(posed_mesh(fit, fit.parameters[t]), model.faces)) * own.normal
+        ).sum(1)
         for t, own in seen.items()
     ]
-    repeated = SurfacePoints(np.tile(points.face, len(seen)), np.tile(points.barycentric, (len(seen), 1)))
+    repeated = SurfacePoints(
+        np.tile(points.face, len(seen)), np.tile(points.barycentric, (len(seen), 1))
+    )
     weight = np.concatenate([own.weight for own in seen.values()]) / len(seen)
-    values = smooth_offsets(model.v_template, model.faces, repeated, np.concatenate(missing), weight)
+    values = smooth_offsets(
+        model.v_template, model.faces, repeated, np.concatenate(missing), weight
+    )
     return np.asarray(values[:, None] * vertex_normals(model.v_template, model.faces))
 
 
-def _often_seen(points: SurfacePoints, seen: Mapping[int, SeenSurface], count: int) -> SurfacePoints:
+def _often_seen(
+    points: SurfacePoints, seen: Mapping[int, SeenSurface], count: int
+) -> SurfacePoints:
     """Up to `count` of the points that are found at most timesteps."""
-    often = np.flatnonzero(np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE)
+    often = np.flatnonzero(
+        np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE
+    )
     rows = often[:: 1 + len(often) // count]
     return SurfacePoints(points.face[rows], points.barycentric[rows])
 
 
-def _posed_alike(fit: HeadFit, first: HeadFit, take: RecordedTake, observed: Mapping[int, Observation]) -> HeadFit:
-    """The fit with its landmarks where they are on `first`. The parameters of `first` itself would put them elsewhere,
-    because its identity is another."""
+def _posed_alike(
+    fit: HeadFit, first: HeadFit, take: RecordedTake, observed: Mapping[int, Observation]
+) -> HeadFit:
+    """The fit with its landmarks where they are on `first`. The parameters of `first` itself would
+    put them elsewhere, because its identity is another."""
     start = np.stack([first.parameters[t] for t in observed])
     solved = solve_take(fit.head, take.places, list(observed.values()), start, fit.ordered)
     return replace(fit, parameters=dict(zip(observed, solved, strict=True)))
@@ -218,8 +268,9 @@ def _whole_take(
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
 
-    observed: the landmarks; points: for each of TAKE_SWEEPS; search(work, parts): results of the helping processes.
-    What a landmark misses at the timesteps of `fit`, it misses in all: it is taken off.
+    observed: the landmarks; points: for each of TAKE_SWEEPS; search(work, parts): results of the
+    helping processes. What a landmark misses at the timesteps of `fit`, it misses in all: it is
+    taken off.
     """
     timesteps, model = list(observed), fit.head.model
     bias = _landmark_bias(fit, take.places, observed)
@@ -229,7 +280,9 @@ def _whole_take(
     }
     landmarks = list(corrected.values())
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
-    start[:, -RIGID_SIZE:] = [rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks]
+    start[:, -RIGID_SIZE:] = [
+        rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks
+    ]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     near = [near_landmarks(fit.head, on, take) for on in points]
@@ -241,7 +294,9 @@ def _whole_take(
         for part in parts_of(timesteps, PART_TIMESTEPS)
     ]
     found, together = zip(*search(_found_part, parts), strict=True)
-    solved = solve_take(fit.head, _both(take.places, points[-1]), together, np.stack(found), fit.ordered)
+    solved = solve_take(
+        fit.head, _both(take.places, points[-1]), together, np.stack(found), fit.ordered
+    )
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
 
 
@@ -254,7 +309,8 @@ def _found_part(
     near: Sequence[np.ndarray],
     step: Step,
 ) -> list[tuple[np.ndarray, Observation]]:
-    """Parameters (E + 18,) of each of the fit's timesteps, and landmarks and surface that they were solved from."""
+    """Parameters (E + 18,) of each of the fit's timesteps, and landmarks and surface that they were
+    solved from."""
     results = []
     visible_points: list[VisiblePoints] = [{} for _ in points]
     for (t, here), own in zip(fit.parameters.items(), landmarks, strict=True):
@@ -264,16 +320,22 @@ def _found_part(
             seen = seen_surface(rough, t, on, images, sweep, visible_points[stage])
             seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
             joined = _joined(own, share, seen)
-            here = solve_take(fit.head, _both(take.places, on), [joined], here[None], ordered=False)[0]
+            here = solve_take(
+                fit.head, _both(take.places, on), [joined], here[None], ordered=False
+            )[0]
         results.append((here, joined))
         step()
     return results
 
 
-def _landmark_bias(fit: HeadFit, places: SurfacePoints, observed: Mapping[int, Observation]) -> np.ndarray:
-    """(N, 3) in the turned head's axes: median distance of the landmarks from their places over the timesteps."""
+def _landmark_bias(
+    fit: HeadFit, places: SurfacePoints, observed: Mapping[int, Observation]
+) -> np.ndarray:
+    """(N, 3) in the turned head's axes: median distance of the landmarks from their places over the
+    timesteps."""
     missed = [
-        (observed[t].position - places.on(posed_mesh(fit, values), fit.head.model.faces)) @ head_rotation(values)
+        (observed[t].position - places.on(posed_mesh(fit, values), fit.head.model.faces))
+        @ head_rotation(values)
         for t, values in fit.parameters.items()
     ]
     return np.asarray(np.median(missed, axis=0))
@@ -281,7 +343,10 @@ def _landmark_bias(fit: HeadFit, places: SurfacePoints, observed: Mapping[int, O
 
 def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
     """Where the head of `first` has the landmarks at every timestep, in the world of the fit."""
-    points, scale = PosedPoints(first.head.model, take.places), fit.to_capture.scale / first.to_capture.scale
+    points, scale = (
+        PosedPoints(first.head.model, take.places),
+        fit.to_capture.scale / first.to_capture.scale,
+    )
     count, found = len(take.reliable), {}
     for timestep in sorted(take.landmarks):
         parameters = first.parameters[timestep]
@@ -298,14 +363,18 @@ def _landmarks(fit: HeadFit, timestep: int, take: RecordedTake) -> Observation:
 
 
 def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:
-    """(N,) of the landmarks' weights: LIPS_LANDMARK_SHARE where the model's lips are, else LANDMARK_SHARE."""
+    """(N,) of the landmarks' weights: LIPS_LANDMARK_SHARE where the model's lips are, else
+    LANDMARK_SHARE."""
     lips = faces_within(head.model.faces, head.model.masks.get("lips", np.zeros(0, np.int64)))
     return np.where(lips[places.face], LIPS_LANDMARK_SHARE, LANDMARK_SHARE)
 
 
 def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> Observation:
-    """Both as one observation, landmarks at shares (N,) of their weight; the surface counts along its normal."""
-    root = LANDMARK_SIGMA_M / SURFACE_SIGMA_M * surface.normal[:, :, None] * surface.normal[:, None, :]
+    """Both as one observation, landmarks at shares (N,) of their weight; the surface counts along
+    its normal."""
+    root = (
+        LANDMARK_SIGMA_M / SURFACE_SIGMA_M * surface.normal[:, :, None] * surface.normal[:, None, :]
+    )
     return Observation(
         np.concatenate([landmarks.position, surface.position]),
         np.concatenate([landmarks.root, root]),
@@ -314,4 +383,6 @@ def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> 
 
 
 def _both(a: SurfacePoints, b: SurfacePoints) -> SurfacePoints:
-    return SurfacePoints(np.concatenate([a.face, b.face]), np.concatenate([a.barycentric, b.barycentric]))
+    return SurfacePoints(
+        np.concatenate([a.face, b.face]), np.concatenate([a.barycentric, b.barycentric])
+    )

@@ -1,10 +1,11 @@
 """The torso's motion: whether what is below the head turns with it, stays, or moves on its own.
 
-Landmarks of a face cannot tell the neck's rotation from the head's, so that a tracked head and the ring of shoulders
-that its neck ends in turn as one. Here the root joint, which carries that ring, gets the orientation that explains the
-images below the head best; the neck turns back by as much, and the head stays where it was tracked. Skin between both
-is blended by the model's own weights. Where that leaves much unexplained, because shoulders were lifted or a chin was
-pushed forward, the torso is shifted as well; and its cloth bends, where that explains more.
+Landmarks of a face cannot tell the neck's rotation from the head's, so that a tracked head and the
+ring of shoulders that its neck ends in turn as one. Here the root joint, which carries that ring,
+gets the orientation that explains the images below the head best; the neck turns back by as much,
+and the head stays where it was tracked. Skin between both is blended by the model's own weights.
+Where that leaves much unexplained, because shoulders were lifted or a chin was pushed forward, the
+torso is shifted as well; and its cloth bends, where that explains more.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +48,8 @@ from .torso_take import (
 )
 
 MIN_TIMESTEPS, MAX_CAMERAS = 4, 4
-"""Below it, there is no motion to tell apart; cameras, spread over the rig, whose images are compared."""
+"""Below it, there is no motion to tell apart; cameras, spread over the rig, whose images are
+compared."""
 TIE = 1e-3
 """Difference in the trace of rotations that time decides."""
 MIN_POINTS = 200
@@ -63,8 +65,8 @@ MAX_STEP, CONVERGED_STEP = 0.15, 1e-4
 COMPARED_TIMESTEPS = 24
 """Spread over the take, at which motions are compared; depths are found at some of them."""
 MIN_GAIN, MIN_OWN_GAIN = 0.1, 0.05
-"""Share by which the misfit has to fall for the torso not to ride on the head, and to move instead of being still, or
-to be shifted as well."""
+"""Share by which the misfit has to fall for the torso not to ride on the head, and to move instead
+of being still, or to be shifted as well."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,8 @@ class FollowedTorso:
 
     fit         the head; a torso that bends is drawn over the surface that cameras see
     parameters  timestep -> (E + 18,)
-    offsets     timestep -> vertex offsets (V, 3) that shift and bend the torso; empty where it is not shifted
+    offsets     timestep -> vertex offsets (V, 3) that shift and bend the torso; empty where it is
+                not shifted
     motion      how it was decided; None where that cannot be told
     points      where the torso's surface is seen; None where it rides on the head
     """
@@ -86,13 +89,17 @@ class FollowedTorso:
 
 
 def follow_torso(
-    fit: HeadFit, parameters: Mapping[int, np.ndarray], footage: Footage, helpers: Helpers, report: Report
+    fit: HeadFit,
+    parameters: Mapping[int, np.ndarray],
+    footage: Footage,
+    helpers: Helpers,
+    report: Report,
 ) -> FollowedTorso:
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
 
-    The torso turns about the neck's joint; the head is not moved. Parameters are returned as they are where the torso
-    rides on the head, and where its motion cannot be told: without masks, in takes shorter than MIN_TIMESTEPS, of
-    models without a neck, and where little of a torso is seen.
+    The torso turns about the neck's joint; the head is not moved. Parameters are returned as they
+    are where the torso rides on the head, and where its motion cannot be told: without masks, in
+    takes shorter than MIN_TIMESTEPS, of models without a neck, and where little of a torso is seen.
     """
     unchanged = dict(parameters)
     torso = torso_faces(fit.head.model)
@@ -120,11 +127,22 @@ def follow_torso(
 
 
 def _followed(
-    fit: HeadFit, take: TorsoTake, posed: Motion, bending: Bending | None, motion: TorsoMotion, points: TorsoPoints
+    fit: HeadFit,
+    take: TorsoTake,
+    posed: Motion,
+    bending: Bending | None,
+    motion: TorsoMotion,
+    points: TorsoPoints,
 ) -> FollowedTorso:
     """The take with the motion that was chosen."""
-    turn = max(float(np.degrees(np.linalg.norm(joint_rotation(own.parameters, NECK)))) for own in posed.values())
-    shift = max((float(np.linalg.norm(own.shift)) for own in posed.values() if own.shift is not None), default=0.0)
+    turn = max(
+        float(np.degrees(np.linalg.norm(joint_rotation(own.parameters, NECK))))
+        for own in posed.values()
+    )
+    shift = max(
+        (float(np.linalg.norm(own.shift)) for own in posed.values() if own.shift is not None),
+        default=0.0,
+    )
     bend = 0.0 if bending is None else bending.largest
     motion = replace(motion, turn_deg=turn, shift_mm=1000 * shift, bend_mm=1000 * bend)
     shifted = {
@@ -144,8 +162,11 @@ def _followed(
     return FollowedTorso(fit, heads, offsets, motion, points)
 
 
-def _motions(take: TorsoTake, seen: SeenPoints, some: Sequence[int], walk: BothWays) -> dict[str, Motion]:
-    """The motions that the torso may have; some: timesteps at which it is followed first, to find the points' depth."""
+def _motions(
+    take: TorsoTake, seen: SeenPoints, some: Sequence[int], walk: BothWays
+) -> dict[str, Motion]:
+    """The motions that the torso may have; some: timesteps at which it is followed first, to find
+    the points' depth."""
     everything = sorted(take.parameters)
     seen = at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [(take, seen, False)], some)
@@ -167,16 +188,22 @@ def _chosen(misfit: Mapping[str, float]) -> str:
 
 
 def _middle_timestep(parameters: Mapping[int, np.ndarray]) -> int:
-    """The timestep at which the head is turned most nearly as on average: there the torso is taken to be straight."""
+    """The timestep at which the head is turned most nearly as on average: there the torso is taken
+    to be straight."""
     timesteps = sorted(parameters)
     turns = np.stack([head_turn(parameters[timestep]) for timestep in timesteps])
-    late = np.abs(np.linspace(-1, 1, len(timesteps)))  # of a head that does not turn, the middle of the take
+    # of a head that does not turn, the middle of the take
+    late = np.abs(np.linspace(-1, 1, len(timesteps)))
     return timesteps[int(((turns * turns.mean(0)).sum((1, 2)) - TIE * late).argmax())]
 
 
 def _cameras(footage: Footage, timestep: int) -> list[FootageCamera]:
     """Cameras with a masked frame at the timestep."""
-    seen = [camera for camera in footage.cameras if timestep in camera.timesteps and camera.mask(timestep) is not None]
+    seen = [
+        camera
+        for camera in footage.cameras
+        if timestep in camera.timesteps and camera.mask(timestep) is not None
+    ]
     return evenly_spread(seen, MAX_CAMERAS)
 
 
@@ -188,9 +215,14 @@ def _poses(
     return [{timestep: TorsoPose(**arrays) for timestep, arrays in own.items()} for own in found]
 
 
-def _follow(take: TorsoTake, seen: SeenPoints, shifts: bool, way: Sequence[int], step: Step) -> dict[str, np.ndarray]:
+def _follow(
+    take: TorsoTake, seen: SeenPoints, shifts: bool, way: Sequence[int], step: Step
+) -> dict[str, np.ndarray]:
     poses = _Follower(take, seen, shifts).follow(way, step)
-    return {"turn": np.stack([pose.turn for pose in poses]), "shift": np.stack([pose.shift for pose in poses])}
+    return {
+        "turn": np.stack([pose.turn for pose in poses]),
+        "shift": np.stack([pose.shift for pose in poses]),
+    }
 
 
 class _Follower:
@@ -230,7 +262,12 @@ class _Follower:
         return float(share[use].mean()) if use.any() else 1.0
 
     def _descended(
-        self, timestep: int, shot: TorsoShot, pose: TorsoPose, usual: TorsoPose, plan: Sequence[tuple[int, int]]
+        self,
+        timestep: int,
+        shot: TorsoShot,
+        pose: TorsoPose,
+        usual: TorsoPose,
+        plan: Sequence[tuple[int, int]],
     ) -> TorsoPose:
         """The pose after up to so many steps in each level of the plan; usual: the prior's."""
         for level, steps in plan:
@@ -243,7 +280,10 @@ class _Follower:
                     pixels, _ = own.camera.project(at[rows])
                     slope = np.stack(sampled(list(own.gradient), pixels), axis=2) / NOISE_LEVELS
                     rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
-                    used = POINT_SHARE / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
+                    used = (
+                        POINT_SHARE
+                        / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
+                    )
                     weight = used[:, None] * CHANNEL_WEIGHTS
                     matrix = matrix + np.einsum("nc,nci,ncj->ij", weight, rate, rate)
                     right = right - np.einsum("nc,nci,nc->i", weight, rate, residual)
@@ -259,7 +299,9 @@ class _Follower:
         old, found = self._posed(before, pose), pose
         flows = flow_targets(old, list(shot_before.views.values()), list(shot.views.values()))
         targets = {key[0]: (camera, target) for key, camera, target in flows}
-        shown = [(number, rows) for number, rows in self._visible(shot_before, old) if number in targets]
+        shown = [
+            (number, rows) for number, rows in self._visible(shot_before, old) if number in targets
+        ]
         for _ in range(FLOW_ITERATIONS):
             at, by_pose = self._linearized(timestep, found)
             matrix, right = _prior(found, pose)
@@ -274,7 +316,8 @@ class _Follower:
         return found
 
     def _visible(self, shot: TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
-        """Number of each camera that sees any of its points that are fitted, and the rows of these."""
+        """Number of each camera that sees any of its points that are fitted, and the rows of
+        these."""
         chosen = [
             (number, rows[self._seen.fitted[rows] & shot.shows(number, at[rows])])
             for number, rows in self._seen.rows.items()
@@ -283,23 +326,29 @@ class _Follower:
         return [(number, rows) for number, rows in chosen if len(rows)]
 
     def _posed(self, timestep: int, pose: TorsoPose) -> np.ndarray:
-        return self._carrier.carried(self._take.with_torso(timestep, pose, self._shifts))(self._seen.at)
+        return self._carrier.carried(self._take.with_torso(timestep, pose, self._shifts))(
+            self._seen.at
+        )
 
     def _linearized(self, timestep: int, pose: TorsoPose) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (N, 3), and derivatives (N, 3, 6) by a small rotation in front of the orientation, as if they were
-        the root joint's alone, and by a shift."""
+        """Positions (N, 3), and derivatives (N, 3, 6) by a small rotation in front of the
+        orientation, as if they were the root joint's alone, and by a shift."""
         at = self._posed(timestep, pose)
         by_turn = -cross_matrices(at - pose.shift - self._take.pivot(timestep))
         return at, np.concatenate([by_turn, np.broadcast_to(np.eye(3), by_turn.shape)], axis=2)
 
-    def _stepped(self, pose: TorsoPose, matrix: np.ndarray, right: np.ndarray) -> tuple[TorsoPose, float]:
+    def _stepped(
+        self, pose: TorsoPose, matrix: np.ndarray, right: np.ndarray
+    ) -> tuple[TorsoPose, float]:
         """The pose after a Gauss–Newton step by 6 numbers, and the step's length."""
         free = 6 if self._shifts else 3
         step = np.zeros(6)
         step[:free] = np.linalg.solve(matrix[:free, :free], right[:free])
         size = float(np.linalg.norm(step))
         step *= min(1.0, MAX_STEP / max(size, 1e-12))
-        return TorsoPose(axis_angle_matrices(step[None, :3])[0] @ pose.turn, pose.shift + step[3:]), size
+        return TorsoPose(
+            axis_angle_matrices(step[None, :3])[0] @ pose.turn, pose.shift + step[3:]
+        ), size
 
 
 def _prior(pose: TorsoPose, usual: TorsoPose) -> tuple[np.ndarray, np.ndarray]:

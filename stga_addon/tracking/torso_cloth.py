@@ -1,7 +1,8 @@
 """The torso's surface as it bends: cloth wrinkles and slides, which a rigid torso cannot follow.
 
-Each image is brought back to where one timestep shows the torso. Optical flow between the two shows what its motion so
-far misses, and the vertices of its sheet move by that, of all cameras together and smoothly.
+Each image is brought back to where one timestep shows the torso. Optical flow between the two shows
+what its motion so far misses, and the vertices of its sheet move by that, of all cameras together
+and smoothly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,8 @@ from .torso_points import HELD_OUT
 from .torso_take import ROOT, BothWays, PosedTorso, TorsoShot, TorsoTake, joint_rotation
 
 BLOCK_PX = 12
-"""Side of the blocks of pixels of which one in HELD_OUT is not fitted, and tells whether bending is right."""
+"""Side of the blocks of pixels of which one in HELD_OUT is not fitted, and tells whether bending is
+right."""
 ROUGHNESS_M, BEND_SIGMA_M = 0.0005, 0.02
 """Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
 FLOW_SIGMA_PX, FLOW_SHARE = 0.5, 0.15
@@ -65,9 +67,14 @@ class Bending:
 
 
 def found_bending(
-    take: TorsoTake, motion: Mapping[int, PosedTorso], points: TorsoPoints, some: Sequence[int], walk: BothWays
+    take: TorsoTake,
+    motion: Mapping[int, PosedTorso],
+    points: TorsoPoints,
+    some: Sequence[int],
+    walk: BothWays,
 ) -> Bending | None:
-    """How a torso with a rigid motion bends; None where the images of some timesteps are not explained better by it."""
+    """How a torso with a rigid motion bends; None where the images of some timesteps are not
+    explained better by it."""
     sheet = torso_sheet(take.model)
     if sheet is None:
         return None
@@ -79,7 +86,9 @@ def found_bending(
     cloth = _Cloth(take, sheet, motion, points.timestep, drape)
     (found,) = walk.along(_bend, [(cloth,)], points.timestep, sorted(motion))
     bends = {timestep: arrays["bend"] for timestep, arrays in found.items()}
-    rigid, bent = cloth.misfit(bends, [timestep for timestep in some if timestep != points.timestep])
+    rigid, bent = cloth.misfit(
+        bends, [timestep for timestep in some if timestep != points.timestep]
+    )
     if not bent < (1 - MIN_GAIN) * rigid:
         return None
     whole = np.zeros_like(take.model.v_template)
@@ -123,8 +132,9 @@ class _Reference:
 
 @dataclass(frozen=True)
 class _Returned:
-    """An image of another timestep brought back to the reference: its luma (H, W), and of the P pixels the positions
-    (P, 3), the pixels (P, 2) that show them there, and whether they do (P,)."""
+    """An image of another timestep brought back to the reference: its luma (H, W), and of the P
+    pixels the positions (P, 3), the pixels (P, 2) that show them there, and whether they do
+    (P,)."""
 
     luma: np.ndarray
     at: np.ndarray
@@ -137,16 +147,28 @@ def _bend(cloth: "_Cloth", way: Sequence[int], step: Step) -> dict[str, np.ndarr
 
 
 class _Cloth:
-    """How the sheet bends over a take, as (N, 3) offsets of its vertices in the torso's axes, in meters."""
+    """How the sheet bends over a take, as (N, 3) offsets of its vertices in the torso's axes, in
+    meters."""
 
     def __init__(
-        self, take: TorsoTake, sheet: TorsoSheet, motion: Mapping[int, PosedTorso], first: int, drape: np.ndarray
+        self,
+        take: TorsoTake,
+        sheet: TorsoSheet,
+        motion: Mapping[int, PosedTorso],
+        first: int,
+        drape: np.ndarray,
     ) -> None:
-        """motion: of the rigid torso; drape (N, 3): that draws the sheet over the surface, in the torso's axes; first:
-        the timestep that the others are compared with."""
+        """motion: of the rigid torso; drape (N, 3): that draws the sheet over the surface, in the
+        torso's axes; first: the timestep that the others are compared with."""
         from scipy.sparse import diags_array, eye_array, kron
 
-        self._take, self._sheet, self._motion, self._first, self._drape = take, sheet, motion, first, drape
+        self._take, self._sheet, self._motion, self._first, self._drape = (
+            take,
+            sheet,
+            motion,
+            first,
+            drape,
+        )
         mean = diags_array(1 / sheet.laplacian.diagonal()) @ sheet.laplacian
         held = HELD * ~drape.any(1)
         own = mean.T @ mean / ROUGHNESS_M**2 + diags_array(BEND_SIGMA_M**-2 + held)
@@ -165,22 +187,34 @@ class _Cloth:
             step()
         return bends
 
-    def misfit(self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]) -> tuple[float, float]:
-        """Share, from 0 to 1, of the pixels that were not fitted that images do not explain: rigid, and bent."""
+    def misfit(
+        self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]
+    ) -> tuple[float, float]:
+        """Share, from 0 to 1, of the pixels that were not fitted that images do not explain: rigid,
+        and bent."""
         total, count, rigid = np.zeros(2), 0, np.zeros_like(self._drape)
         for timestep in timesteps:
             shot = self._take.shot(timestep)
             for number in self._numbers(shot):
                 reference = self._references[number]
-                both = [self._returned(timestep, shot, number, bend) for bend in (rigid, bends[timestep])]
+                both = [
+                    self._returned(timestep, shot, number, bend)
+                    for bend in (rigid, bends[timestep])
+                ]
                 use = both[0].visible & both[1].visible & ~reference.fitted
-                changed = np.array([(own.luma.astype(float) - reference.luma)[reference.pixels][use] for own in both])
+                changed = np.array(
+                    [
+                        (own.luma.astype(float) - reference.luma)[reference.pixels][use]
+                        for own in both
+                    ]
+                )
                 total += (changed**2 / (CHANGE_OUTLIER_LEVELS**2 + changed**2)).sum(1)
                 count += int(use.sum())
         return float(total[0] / max(count, 1)), float(total[1] / max(count, 1))
 
     def _numbers(self, shot: TorsoShot) -> list[int]:
-        """Of the cameras that see the sheet at the first timestep and now, in images of one size."""
+        """Of the cameras that see the sheet at the first timestep and now, in images of one
+        size."""
         return [
             number
             for number, view in shot.views.items()
@@ -197,17 +231,24 @@ class _Cloth:
         triangle, barycentric = rasterize(mesh, model.faces, camera)
         shown = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
         rows, columns = np.nonzero(shown)
-        corners, weights = sheet.rows(model.faces[triangle[rows, columns]]), barycentric[rows, columns]
+        corners, weights = (
+            sheet.rows(model.faces[triangle[rows, columns]]),
+            barycentric[rows, columns],
+        )
         at = np.einsum("pk,pki->pi", weights, mesh[sheet.vertices][corners])
         visible = self._visible(shot, number, at)
         shown[rows, columns] = visible
         fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
-        return _Reference(shown, _luma(shot, number), corners[visible], weights[visible], fitted[visible])
+        return _Reference(
+            shown, _luma(shot, number), corners[visible], weights[visible], fitted[visible]
+        )
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
         """(N, 3) of the sheet's vertices."""
         torso = self._motion[timestep]
-        return np.asarray(_rigid(self._take, torso, self._sheet.vertices) + (self._drape + bend) @ _axes(torso).T)
+        return np.asarray(
+            _rigid(self._take, torso, self._sheet.vertices) + (self._drape + bend) @ _axes(torso).T
+        )
 
     @staticmethod
     def _visible(shot: TorsoShot, number: int, at: np.ndarray) -> np.ndarray:
@@ -215,11 +256,15 @@ class _Cloth:
         view = shot.views[number]
         share = sampled([shot.masks[number].astype(np.float32)], view.camera.project(at)[0])[0]
         finest = view.levels[0].camera
-        return np.asarray(shot.shows(number, at) & inside(finest, *finest.project(at)) & (share > 127))
+        return np.asarray(
+            shot.shows(number, at) & inside(finest, *finest.project(at)) & (share > 127)
+        )
 
     def _returned(self, timestep: int, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
         reference = self._references[number]
-        at = np.einsum("pk,pki->pi", reference.barycentric, self._positions(timestep, bend)[reference.corners])
+        at = np.einsum(
+            "pk,pki->pi", reference.barycentric, self._positions(timestep, bend)[reference.corners]
+        )
         source, _ = shot.views[number].levels[0].camera.project(at)
         luma = reference.luma.copy()
         values = sampled([_luma(shot, number).astype(np.float32)], source)[0]
@@ -239,16 +284,22 @@ class _Cloth:
             turned = projection_derivative(shot.views[number].levels[0].camera, now.at[used]) @ axes
             rates = turned[:, :, None, :] * reference.barycentric[used][:, None, :, None]
             rows = np.broadcast_to(np.arange(2 * len(used)).reshape(-1, 2, 1, 1), rates.shape)
-            columns = np.broadcast_to((3 * reference.corners[used][..., None] + np.arange(3))[:, None], rates.shape)
-            rate = csr_array((rates.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * len(used), bend.size))
-            weighted = rate.T @ diags_array(np.repeat(FLOW_SHARE / FLOW_SIGMA_PX**2 * weight[used], 2))
+            columns = np.broadcast_to(
+                (3 * reference.corners[used][..., None] + np.arange(3))[:, None], rates.shape
+            )
+            rate = csr_array(
+                (rates.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * len(used), bend.size)
+            )
+            weighted = rate.T @ diags_array(
+                np.repeat(FLOW_SHARE / FLOW_SIGMA_PX**2 * weight[used], 2)
+            )
             matrix, right = matrix + weighted @ rate, right + weighted @ miss[used].ravel()
         return np.asarray(bend + _solved(matrix.tocsr(), right).reshape(-1, 3))
 
 
 def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:
-    """Solution (M,) of equations with a sparse, symmetric, positive definite matrix (M, M), in a narrow band once they
-    are ordered (reverse Cuthill-McKee): in a fifth of SuperLU's time."""
+    """Solution (M,) of equations with a sparse, symmetric, positive definite matrix (M, M), in a
+    narrow band once they are ordered (reverse Cuthill-McKee): in a fifth of SuperLU's time."""
     from scipy.linalg import solveh_banded
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -264,11 +315,14 @@ def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:
 
 
 def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarray]:
-    """By how many pixels (P, 2) the images show points beside where they are, and weights (P,) from 0 to 1."""
+    """By how many pixels (P, 2) the images show points beside where they are, and weights (P,) from
+    0 to 1."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS
-    flow = opencv.DISOpticalFlow_create(opencv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(reference.luma, now.luma, None)
+    flow = opencv.DISOpticalFlow_create(opencv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
+        reference.luma, now.luma, None
+    )
     rows, columns = reference.pixels
     places = np.stack([columns, rows], axis=1) + 0.5 + flow[rows, columns]
     shown = np.full((*reference.shown.shape, 3), np.nan, np.float32)
@@ -279,7 +333,9 @@ def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarr
     miss = np.where(weight[:, None], found[:, :2] - now.source, 0)
     changed = found[:, 2] - reference.luma[rows, columns]
     distance = np.linalg.norm(miss, axis=1)
-    share = 1 / ((1 + (distance / FLOW_OUTLIER_PX) ** 2) * (1 + (changed / CHANGE_OUTLIER_LEVELS) ** 2))
+    share = 1 / (
+        (1 + (distance / FLOW_OUTLIER_PX) ** 2) * (1 + (changed / CHANGE_OUTLIER_LEVELS) ** 2)
+    )
     return miss, weight * share
 
 

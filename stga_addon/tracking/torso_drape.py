@@ -1,7 +1,8 @@
 """The end of a head model's neck, drawn out over the torso's surface as far as cameras see it.
 
-FLAME ends in a ring of shoulders of a hand's width. Splats on clothes that hang on such a ring can only move as one.
-Drawn over the clothes, its triangles lie where the splats are, and its vertices can bend them.
+FLAME ends in a ring of shoulders of a hand's width. Splats on clothes that hang on such a ring can
+only move as one. Drawn over the clothes, its triangles lie where the splats are, and its vertices
+can bend them.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ import numpy as np
 from ..flame.model import FlameModel, torso_faces
 
 DEPTH_SIGMA_M, MIN_WEIGHT = 0.02, 0.5
-"""Over which points' depths are averaged; sum of their weights, below which the surface is not seen."""
+"""Over which points' depths are averaged; sum of their weights, below which the surface is not
+seen."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
 """From the base of the neck, as seen from the front: from straight down to the person's left."""
 SLOPE = 0.8
@@ -20,9 +22,11 @@ SLOPE = 0.8
 REACH_RAD, DIRECTION_SIGMA = np.radians(10), 1.0
 """Of a direction to both sides; smoothing of what is found in them, in steps."""
 MIN_POINTS, FARTHEST_SHARE, BEYOND_M = 5, 0.98, 0.015
-"""In a direction: points below which it is not seen, the share of them that the mesh reaches, and how far beyond."""
+"""In a direction: points below which it is not seen, the share of them that the mesh reaches, and
+how far beyond."""
 FULL_HEIGHT = 0.5
-"""Height (see `TorsoSheet`) from which vertices lie on the surface, not between it and the model's."""
+"""Height (see `TorsoSheet`) from which vertices lie on the surface, not between it and the
+model's."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +74,12 @@ def torso_sheet(model: FlameModel) -> TorsoSheet | None:
 
 
 def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Where the sheet's vertices (N, 3) lie when it is drawn over the surface that points (P, 3) show.
+    """Where the sheet's vertices (N, 3) lie when it is drawn over the surface that points (P, 3)
+    show.
 
-    Both in the torso's axes, from the base of the neck: x to the person's left, y up, z forward. What lies around the
-    neck, from its front to its sides, is unrolled as seen from the front, from straight down to the shoulders. Vertices
-    where nothing is seen, as at the back, stay.
+    Both in the torso's axes, from the base of the neck: x to the person's left, y up, z forward.
+    What lies around the neck, from its front to its sides, is unrolled as seen from the front, from
+    straight down to the shoulders. Vertices where nothing is seen, as at the back, stay.
     """
     around = SLOPE * np.arctan2(at[:, 0], at[:, 2])
     farthest, seen = _farthest(points, around)
@@ -88,8 +93,8 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _farthest(points: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far (N,) the points reach in directions (N,) around the neck, as seen from the front, and how surely these
-    are seen (N,), from 0 to 1."""
+    """How far (N,) the points reach in directions (N,) around the neck, as seen from the front, and
+    how surely these are seen (N,), from 0 to 1."""
     from scipy.ndimage import gaussian_filter1d
 
     angle, distance = np.arctan2(points[:, 0], -points[:, 1]), np.linalg.norm(points[:, :2], axis=1)
@@ -100,7 +105,9 @@ def _farthest(points: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.nd
             found[number], seen[number] = np.quantile(distance[near], FARTHEST_SHARE) + BEYOND_M, 1
     sure = gaussian_filter1d(seen, DIRECTION_SIGMA, mode="constant")
     found = gaussian_filter1d(found, DIRECTION_SIGMA, mode="constant") / np.maximum(sure, 1e-6)
-    inside, reach, share = (np.interp(around, DIRECTIONS_RAD, own, 0, 0) for own in (seen, found, sure))
+    inside, reach, share = (
+        np.interp(around, DIRECTIONS_RAD, own, 0, 0) for own in (seen, found, sure)
+    )
     return reach, np.where(inside > 0.5, share, 0.0)
 
 

@@ -21,10 +21,13 @@ POINTS_FILE = "torso_points.npz"
 class TorsoMotion:
     """Which of MOTIONS the torso follows, and what speaks for it.
 
-    misfit    motion -> share of the points below the head, held out from fitting, that images do not explain
+    misfit    motion -> share of the points below the head, held out from fitting, that images do
+              not explain
     turn_deg  largest angle between torso and head
-    shift_mm  largest distance of the torso from where the neck's joint holds it; 0 where a rotation explains enough
-    bend_mm   largest distance of its cloth from where a rigid torso has it; 0 where that explains enough
+    shift_mm  largest distance of the torso from where the neck's joint holds it; 0 where a rotation
+              explains enough
+    bend_mm   largest distance of its cloth from where a rigid torso has it; 0 where that explains
+              enough
     """
 
     motion: str = setting(choices=MOTIONS)
@@ -38,7 +41,11 @@ class TorsoMotion:
         """A clause with the figures that decided."""
         shift = f" and {self.shift_mm:.0f} mm" if self.shift_mm else ""
         bend = f", its cloth bends by up to {self.bend_mm:.0f} mm" if self.bend_mm else ""
-        apart = "" if self.motion == "head" else f", up to {self.turn_deg:.0f}°{shift} apart from the head{bend}"
+        apart = (
+            ""
+            if self.motion == "head"
+            else f", up to {self.turn_deg:.0f}°{shift} apart from the head{bend}"
+        )
         shares = {name: f"{self.misfit[name]:.0%}" for name in MOTIONS}
         return (
             f"the torso {MOTIONS[self.motion]}{apart}; images below the head are not explained by {shares['head']} if "
@@ -60,7 +67,8 @@ def read_torso_motion(capture: Path) -> TorsoMotion | None:
         return None
     try:
         if isinstance(found, dict):
-            found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}  # of a capture that was tracked before there were any
+            # of a capture that was tracked before there were any
+            found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}
         motion: TorsoMotion = from_json(TorsoMotion, found)
         if set(motion.misfit) != set(MOTIONS):
             raise StgaError(f"misfit: expected {', '.join(MOTIONS)}")
@@ -79,11 +87,15 @@ class TorsoPoints:
 
 def write_torso_points(capture: Path, points: TorsoPoints) -> None:
     """Write the points into a capture's folder."""
-    write_npz(capture / POINTS_FILE, {"timestep": np.array(points.timestep), "points": points.at.astype(np.float32)})
+    write_npz(
+        capture / POINTS_FILE,
+        {"timestep": np.array(points.timestep), "points": points.at.astype(np.float32)},
+    )
 
 
 def read_torso_points(capture: Path) -> TorsoPoints | None:
-    """The points in a capture's folder; None where it has none. Raises StgaError where their file is damaged."""
+    """The points in a capture's folder; None where it has none. Raises StgaError where their file
+    is damaged."""
     path = capture / POINTS_FILE
     if not path.is_file():
         return None

@@ -1,4 +1,5 @@
-"""Points seen at the torso: where they lie, how motions carry them, and which motion the images agree with."""
+"""Points seen at the torso: where they lie, how motions carry them, and which motion the images
+agree with."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,14 +18,16 @@ from .torso_take import EVIDENCE_LEVEL, PosedTorso, TorsoShot, TorsoTake, grown
 POINT_STEP_M, MAX_POINTS = 0.005, 800
 """Distance between points at the torso, and how many of them a camera has at most."""
 BLOCK_POINTS, HELD_OUT = 4, 3
-"""Blocks of so many points by so many; one of so many blocks is not fitted, and tells which motion is right."""
+"""Blocks of so many points by so many; one of so many blocks is not fitted, and tells which motion
+is right."""
 MASK_MARGIN = 0.01
 """Around the mask, whose edge is compared as well; share of the image's height."""
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
-"""Along a point's ray, from the depth of the mesh beside it, that are tried: a chest is before the neck."""
+"""Along a point's ray, from the depth of the mesh beside it, that are tried: a chest is before the
+neck."""
 DEPTH_TIMESTEPS, NEIGHBORS, UNSEEN_COST = 8, 25, 0.5
-"""Timesteps at which depths are compared; points whose evidence counts for each other; cost where a point is not in
-sight."""
+"""Timesteps at which depths are compared; points whose evidence counts for each other; cost where a
+point is not in sight."""
 ALONG_CAMERAS = CHANNEL_WEIGHTS * [0, 1, 1]
 """Weights of channels between cameras, from which surfaces are not equally bright."""
 
@@ -36,7 +39,8 @@ Motion = Mapping[int, PosedTorso]
 class SeenPoints:
     """N points below the head as the cameras see them at one timestep.
 
-    rows       number of a camera -> the rows of its own points: how deep they lie is a guess that other cameras lack
+    rows       number of a camera -> the rows of its own points: how deep they lie is a guess that
+               other cameras lack
     at, ray    (N, 3) meters; unit vectors away from their camera
     fitted     (N,) bool: points that the motion is fitted to
     reference  by level, the images' channels (N, 3)
@@ -49,9 +53,11 @@ class SeenPoints:
     fitted: np.ndarray
     reference: Sequence[np.ndarray]
 
-    def unexplained(self, shot: TorsoShot, at: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Share (N,) from 0 to 1 of each point, moved to `at` (N, 3), that the images do not explain, and (N,) bool
-        whether it is seen."""
+    def unexplained(
+        self, shot: TorsoShot, at: np.ndarray, level: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Share (N,) from 0 to 1 of each point, moved to `at` (N, 3), that the images do not
+        explain, and (N,) bool whether it is seen."""
         share, seen = np.zeros(len(at)), np.zeros(len(at), bool)
         for number, rows in self.rows.items():
             if number in shot.views:
@@ -68,12 +74,16 @@ class SeenPoints:
         level: int,
         weights: np.ndarray = CHANNEL_WEIGHTS,
     ) -> np.ndarray:
-        """(M,) from 0 to 1: how little a camera's image at points (M, 3) looks like the reference of the rows."""
+        """(M,) from 0 to 1: how little a camera's image at points (M, 3) looks like the reference
+        of the rows."""
         squared = self.residual(shot, number, rows, at, level) ** 2 @ weights
         return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
 
-    def residual(self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int) -> np.ndarray:
-        """Channels (M, 3) of a camera's image at points, minus those of the reference, in NOISE_LEVELS."""
+    def residual(
+        self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int
+    ) -> np.ndarray:
+        """Channels (M, 3) of a camera's image at points, minus those of the reference, in
+        NOISE_LEVELS."""
         own = shot.views[number].levels[level]
         values = sampled([own.channels], own.camera.project(at)[0])[0]
         return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
@@ -98,7 +108,9 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
     reference = []
     for level in range(len(OUTLIER_SQUARED)):
         images = {number: shot.views[number].levels[level] for number in rows}
-        pixels = {number: own.camera.project(every[rows[number]])[0] for number, own in images.items()}
+        pixels = {
+            number: own.camera.project(every[rows[number]])[0] for number, own in images.items()
+        }
         values = [sampled([own.channels], pixels[number])[0] for number, own in images.items()]
         reference.append(np.concatenate(values) if values else np.zeros((0, 3)))
     ray = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
@@ -108,7 +120,8 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
 def _below_head(
     take: TorsoTake, timestep: int, mesh: np.ndarray, number: int, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) on the rays of the pixels below the head, as deep as the mesh beside them; which are fitted."""
+    """Points (N, 3) on the rays of the pixels below the head, as deep as the mesh beside them;
+    which are fitted."""
     from scipy.spatial import cKDTree
 
     mask = take.cameras[number].mask(timestep)
@@ -136,32 +149,49 @@ class Carrier:
         candidates = np.flatnonzero(take.torso)
         centers = take.mesh(first.parameters)[take.model.faces[candidates]].mean(1)
         used, self._face = np.unique(candidates[cKDTree(centers).query(at)[1]], return_inverse=True)
-        self._corners = PosedPoints(take.model, SurfacePoints(np.repeat(used, 3), np.tile(np.eye(3), (len(used), 1))))
+        self._corners = PosedPoints(
+            take.model, SurfacePoints(np.repeat(used, 3), np.tile(np.eye(3), (len(used), 1)))
+        )
         self._take, self._vertices = take, take.model.faces[used].ravel()
         self._neutral = take.model.v_template[self._vertices]
         self._triangles = np.arange(3 * len(used)).reshape(-1, 3)
         self._first = self._frames(first)
 
     def carried(self, torso: PosedTorso) -> Callable[[np.ndarray], np.ndarray]:
-        """What brings the points (N, 3) from where they are at first to where this torso has them."""
+        """What brings the points (N, 3) from where they are at first to where this torso has
+        them."""
         before, after, face = self._first, self._frames(torso), self._face
-        turn = (after.scale / before.scale)[:, None, None] * after.rotation @ before.rotation.swapaxes(1, 2)
-        return lambda at: np.einsum("nij,nj->ni", turn[face], at - before.origin[face]) + after.origin[face]
+        turn = (
+            (after.scale / before.scale)[:, None, None]
+            * after.rotation
+            @ before.rotation.swapaxes(1, 2)
+        )
+        return lambda at: (
+            np.einsum("nij,nj->ni", turn[face], at - before.origin[face]) + after.origin[face]
+        )
 
     def _frames(self, torso: PosedTorso) -> FaceFrames:
         if torso.shift is None:
-            corners = self._corners.positions(torso.parameters[:-RIGID_SIZE], torso.parameters[-RIGID_SIZE:])
+            corners = self._corners.positions(
+                torso.parameters[:-RIGID_SIZE], torso.parameters[-RIGID_SIZE:]
+            )
         else:
             corners = self._take.rigid(torso.parameters, self._vertices) + torso.shift
         return face_frames(corners, self._triangles, self._neutral)
 
 
 def compared(
-    take: TorsoTake, seen: Mapping[str, SeenPoints], motions: Mapping[str, Motion], timesteps: Sequence[int]
+    take: TorsoTake,
+    seen: Mapping[str, SeenPoints],
+    motions: Mapping[str, Motion],
+    timesteps: Sequence[int],
 ) -> dict[str, float]:
-    """Motion -> mean misfit of the points that were not fitted, where all motions leave them in sight."""
+    """Motion -> mean misfit of the points that were not fitted, where all motions leave them in
+    sight."""
     first = seen["head"]
-    carriers = {name: Carrier(take, own[first.timestep], seen[name].at) for name, own in motions.items()}
+    carriers = {
+        name: Carrier(take, own[first.timestep], seen[name].at) for name, own in motions.items()
+    }
     total, count = dict.fromkeys(motions, 0.0), 0
     for timestep in timesteps:
         if timestep == first.timestep:
@@ -177,9 +207,11 @@ def compared(
     return {name: value / max(count, 1) for name, value in total.items()}
 
 
-def at_depth(take: TorsoTake, seen: SeenPoints, motions: Mapping[str, Motion]) -> dict[str, SeenPoints]:
-    """Motion -> the points at the depths along their rays at which other cameras, and other timesteps of the motion,
-    look like them; "stereo": of other cameras alone."""
+def at_depth(
+    take: TorsoTake, seen: SeenPoints, motions: Mapping[str, Motion]
+) -> dict[str, SeenPoints]:
+    """Motion -> the points at the depths along their rays at which other cameras, and other
+    timesteps of the motion, look like them; "stereo": of other cameras alone."""
     candidates = [seen.at + depth * seen.ray for depth in DEPTHS_M]
     shot, stereo = take.shot(seen.timestep), np.zeros((len(DEPTHS_M), len(seen.at)))
     for number, rows in seen.rows.items():
@@ -201,8 +233,8 @@ def at_depth(take: TorsoTake, seen: SeenPoints, motions: Mapping[str, Motion]) -
 
 
 def _moved_in_depth(seen: SeenPoints, cost: np.ndarray) -> SeenPoints:
-    """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least; where it tells nothing, as they
-    are."""
+    """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least; where it tells
+    nothing, as they are."""
     from scipy.spatial import cKDTree
 
     moved = seen.at.copy()

@@ -1,4 +1,5 @@
-"""The frames of a tracked take in which the torso is followed, and the head's parameters with any orientation of it."""
+"""The frames of a tracked take in which the torso is followed, and the head's parameters with any
+orientation of it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,8 +35,8 @@ EVIDENCE_LEVEL = 1
 class PosedTorso:
     """Parameters (E + 18,) of a head with its torso.
 
-    shift  (3,) meters, from where the neck's joint holds the torso, which is rigid then; None: the model's weights
-           blend it with the neck
+    shift  (3,) meters, from where the neck's joint holds the torso, which is rigid then; None: the
+           model's weights blend it with the neck
     """
 
     parameters: np.ndarray
@@ -44,7 +45,8 @@ class PosedTorso:
 
 @dataclass(frozen=True)
 class TorsoPose:
-    """Orientation (3, 3) of the torso in the world, and its shift (3,) in meters, 0 where it is only turned."""
+    """Orientation (3, 3) of the torso in the world, and its shift (3,) in meters, 0 where it is
+    only turned."""
 
     turn: np.ndarray
     shift: np.ndarray
@@ -52,22 +54,26 @@ class TorsoPose:
 
 @dataclass(frozen=True)
 class TorsoShot:
-    """A timestep: by number of the camera its image, its mask (H, W) uint8, and the pixels (H, W) bool of the head at
-    EVIDENCE_LEVEL."""
+    """A timestep: by number of the camera its image, its mask (H, W) uint8, and the pixels (H, W)
+    bool of the head at EVIDENCE_LEVEL."""
 
     views: Mapping[int, PyramidView]
     masks: Mapping[int, np.ndarray]
     heads: Mapping[int, np.ndarray]
 
     def shows(self, number: int, at: np.ndarray) -> np.ndarray:
-        """(N,) bool: points (N, 3) that lie in the camera's image, and not behind or before the head."""
+        """(N,) bool: points (N, 3) that lie in the camera's image, and not behind or before the
+        head."""
         camera, head = self.views[number].levels[EVIDENCE_LEVEL].camera, self.heads[number]
-        x, y = np.clip(camera.project(at)[0].astype(int), 0, [camera.width - 1, camera.height - 1]).T
+        x, y = np.clip(
+            camera.project(at)[0].astype(int), 0, [camera.width - 1, camera.height - 1]
+        ).T
         return np.asarray(inside(camera, *camera.project(at)) & ~head[y, x])
 
 
 class TorsoTake:
-    """The tracked take: images by timestep, and the head's parameters with any orientation of the torso."""
+    """The tracked take: images by timestep, and the head's parameters with any orientation of the
+    torso."""
 
     def __init__(
         self,
@@ -76,7 +82,12 @@ class TorsoTake:
         cameras: Sequence[FootageCamera],
         torso: np.ndarray,
     ) -> None:
-        self.model, self.parameters, self.cameras, self.torso = fit.head.model, parameters, cameras, torso
+        self.model, self.parameters, self.cameras, self.torso = (
+            fit.head.model,
+            parameters,
+            cameras,
+            torso,
+        )
         self._fit = fit
         regressor = self.model.j_regressor[[ROOT, NECK]]
         self._joints = regressor @ self.model.v_template
@@ -91,27 +102,41 @@ class TorsoTake:
 
     def motion(self, poses: Mapping[int, TorsoPose], rigid: bool) -> dict[int, PosedTorso]:
         """The torso posed at each timestep."""
-        return {timestep: self.with_torso(timestep, pose, rigid) for timestep, pose in poses.items()}
+        return {
+            timestep: self.with_torso(timestep, pose, rigid) for timestep, pose in poses.items()
+        }
 
     def rigid(self, parameters: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """(N, 3) where the root joint alone carries some vertices (N,)."""
         expr, rigid = parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
         root = self._joints[0] + self._joint_dirs[0] @ expr
         rest = self.model.v_template[vertices] + self.model.shapedirs[vertices] @ expr
-        return np.asarray((rest - root) @ axis_angle_matrices(rigid[None, :3])[0].T + root + rigid[-3:])
+        return np.asarray(
+            (rest - root) @ axis_angle_matrices(rigid[None, :3])[0].T + root + rigid[-3:]
+        )
 
-    def with_offset(self, torso: PosedTorso, bend: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters (E + 18,) and vertex offsets (V, 3) by which a torso is rigid and shifted, and bent.
+    def with_offset(
+        self, torso: PosedTorso, bend: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters (E + 18,) and vertex offsets (V, 3) by which a torso is rigid and shifted, and
+        bent.
 
-        bend (V, 3): offsets in meters, in the torso's axes, which the root joint turns. Offsets move the joints as
-        well, which FLAME finds from vertices; the translation undoes that for the head.
+        bend (V, 3): offsets in meters, in the torso's axes, which the root joint turns. Offsets
+        move the joints as well, which FLAME finds from vertices; the translation undoes that for
+        the head.
         """
         assert torso.shift is not None
-        model, parameters, offset = self.model, torso.parameters.copy(), np.zeros_like(self.model.v_template)
+        model, parameters, offset = (
+            self.model,
+            torso.parameters.copy(),
+            np.zeros_like(self.model.v_template),
+        )
         share = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
         moved = np.flatnonzero(share)
         before = posed_mesh(self._fit, parameters)[moved]
-        wanted = before + share[moved, None] * (self.rigid(parameters, moved) + torso.shift - before)
+        wanted = before + share[moved, None] * (
+            self.rigid(parameters, moved) + torso.shift - before
+        )
         root = axis_angle_matrices(joint_rotation(parameters, ROOT)[None])[0]
         wanted += np.broadcast_to(bend, offset.shape)[moved] @ root.T
         turns = axis_angle_matrices(parameters[-RIGID_SIZE:-3].reshape(-1, 3))
@@ -128,7 +153,9 @@ class TorsoTake:
 
     def base(self, parameters: np.ndarray) -> np.ndarray:
         """(3,) the root joint, inside the base of the neck."""
-        return np.asarray(self._joints[0] + self._joint_dirs[0] @ parameters[:-RIGID_SIZE] + parameters[-3:])
+        return np.asarray(
+            self._joints[0] + self._joint_dirs[0] @ parameters[:-RIGID_SIZE] + parameters[-3:]
+        )
 
     def pivot(self, timestep: int) -> np.ndarray:
         """(3,) what the torso turns about: the joint of the neck."""
@@ -153,7 +180,10 @@ class TorsoTake:
                 camera = self._fit.to_capture.camera(source.camera)
                 levels = pyramid(camera, _masked(source.image(timestep), mask), self._center)
                 views[number] = PyramidView(bytes([number]), camera, levels)
-                heads[number], masks[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera), mask
+                heads[number], masks[number] = (
+                    self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera),
+                    mask,
+                )
         return TorsoShot(views, masks, heads)
 
     def head_pixels(self, mesh: np.ndarray, camera: Camera) -> np.ndarray:
@@ -162,34 +192,46 @@ class TorsoTake:
 
 
 class BothWays:
-    """Work along a take, from one timestep to both ends, on which each timestep's result begins with that before: by
-    helping processes, each on a way."""
+    """Work along a take, from one timestep to both ends, on which each timestep's result begins
+    with that before: by helping processes, each on a way."""
 
     def __init__(self, helpers: Helpers, report: Report, total: int) -> None:
         self._helpers, self._report, self._done, self._total = helpers, report, 0, total
 
     def along(
-        self, work: Callable[..., dict[str, np.ndarray]], parts: Sequence[tuple], first: int, timesteps: Sequence[int]
+        self,
+        work: Callable[..., dict[str, np.ndarray]],
+        parts: Sequence[tuple],
+        first: int,
+        timesteps: Sequence[int],
     ) -> list[dict[int, dict[str, np.ndarray]]]:
-        """For each part, by timestep, the rows of the arrays that work(*part, way, step) gives for both ways."""
+        """For each part, by timestep, the rows of the arrays that work(*part, way, step) gives for
+        both ways."""
         later = [first, *(t for t in timesteps if t > first)]
         earlier = [first, *(t for t in reversed(timesteps) if t < first)]
         every, done = [(*part, way) for part in parts for way in (later, earlier)], self._done
-        found = self._helpers.map(work, every, lambda n: self._report("Torso", done + n, self._total), keep=True)
+        found = self._helpers.map(
+            work, every, lambda n: self._report("Torso", done + n, self._total), keep=True
+        )
         self._done += len(parts) * (len(later) + len(earlier) - 2)
         rows = [
             {t: {name: array[row] for name, array in own.items()} for row, t in enumerate(way)}
             for (*_, way), own in zip(every, found, strict=True)
         ]
-        return [dict(sorted({**a, **b}.items())) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+        return [
+            dict(sorted({**a, **b}.items())) for a, b in zip(rows[::2], rows[1::2], strict=True)
+        ]
 
 
 def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """Parameters (E + 18,) with the root joint in another orientation (3, 3), and the head in its place.
+    """Parameters (E + 18,) with the root joint in another orientation (3, 3), and the head in its
+    place.
 
     arm (3,): from the root joint to the neck's, before posing.
     """
-    before, neck = axis_angle_matrices(np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)]))
+    before, neck = axis_angle_matrices(
+        np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)])
+    )
     changed = parameters.copy()
     rigid = changed[-RIGID_SIZE:]
     rigid[3 * ROOT : 3 * ROOT + 3] = axis_angle(rotation)
@@ -200,7 +242,9 @@ def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> 
 
 def head_turn(parameters: np.ndarray) -> np.ndarray:
     """(3, 3) orientation of the head in the world."""
-    root, neck = axis_angle_matrices(np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)]))
+    root, neck = axis_angle_matrices(
+        np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)])
+    )
     return np.asarray(root @ neck)
 
 

@@ -41,7 +41,15 @@ from .fit import (
     is_metric,
 )
 from .focal_length import solved_focal
-from .folder import KEPT_FOLDER, LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, image_name, is_written
+from .folder import (
+    KEPT_FOLDER,
+    LANDMARKS_FOLDER,
+    PLACES_FILE,
+    REPORT_FILE,
+    SHEET_FILE,
+    image_name,
+    is_written,
+)
 from .footage.model import Footage, FootageCamera
 from .footage.stored import StoredFrames, with_stored
 from .head_model import HeadModel, read_head_model
@@ -65,29 +73,32 @@ from .torso_motion import TORSO_KEY, TorsoMotion, write_torso_points
 from .write_capture import posed_mesh, write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
-"""A camera is at fault whose landmarks miss the fitted head by this many times those of the others, and by this share
-of the face's size."""
+"""A camera is at fault whose landmarks miss the fitted head by this many times those of the others,
+and by this share of the face's size."""
 MAX_USUAL_SHARE = 0.04
-"""Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the demo's gives 0.06
-where no camera is in step with another, and 0.2 mirrored."""
+"""Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
+demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 
 
 LONG_TAKE = 50
-"""Timesteps from which the fit to landmarks is worth a helping process: its small matrices are slower in threads."""
+"""Timesteps from which the fit to landmarks is worth a helping process: its small matrices are
+slower in threads."""
 
 
 @dataclass(frozen=True)
 class TrackingReport:
     """What `track` found, as written to tracking.json.
 
-    reprojection_px  camera -> timestep -> median distance in pixels of its landmarks from those of the fitted head
+    reprojection_px  camera -> timestep -> median distance in pixels of its landmarks from those of
+                     the fitted head
     interpolated     timesteps without a face, filled from their neighbors
     scale            meters per unit of the cameras' world
     warnings         one sentence each
-    image_misfit     region of the face -> timestep -> share of the images' points that are not explained, from 0 to 1;
-                     empty for takes too short for dense tracking
+    image_misfit     region of the face -> timestep -> share of the images' points that are not
+                     explained, from 0 to 1; empty for takes too short for dense tracking
     torso            how the torso moves; None where that cannot be told
-    focal_px, focal  focal length of a single camera without a calibration, else None; and `Footage.focal`
+    focal_px, focal  focal length of a single camera without a calibration, else None; and
+                     `Footage.focal`
     """
 
     reprojection_px: Mapping[str, Mapping[int, float]]
@@ -120,10 +131,12 @@ def track(
     head_file: a head model; None: the bundled one, which is copied into the capture.
     landmarks: folder of landmark files in place of the networks'.
     mattes: whether they are made for frames without a mask (`with_mattes`).
-    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks, frames of videos in OUT/images, and in
-    OUT/unfinished what helping processes found: called again after an interruption, that is not worked on again.
-    world: "head": meters as the head's size says, y up, the head near the origin; "keep": that of the cameras, which is
-    scaled about its origin where it is not in meters; "auto": as the calibration says, else "head".
+    What was detected is kept in OUT/landmarks, mattes in OUT/fg_masks, frames of videos in
+    OUT/images, and in OUT/unfinished what helping processes found: called again after an
+    interruption, that is not worked on again.
+    world: "head": meters as the head's size says, y up, the head near the origin; "keep": that of
+    the cameras, which is scaled about its origin where it is not in meters; "auto": as the
+    calibration says, else "head".
     show: given pictures and figures of how the head fits, the first one within seconds.
     Raises StgaError.
     """
@@ -153,7 +166,9 @@ def track(
         fit = in_cameras_world(fit) if keep else fit
         errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
         shares = [share for own in misfits.values() for share in own.values()]
-        quality = {"error_px": _median_px(errors)} | ({"unexplained": float(np.mean(shares))} if shares else {})
+        quality = {"error_px": _median_px(errors)} | (
+            {"unexplained": float(np.mean(shares))} if shares else {}
+        )
         show(partial(picture_of_fit, fit, footage), quality)
         parameters = interpolated(fit.parameters, footage.timesteps)
         matte_warnings: tuple[str, ...] = ()
@@ -161,7 +176,9 @@ def track(
             plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
             source = {**source, "plates": [list(map(str, plates)), _state(plates)]}
             head_pixels = _HeadPixels(fit, parameters)
-            footage, matte_warnings = with_mattes(footage, head_pixels, out, source, helpers, report)
+            footage, matte_warnings = with_mattes(
+                footage, head_pixels, out, source, helpers, report
+            )
         torso = follow_torso(fit, parameters, footage, helpers, report)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
@@ -181,7 +198,9 @@ def track(
         out / SHEET_FILE,
         footage,
         {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras},
-        lambda timestep: posed_mesh(torso.fit, torso.parameters[timestep], torso.offsets.get(timestep)),
+        lambda timestep: posed_mesh(
+            torso.fit, torso.parameters[timestep], torso.offsets.get(timestep)
+        ),
         fit.head.model.faces,
         result.reprojection_px,
         result.image_misfit,
@@ -200,7 +219,8 @@ def track(
 
 @dataclass(frozen=True)
 class _Seen:
-    """Landmarks: their places on the head model, which are reliable, and by camera, as detected and as used."""
+    """Landmarks: their places on the head model, which are reliable, and by camera, as detected and
+    as used."""
 
     places: SurfacePoints
     reliable: np.ndarray
@@ -208,9 +228,12 @@ class _Seen:
 
     @cached_property
     def found(self) -> dict[str, CameraLandmarks]:
-        """With confidence 0 for those that are not reliable; cameras without a face have none at all."""
+        """With confidence 0 for those that are not reliable; cameras without a face have none at
+        all."""
         return {
-            name: replace(own, confidence=own.confidence * self.reliable) if own.confidence.any() else own
+            name: replace(own, confidence=own.confidence * self.reliable)
+            if own.confidence.any()
+            else own
             for name, own in self.detected.items()
         }
 
@@ -249,17 +272,21 @@ def _detected(
 
 
 def _check_seen(head: HeadModel, seen: _Seen, places_file: Path) -> None:
-    """Raise StgaError for landmarks of another number than on the head, and for places that are no face."""
+    """Raise StgaError for landmarks of another number than on the head, and for places that are no
+    face."""
     check_count(seen.detected, seen.places)
     neutral = seen.places.on(head.model.v_template, head.model.faces)
     if np.ptp(neutral[seen.reliable], axis=0).max() < MIN_FACE_M:
-        raise StgaError(f"{places_file}: face: its landmarks lie in one point of the head model; expected a face")
+        raise StgaError(
+            f"{places_file}: face: its landmarks lie in one point of the head model; expected a face"
+        )
 
 
 def _with_take(
     head: HeadModel, footage: Footage, seen: _Seen, report: Report
 ) -> tuple[Footage, dict[int, TimestepLandmarks]]:
-    """The footage with the focal length of a camera that says none, and the timesteps that the head is fitted to."""
+    """The footage with the focal length of a camera that says none, and the timesteps that the head
+    is fitted to."""
     take = _take(head, footage, seen)
     if not take:
         raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
@@ -271,13 +298,23 @@ def _with_take(
 
 
 def _fitted(
-    head: HeadModel, seen: _Seen, take: Mapping[int, TimestepLandmarks], metric: bool, helpers: Helpers, report: Report
+    head: HeadModel,
+    seen: _Seen,
+    take: Mapping[int, TimestepLandmarks],
+    metric: bool,
+    helpers: Helpers,
+    report: Report,
 ) -> HeadFit:
     """The fit to the landmarks."""
-    part, done = (head, seen.places, seen.reliable, take, metric), lambda rounds: report("Fit", rounds, ROUNDS)
+    part, done = (
+        (head, seen.places, seen.reliable, take, metric),
+        lambda rounds: report("Fit", rounds, ROUNDS),
+    )
     report("Fit", 0, ROUNDS)
     fit: HeadFit = (
-        helpers.map(fit_head, [part], done)[0] if len(take) < LONG_TAKE else helpers.run(fit_head, part, done)
+        helpers.map(fit_head, [part], done)[0]
+        if len(take) < LONG_TAKE
+        else helpers.run(fit_head, part, done)
     )
     return fit
 
@@ -301,8 +338,9 @@ def by_images(
     helpers: Helpers,
     report: Report = lambda stage, done, total: None,
 ) -> tuple[HeadFit, dict[str, dict[int, float]]]:
-    """The fit moved onto what the images show, and region -> timestep -> how badly they are explained (`Misfit`); none
-    where the take is too short for dense tracking. `fit` is what `fit_head` returns for `head`."""
+    """The fit moved onto what the images show, and region -> timestep -> how badly they are
+    explained (`Misfit`); none where the take is too short for dense tracking. `fit` is what
+    `fit_head` returns for `head`."""
     dense = fit_dense(fit, take, helpers, report=report)
     if dense is None:
         return fit_surface(head, fit, take, helpers, report), {}
@@ -310,17 +348,25 @@ def by_images(
     fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
     dense = fit_dense(fit, take, helpers, True, report)
     assert dense is not None
-    misfits = {name: {t: float(own[row]) for t, own in dense.misfit.items()} for row, name in enumerate(REGIONS)}
+    misfits = {
+        name: {t: float(own[row]) for t, own in dense.misfit.items()}
+        for row, name in enumerate(REGIONS)
+    }
     return dense.fit, misfits
 
 
 def _median_px(errors: Mapping[str, Mapping[int, float | tuple[float, float]]]) -> float:
     """Of `reprojection_errors`, or of the pixels in them."""
-    return float(np.median([np.ravel(error)[0] for own in errors.values() for error in own.values()]))
+    return float(
+        np.median([np.ravel(error)[0] for own in errors.values() for error in own.values()])
+    )
 
 
-def interpolated(parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]) -> dict[int, np.ndarray]:
-    """Parameters of all timesteps: linear between the known ones, constant before the first and after the last."""
+def interpolated(
+    parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]
+) -> dict[int, np.ndarray]:
+    """Parameters of all timesteps: linear between the known ones, constant before the first and
+    after the last."""
     known = sorted(parameters)
     values = np.stack([parameters[timestep] for timestep in known])
     columns = np.stack([np.interp(timesteps, known, column) for column in values.T], axis=1)
@@ -335,14 +381,21 @@ def reprojection_errors(
     footage: Footage,
     found: Mapping[str, CameraLandmarks],
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Camera -> timestep -> median distance of its landmarks from the fitted head's, in pixels and in face sizes."""
+    """Camera -> timestep -> median distance of its landmarks from the fitted head's, in pixels and
+    in face sizes."""
     points = PosedPoints(fit.head.model, places)
-    errors: dict[str, dict[int, tuple[float, float]]] = {camera.name: {} for camera in footage.cameras}
+    errors: dict[str, dict[int, tuple[float, float]]] = {
+        camera.name: {} for camera in footage.cameras
+    }
     for timestep, parameters in fit.parameters.items():
         head = points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
         cameras = [name for name, own in found.items() if _row(own, timestep) is not None]
         for name, camera, pixels, confidence in zip(
-            cameras, take[timestep].cameras, take[timestep].points, take[timestep].confidence, strict=True
+            cameras,
+            take[timestep].cameras,
+            take[timestep].points,
+            take[timestep].confidence,
+            strict=True,
         ):
             use = reliable & (confidence > 0)
             projected, _ = fit.to_capture.camera(camera).project(head[use])
@@ -352,22 +405,30 @@ def reprojection_errors(
     return errors
 
 
-def _source(footage: Footage, head_file: Path | None, landmarks: Path | None = None) -> dict[str, Any]:
+def _source(
+    footage: Footage, head_file: Path | None, landmarks: Path | None = None
+) -> dict[str, Any]:
     """What landmarks and mattes are of; landmarks: the folder that they were read from."""
     return {
         "footage": str(footage.root),
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
-        "head_model": [str(head_file.resolve()) if head_file else "", _state([head_file or BUNDLED_HEAD])],
+        "head_model": [
+            str(head_file.resolve()) if head_file else "",
+            _state([head_file or BUNDLED_HEAD]),
+        ],
         "landmarks": None if landmarks is None else realpath(landmarks),
     }
 
 
 def _begin(out: Path, source: dict[str, Any]) -> None:
-    """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other footage."""
+    """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other
+    footage."""
     path = out / LANDMARKS_FOLDER / "footage.json"
     if path.exists() and read_json(path) != source:
-        raise StgaError(f"{out}: holds landmarks of other footage; give another --out, or delete it")
+        raise StgaError(
+            f"{out}: holds landmarks of other footage; give another --out, or delete it"
+        )
     write_json(path, source)
 
 
@@ -381,12 +442,20 @@ def _stored(footage: Footage, out: Path) -> Footage:
 
 
 def _recording(camera: FootageCamera) -> list[Any]:
-    """The first frame, the state of all files, and how frames are undistorted; it changes with offset and lens."""
+    """The first frame, the state of all files, and how frames are undistorted; it changes with
+    offset and lens."""
     pinhole = camera.camera
     first = [camera.source(camera.timesteps[0]), _state(camera.frames.files)]
     if camera.undistortion is None:
         return first
-    return [*first, repr(camera.undistortion.lens), pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy]
+    return [
+        *first,
+        repr(camera.undistortion.lens),
+        pinhole.fl_x,
+        pinhole.fl_y,
+        pinhole.cx,
+        pinhole.cy,
+    ]
 
 
 def _state(files: Iterable[Path]) -> str:
@@ -407,8 +476,14 @@ def _row(camera: CameraLandmarks, timestep: int) -> int | None:
 def _take(head: HeadModel, footage: Footage, seen: _Seen) -> dict[int, TimestepLandmarks]:
     """The timesteps that the head is fitted to."""
     neutral = seen.places.on(head.model.v_template, head.model.faces)
-    everything = {timestep: _at(footage, seen.found, timestep, len(neutral)) for timestep in footage.timesteps}
-    return {timestep: own for timestep, own in everything.items() if determines_pose(own, seen.reliable, neutral)}
+    everything = {
+        timestep: _at(footage, seen.found, timestep, len(neutral)) for timestep in footage.timesteps
+    }
+    return {
+        timestep: own
+        for timestep, own in everything.items()
+        if determines_pose(own, seen.reliable, neutral)
+    }
 
 
 def _with_focal(footage: Footage, pixels: float | None) -> Footage:
@@ -420,7 +495,9 @@ def _with_focal(footage: Footage, pixels: float | None) -> Footage:
     return replace(footage, cameras=(moved,), focal="solved")
 
 
-def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, count: int) -> TimestepLandmarks:
+def _at(
+    footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, count: int
+) -> TimestepLandmarks:
     cameras = {camera.name: camera.camera for camera in footage.cameras}
     rows = {name: row for name, own in found.items() if (row := _row(own, timestep)) is not None}
     return TimestepLandmarks(
@@ -430,14 +507,18 @@ def _at(footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, c
     )
 
 
-def _images(footage: Footage, timestep: int, most: int | None = None) -> list[tuple[Camera, np.ndarray]]:
+def _images(
+    footage: Footage, timestep: int, most: int | None = None
+) -> list[tuple[Camera, np.ndarray]]:
     cameras = _recording_at(footage, timestep, most)
     with ThreadPoolExecutor() as pool:  # decoding of a camera's images needs no lock of Python's
         images = list(pool.map(lambda camera: camera.image(timestep), cameras))
     return [(camera.camera, image) for camera, image in zip(cameras, images, strict=True)]
 
 
-def _masks(footage: Footage, timestep: int, most: int | None = None) -> list[tuple[Camera, np.ndarray]]:
+def _masks(
+    footage: Footage, timestep: int, most: int | None = None
+) -> list[tuple[Camera, np.ndarray]]:
     cameras = _recording_at(footage, timestep, most)
     found = [(camera.camera, camera.mask(timestep)) for camera in cameras]
     return [(camera, mask) for camera, mask in found if mask is not None]
@@ -452,12 +533,21 @@ def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
     """Raise StgaError where no camera ever sees a face."""
     if not any(camera.confidence.any() for camera in found.values()):
         views = list(footage.views())
-        raise StgaError(f"{views[0][1].source(views[0][0])}: shows no face, nor does any other of {len(views)} frames")
+        raise StgaError(
+            f"{views[0][1].source(views[0][0])}: shows no face, nor does any other of {len(views)} frames"
+        )
 
 
-def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]) -> None:
-    """Raise StgaError for a camera whose landmarks do not fit the head that the others see, or where none fits."""
-    share = {name: float(np.median([part for _, part in own.values()])) for name, own in errors.items() if own}
+def _check_cameras(
+    footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]
+) -> None:
+    """Raise StgaError for a camera whose landmarks do not fit the head that the others see, or
+    where none fits."""
+    share = {
+        name: float(np.median([part for _, part in own.values()]))
+        for name, own in errors.items()
+        if own
+    }
 
     def at_worst(name: str) -> str:
         worst = max(errors[name], key=lambda timestep: errors[name][timestep][1])
@@ -477,17 +567,23 @@ def _check_cameras(footage: Footage, errors: Mapping[str, Mapping[int, tuple[flo
         )
 
 
-def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit, is_scaled: bool) -> tuple[str, ...]:
+def _warnings(
+    footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadFit, is_scaled: bool
+) -> tuple[str, ...]:
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
     blind = [name for name, own in found.items() if not own.confidence.any()]
     warnings = list(footage.warnings)
     if missing:
         listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
-        warnings.append(f"no face at {len(missing)} of {len(footage.timesteps)} timesteps, interpolated: {listed}")
+        warnings.append(
+            f"no face at {len(missing)} of {len(footage.timesteps)} timesteps, interpolated: {listed}"
+        )
     if blind:
         warnings.append(f"no face in any frame of: {', '.join(blind)}")
     if len(footage.cameras) == 1:
-        warnings.append("one camera: size and distance of the head, and its depth, are those of the average head")
+        warnings.append(
+            "one camera: size and distance of the head, and its depth, are those of the average head"
+        )
     elif fit.static_offset is None:
         warnings.append(
             "the images do not show the skin's surface sharply enough: the head is fitted to landmarks alone"
@@ -498,7 +594,9 @@ def _warnings(footage: Footage, found: Mapping[str, CameraLandmarks], fit: HeadF
             f"{MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by {fit.to_capture.scale:.4g}"
         )
     if footage.focal == "usual":
-        warnings.append("the focal length is a guess, as the head turns too little to tell; give it if it is known")
+        warnings.append(
+            "the focal length is a guess, as the head turns too little to tell; give it if it is known"
+        )
     return tuple(warnings)
 
 
@@ -517,4 +615,7 @@ def _as_json(result: TrackingReport) -> dict[str, Any]:
 
 
 def _rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
-    return {name: {str(timestep): round(value, 3) for timestep, value in own.items()} for name, own in values.items()}
+    return {
+        name: {str(timestep): round(value, 3) for timestep, value in own.items()}
+        for name, own in values.items()
+    }

@@ -9,9 +9,11 @@ from ..capture.camera import Camera
 
 ITERATIONS = 15
 OUTLIER_SCALE = 1.5
-"""Distances from a ray, in medians of the landmark's rays, at which its weight has fallen to a quarter."""
+"""Distances from a ray, in medians of the landmark's rays, at which its weight has fallen to a
+quarter."""
 MIN_DISTANCE_SHARE = 1e-5
-"""Smallest scale of outliers, as a share of the distance to the cameras: below it, residuals are rounding."""
+"""Smallest scale of outliers, as a share of the distance to the cameras: below it, residuals are
+rounding."""
 RANK_GUARD = 1e-9
 
 
@@ -19,9 +21,10 @@ RANK_GUARD = 1e-9
 class Triangulation:
     """What one timestep's cameras say of N landmarks, in the units of the cameras' world.
 
-    position     (N, 3) the best point; for a single ray, one on that ray; without a ray, the center of the cameras
-    information  (N, 3, 3) weighted mean over the rays of I − d dᵀ: (x − position)ᵀ information (x − position) is the
-                 mean squared distance of x from the rays, up to a constant
+    position     (N, 3) the best point; for a single ray, one on that ray; without a ray, the center
+                 of the cameras
+    information  (N, 3, 3) weighted mean over the rays of I − d dᵀ: (x − position)ᵀ information (x −
+                 position) is the mean squared distance of x from the rays, up to a constant
     residual     (N,) median distance of the rays from `position`, 0 where there is none
     seen         (N,) bool: by two cameras at least, or by the only one
     """
@@ -34,18 +37,27 @@ class Triangulation:
 
 def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and unit directions (N, 3) in the world of pixels (N, 2)."""
-    local = np.column_stack([(points - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y], np.ones(len(points))])
+    local = np.column_stack(
+        [(points - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y], np.ones(len(points))]
+    )
     directions = local @ camera.world_to_camera[:3, :3]
     return camera.position, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def triangulate(cameras: Sequence[Camera], points: np.ndarray, confidence: np.ndarray) -> Triangulation:
-    """Landmarks (C, N, 2) pixels with confidence (C, N) ≥ 0, 0 for not seen, of C cameras at one timestep.
+def triangulate(
+    cameras: Sequence[Camera], points: np.ndarray, confidence: np.ndarray
+) -> Triangulation:
+    """Landmarks (C, N, 2) pixels with confidence (C, N) ≥ 0, 0 for not seen, of C cameras at one
+    timestep.
 
-    Iteratively reweighted least squares with Geman-McClure weights; scale per landmark is its median residual.
+    Iteratively reweighted least squares with Geman-McClure weights; scale per landmark is its
+    median residual.
     """
     pairs = [rays(camera, pixels) for camera, pixels in zip(cameras, points, strict=True)]
-    origins, directions = np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
+    origins, directions = (
+        np.stack([pair[0] for pair in pairs]),
+        np.stack([pair[1] for pair in pairs]),
+    )
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]  # (C, N, 3, 3)
     offsets = np.einsum("cnij,cj->cni", across, origins)
     guess = origins.mean(0) + (directions * confidence[..., None]).sum(0)
@@ -62,8 +74,11 @@ def triangulate(cameras: Sequence[Camera], points: np.ndarray, confidence: np.nd
         distance = np.linalg.norm(np.cross(to_point, directions), axis=2)
         scale = OUTLIER_SCALE * _median(distance, confidence > 0)
         floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
-        smallest = np.finfo(np.float64).tiny  # a point without a ray may lie in a camera, at distance 0 from its ray
-        weights = confidence / (1 + (distance / np.maximum(np.maximum(scale, floor), smallest)) ** 2) ** 2
+        # a point without a ray may lie in a camera, at distance 0 from its ray
+        smallest = np.finfo(np.float64).tiny
+        weights = (
+            confidence / (1 + (distance / np.maximum(np.maximum(scale, floor), smallest)) ** 2) ** 2
+        )
     seen = (confidence > 0).sum(0) >= min(2, len(cameras))
     return Triangulation(position, information, _median(distance, confidence > 0), seen)
 

@@ -1,4 +1,5 @@
-"""Writing of a tracked take as a capture: VHAP's layout for FLAME, the mesh layout for other models."""
+"""Writing of a tracked take as a capture: VHAP's layout for FLAME, the mesh layout for other
+models."""
 
 import shutil
 from collections.abc import Mapping
@@ -31,31 +32,42 @@ def write_capture(
     meshes: bool,
     report: Report,
 ) -> None:
-    """Write images, masks, the tracked head of each timestep, and at last the transforms that make it a capture.
+    """Write images, masks, the tracked head of each timestep, and at last the transforms that make
+    it a capture.
 
-    parameters: timestep -> (E + 18,), interpolated ones included; offsets: timestep -> (V, 3), where there are any.
-    With four cameras or more, the one nearest to the middle is held out as `val`. Raises StgaError where `out` cannot
-    be written.
+    parameters: timestep -> (E + 18,), interpolated ones included; offsets: timestep -> (V, 3),
+    where there are any. With four cameras or more, the one nearest to the middle is held out as
+    `val`. Raises StgaError where `out` cannot be written.
     """
     views = [view for view in footage.views() if view[0] in parameters]
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
     frames: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
     held_out = _middle_camera(footage) if len(footage.cameras) >= MIN_CAMERAS_TO_HOLD_OUT else None
     for number, (timestep, camera) in enumerate(views):
-        entry = _entry(out, timestep, camera, index[camera.name], fit.to_capture.camera(camera.camera))
+        entry = _entry(
+            out, timestep, camera, index[camera.name], fit.to_capture.camera(camera.camera)
+        )
         folder = (f"{PARAMETERS}", "npz") if fit.head.layout == "flame" else ("meshes", "obj")
-        entry["flame_param_path" if folder[1] == "npz" else "mesh_path"] = f"{folder[0]}/{timestep:05d}.{folder[1]}"
+        entry["flame_param_path" if folder[1] == "npz" else "mesh_path"] = (
+            f"{folder[0]}/{timestep:05d}.{folder[1]}"
+        )
         frames["val" if camera.name == held_out else "train"].append(entry)
         report("Images", number + 1, len(views))
-    top: dict[str, Any] = {**_write_heads(out, fit, parameters, offsets, meshes or fit.head.layout == "mesh", report)}
+    top: dict[str, Any] = {
+        **_write_heads(out, fit, parameters, offsets, meshes or fit.head.layout == "mesh", report)
+    }
     if footage.fps is not None:
         top["fps"] = footage.fps
-    for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):  # train last: see is_written
+    # train last: see is_written
+    for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):
         write_json(out / name, {**top, "frames": entries})
 
 
-def posed_mesh(fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None) -> np.ndarray:
-    """The head's vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this timestep."""
+def posed_mesh(
+    fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None
+) -> np.ndarray:
+    """The head's vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this
+    timestep."""
     return flame_forward(fit.head.model, np.zeros(0), frame_of(parameters, offset))
 
 
@@ -72,7 +84,9 @@ def _middle_camera(footage: Footage) -> str:
     return footage.cameras[int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())].name
 
 
-def _entry(out: Path, timestep: int, source: FootageCamera, number: int, camera: Camera) -> dict[str, Any]:
+def _entry(
+    out: Path, timestep: int, source: FootageCamera, number: int, camera: Camera
+) -> dict[str, Any]:
     """Copy image and mask; the entry of the transforms."""
     file = source.file(timestep)
     name = image_name(timestep, number, ".png" if file is None else file.suffix.lower())
@@ -128,7 +142,8 @@ def _write_heads(
 
 
 def moving_arrays(parameters: np.ndarray) -> dict[str, np.ndarray]:
-    """What changes from timestep to timestep of (E + 18,) parameters, as in VHAP's files: (1, …) float32."""
+    """What changes from timestep to timestep of (E + 18,) parameters, as in VHAP's files: (1, …)
+    float32."""
     frame = frame_of(parameters)
     return {name: getattr(frame, name)[None].astype(np.float32) for name in FRAME_FIELDS}
 

@@ -7,12 +7,13 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect: its name, as in `--effect NAME=on`, its cost while it is on, and the settings that switch it.
+    """An effect: its name, as in `--effect NAME=on`, its cost while it is on, and the settings that
+    switch it.
 
     on, off      changes to `TrainingSettings`
     offset       the driven offset (`avatar.offsets.table`) that it trains, if any
-    added_later  whether a continuation may switch it on in a run that went without: only where it adds coefficients,
-                 which leave the splats as they were while they are zero
+    added_later  whether a continuation may switch it on in a run that went without: only where it
+                 adds coefficients, which leave the splats as they were while they are zero
     """
 
     name: str
@@ -24,7 +25,8 @@ class Effect:
 
 
 RELIGHT = "relight"
-"""The light of the capture is estimated after training, so that the lights of a scene can take its place."""
+"""The light of the capture is estimated after training, so that the lights of a scene can take its
+place."""
 WORLD = "world"
 """What stands still behind the person becomes splats of its own, after training."""
 _EFFECTS = (
@@ -50,9 +52,18 @@ _EFFECTS = (
     Effect(
         "depth-limits",
         "none: splats are smaller and nearer to their triangles",
-        on={"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03},
+        on={
+            "scale_limit": 1.5,
+            "stray_limit": 0.5,
+            "stray_reset_interval": 20,
+            "adam_epsilon": 0.03,
+        },
     ),
-    Effect("density", "up to a quarter more splats, more in the preset final", off={"density_interval": 0}),
+    Effect(
+        "density",
+        "up to a quarter more splats, more in the preset final",
+        off={"density_interval": 0},
+    ),
     Effect(
         "selection",
         "none: local iterations are cheaper than global ones",
@@ -75,7 +86,12 @@ _EFFECTS = (
     Effect(RELIGHT, "seconds after training, and 30 bytes a vertex in the avatar file"),
     Effect(WORLD, "seconds to a minute after training, and a file of its own"),
     Effect("teeth", "splats on 168 triangles", on={"teeth": True}, off={"teeth": False}),
-    Effect("torso", "none: splats below the neck follow other triangles", on={"torso": True}, off={"torso": False}),
+    Effect(
+        "torso",
+        "none: splats below the neck follow other triangles",
+        on={"torso": True},
+        off={"torso": False},
+    ),
     Effect("neck", "9 shape keys and drivers in Blender"),
     Effect("jaw", "9 shape keys and drivers in Blender"),
     Effect("eyes", "18 shape keys and drivers in Blender"),

@@ -33,12 +33,16 @@ class EffectDecision:
 
     def __str__(self) -> str:
         asked = "" if self.choice == "auto" else ", as asked"
-        return f"{'on' if self.on else 'off'}{asked}: {self.reason}" + (f" [{self.cost}]" if self.on else "")
+        return f"{'on' if self.on else 'off'}{asked}: {self.reason}" + (
+            f" [{self.cost}]" if self.on else ""
+        )
 
 
 def parse_choice(text: str) -> tuple[str, str]:
     """Effect and choice, from a text such as "jaw=off". Raises StgaError for anything else."""
     name, _, choice = text.partition("=")
     if name not in EFFECTS or choice not in CHOICES:
-        raise StgaError(f"'{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}")
+        raise StgaError(
+            f"'{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}"
+        )
     return name, choice

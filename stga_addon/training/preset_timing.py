@@ -1,4 +1,5 @@
-"""Preset timing: how long each preset would train on this machine, measured on the capture itself."""
+"""Preset timing: how long each preset would train on this machine, measured on the capture
+itself."""
 
 from dataclasses import dataclass
 from itertools import cycle, islice
@@ -30,7 +31,8 @@ MAX_ITERATIONS = 2000
 
 @dataclass(frozen=True)
 class PresetTiming:
-    """A preset's iterations for a capture, and the seconds of training that they are expected to take."""
+    """A preset's iterations for a capture, and the seconds of training that they are expected to
+    take."""
 
     preset: str
     purpose: str
@@ -38,8 +40,11 @@ class PresetTiming:
     seconds: float
 
 
-def time_presets(capture: Capture, seconds: float = CALIBRATION_S, device: str = "cpu") -> list[PresetTiming]:
-    """Measure each preset, with the effects that suit the capture, for `seconds` on a device of `choose_device`.
+def time_presets(
+    capture: Capture, seconds: float = CALIBRATION_S, device: str = "cpu"
+) -> list[PresetTiming]:
+    """Measure each preset, with the effects that suit the capture, for `seconds` on a device of
+    `choose_device`.
 
     Raises StgaError if the capture has no training views.
     """
@@ -55,13 +60,16 @@ def time_presets(capture: Capture, seconds: float = CALIBRATION_S, device: str =
 
 
 def seconds_per_iteration(
-    capture: Capture, settings: TrainingSettings, seconds: float = CALIBRATION_S, device: str = "cpu"
+    capture: Capture,
+    settings: TrainingSettings,
+    seconds: float = CALIBRATION_S,
+    device: str = "cpu",
 ) -> float:
     """Mean time of an iteration, measured by a short run whose result is discarded.
 
-    The run passes through the whole schedule in `seconds`, so that coarse images, spherical harmonics and local
-    iterations have the weight that they have in a real run. Reading files is not measured: in a real run, the loader's
-    thread does it.
+    The run passes through the whole schedule in `seconds`, so that coarse images, spherical
+    harmonics and local iterations have the weight that they have in a real run. Reading files is
+    not measured: in a real run, the loader's thread does it.
     """
     precompile_kernels(device)
     selective = settings.strategy == "selective"
@@ -70,7 +78,9 @@ def seconds_per_iteration(
     order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
     scales = {image_scale(settings, 0.0), settings.scale}
-    loaded = {scale: cycle([_load(capture, view, scale, settings) for view in views]) for scale in scales}
+    loaded = {
+        scale: cycle([_load(capture, view, scale, settings) for view in views]) for scale in scales
+    }
     times: list[float] = []
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)

@@ -1,4 +1,5 @@
-"""Schedules over the training budget: order of views, degree of spherical harmonics, learning rates, image scale."""
+"""Schedules over the training budget: order of views, degree of spherical harmonics, learning
+rates, image scale."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,14 +9,16 @@ from ..capture.model import View
 from .settings import Rates, TrainingSettings
 
 COARSE_SCALE = 0.5
-"""Size of the images during `TrainingSettings.coarse_share`, as a share of the size trained at afterwards."""
+"""Size of the images during `TrainingSettings.coarse_share`, as a share of the size trained at
+afterwards."""
 
 
 def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0) -> Iterator[View]:
     """Endless random order of views, from position `start` on.
 
-    Views of a frame are visited in groups of `per_visit` (0: all of them, the paper's batches; 1: fully shuffled),
-    and the groups in random order. Epoch e depends on (seed, e) alone, so a resumed run continues the same order.
+    Views of a frame are visited in groups of `per_visit` (0: all of them, the paper's batches; 1:
+    fully shuffled), and the groups in random order. Epoch e depends on (seed, e) alone, so a
+    resumed run continues the same order.
     """
     epoch = start // len(views)
     skip = start % len(views)
@@ -44,7 +47,9 @@ def sh_degree(settings: TrainingSettings, progress: float) -> int:
 
 def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
     """Exponential decay from the initial rates to their ends."""
-    initial = {name: rate for name, rate in vars(rates).items() if name not in ("position_end", "end")}
+    initial = {
+        name: rate for name, rate in vars(rates).items() if name not in ("position_end", "end")
+    }
     ends = {name: rates.position_end if name == "xyz" else rates.end for name in initial}
     return {name: rate * ends[name] ** min(1.0, progress) for name, rate in initial.items()}
 

@@ -30,12 +30,14 @@ MAX_WEIGHT = 1e6
 MAX_RATE = 1e3
 MAX_GROWTH = 100
 EXPOSURE_SIZES = 7, 8
-"""Numbers of a row of `TrainingSettings.exposure`: of a whole recording, and of a timestep of one that drifts."""
+"""Numbers of a row of `TrainingSettings.exposure`: of a whole recording, and of a timestep of one
+that drifts."""
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates at the start; each decays exponentially to `position_end` or `end` of itself.
+    """Adam's learning rates at the start; each decays exponentially to `position_end` or `end` of
+    itself.
 
     Positions in local units (meters of the neutral mesh), scales as logarithms, opacity as logit.
     """
@@ -52,14 +54,17 @@ class Rates:
 
 
 MAX_FINE_TRIANGLES = 16_000
-"""Of FLAME's size and less; on meshes of 20,000 and more triangles, 3 splats a triangle give the same images as 6."""
+"""Of FLAME's size and less; on meshes of 20,000 and more triangles, 3 splats a triangle give the
+same images as 6."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A level of quality: its purpose, the settings that differ from the defaults, and how long to train.
+    """A level of quality: its purpose, the settings that differ from the defaults, and how long to
+    train.
 
-    iterations, passes  train so many iterations, but at least so many passes over all training views
+    iterations, passes  train so many iterations, but at least so many passes over all training
+                        views
     """
 
     purpose: str
@@ -84,59 +89,74 @@ PRESETS = {
 class TrainingSettings:
     """Settings of one training run.
 
-    strategy       "selective" trains local and global iterations in turn (STGA, training); "global" only global
-                   ones, which measured best at equal time (docs/results.md); "gaussian-avatars" is global training
-                   with that method's binding, losses and rates; "refine" and "extend" continue a finished run
+    strategy       "selective" trains local and global iterations in turn (STGA, training); "global"
+                   only global ones, which measured best at equal time (docs/results.md);
+                   "gaussian-avatars" is global training with that method's binding, losses and
+                   rates; "refine" and "extend" continue a finished run
     schedule       "paper": with `PAPER_SETTINGS` instead of the defaults
-    seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations; one of the two,
-                          or neither with a preset, which brings its iterations (`with_budget`)
+    seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations;
+                          one of the two, or neither with a preset, which brings its iterations
+                          (`with_budget`)
     seed           fixes the order of views and every random choice
-    lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA, embedding); None: 2,
-                   or 1 (3 splats) on meshes of more than MAX_FINE_TRIANGLES
+    lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA,
+                   embedding); None: 2, or 1 (3 splats) on meshes of more than MAX_FINE_TRIANGLES
     convention     embedding convention
-    views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the paper's batches)
-    global_interval, global_unit   a global iteration after every so many local iterations, or "frame" visits
+    views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the
+                     paper's batches)
+    global_interval, global_unit   a global iteration after every so many local iterations, or
+                                   "frame" visits
     warm_up_share  share of the budget trained globally before the first local iteration
     selection      which triangles a frame trains
     ssim_weight    of the image loss (1 − w)·L1 + w·(1 − SSIM)
     scale_weight, scale_limit   weight of ‖ReLU(scale − limit)‖₂ and the limit
     distance_weight, distance_limit   the same for the distance from the triangle's origin
-    unbound_scale_limit  the scale limit of unbound splats, a multiple of the distance between hull points
-    unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points that few cameras
+    unbound_scale_limit  the scale limit of unbound splats, a multiple of the distance between hull
+                         points
+    unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points
+                           that few cameras
                    see fade, unless nothing else explains what these cameras see
-    adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats that hardly show
-                   in an image, and whose gradients are below it, hardly move
-    ema_share      share of the latest step in each splat's exponential moving average, which the avatar is made of;
+    adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats
+                   that hardly show in an image, and whose gradients are below it, hardly move
+    ema_share      share of the latest step in each splat's exponential moving average, which the
+                   avatar is made of;
                    1: no averaging
-    stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a splat farther than the
-                   limit from its triangle's origin is put back to this share of the limit; 0: onto the origin, as in
-                   the paper
-                   All limits but `unbound_scale_limit` are multiples of sqrt(2·triangle area) for "stga", of the
-                   triangle's own unit of length for "gaussian_avatars"
-    sh_degree, sh_steps   highest SH degree, and the shares of the budget at which the degree rises by one
+    stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a
+    splat farther than the
+                   limit from its triangle's origin is put back to this share of the limit; 0: onto
+                   the origin, as in the paper All limits but `unbound_scale_limit` are multiples of
+                   sqrt(2·triangle area) for "stga", of the triangle's own unit of length for
+                   "gaussian_avatars"
+    sh_degree, sh_steps   highest SH degree, and the shares of the budget at which the degree rises
+                          by one
     hull_points    add hull points for what the mesh does not cover
-    density_interval  iterations between density control, 0 never; it works during `density_span` of the budget
+    density_interval  iterations between density control, 0 never; it works during `density_span` of
+                      the budget
     growth         most splats that density control may add, as a share of the initial number
     background     color behind the head in the capture's images, and behind transparent ones
-    random_background  where there are masks, put a random color behind the head in every iteration, so that splats
+    random_background  where there are masks, put a random color behind the head in every iteration,
+                       so that splats
                    of the background's color cannot hide in it and alpha is learned
-    backdrop       what is behind the head in the images, one of `backdrop.BACKDROPS`: but for "plain", training and
-                   evaluations see the head over the color `background`
-    scale, coarse_share   size of the images trained on, as a share of the captured ones; during the first
+    backdrop       what is behind the head in the images, one of `backdrop.BACKDROPS`: but for
+                   "plain", training and evaluations see the head over the color `background`
+    scale, coarse_share   size of the images trained on, as a share of the captured ones; during the
+                          first
                    `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
     stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
-    strain_color   splats have color that depends on the deformation of their triangle (`avatar.strain`)
+    strain_color   splats have color that depends on the deformation of their triangle
+                   (`avatar.strain`)
     driven_offsets  names of `avatar.offsets.table`: splats move with signals of the pose
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
-    torso          hull points below the neck follow FLAME's root joint, not the head's nearest triangle
-    exposure       per training camera: its index, and gain and offset (levels of 255) of red, green and blue in its
-                   images, which are corrected when they are read; where it drifts, several rows with their timestep
+    torso          hull points below the neck follow FLAME's root joint, not the head's nearest
+                   triangle
+    exposure       per training camera: its index, and gain and offset (levels of 255) of red, green
+                   and blue in its images, which are corrected when they are read; where it drifts,
+                   several rows with their timestep
     tracking       whether the avatar tracks its own head halfway (`RefinedTracking`)
-    effects        effect -> "on" or "off" where the user has decided; the others are decided from the capture
-                   (`effects.plan`). None: these settings are final
+    effects        effect -> "on" or "off" where the user has decided; the others are decided from
+                   the capture (`effects.plan`). None: these settings are final
     """
 
     strategy: str = option(
@@ -144,13 +164,17 @@ class TrainingSettings:
         "global", choices=(*STRATEGIES, *CONTINUATIONS), offered=STRATEGIES,
     )  # fmt: skip
     schedule: str = option(
-        "paper: the settings of the STGA paper (default: what measured best)", "default", choices=SCHEDULES
+        "paper: the settings of the STGA paper (default: what measured best)",
+        "default",
+        choices=SCHEDULES,
     )
     seconds: float | None = option(
         "training time such as 90s, 10m (default 2m)", None, above=0,
         flag="--budget", metavar="TIME", parse=duration, group="budget",
     )  # fmt: skip
-    iterations: int | None = option("number of iterations instead of a time", None, 1, MAX_COUNT, group="budget")
+    iterations: int | None = option(
+        "number of iterations instead of a time", None, 1, MAX_COUNT, group="budget"
+    )
     seed: int = option("fixes every random choice", 0, 0, (1 << 63) - 1)
     lattice: int | None = setting(None, 0, 16)
     convention: str = setting("stga", choices=CONVENTIONS)
@@ -220,7 +244,8 @@ class TrainingSettings:
         return 2 if triangles <= MAX_FINE_TRIANGLES else 1
 
     def check(self) -> None:
-        """Raise StgaError for settings at odds with each other, and for rows and names that types do not tell."""
+        """Raise StgaError for settings at odds with each other, and for rows and names that types
+        do not tell."""
         given = (self.seconds is not None) + (self.iterations is not None)
         if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")
@@ -229,12 +254,20 @@ class TrainingSettings:
                 expected = "rows of a camera index, three gains above 0, three offsets, and a timestep where they drift"
                 raise StgaError(complaint("exposure", expected, row))
         if not set(self.driven_offsets) <= set(OFFSETS):
-            raise StgaError(complaint("driven_offsets", f"names among {', '.join(OFFSETS)}", self.driven_offsets))
+            raise StgaError(
+                complaint(
+                    "driven_offsets", f"names among {', '.join(OFFSETS)}", self.driven_offsets
+                )
+            )
         effects = self.effects or {}
         if not (set(effects) <= set(EFFECTS) and set(effects.values()) <= set(CHOICES)):
-            raise StgaError(complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects)))
+            raise StgaError(
+                complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects))
+            )
         if effects and (self.schedule == "paper" or self.strategy == "gaussian-avatars"):
-            other = "--schedule paper" if self.schedule == "paper" else "--strategy gaussian-avatars"
+            other = (
+                "--schedule paper" if self.schedule == "paper" else "--strategy gaussian-avatars"
+            )
             raise StgaError(f"--effect cannot be combined with {other}")
 
 
@@ -255,13 +288,21 @@ PAPER_SETTINGS = {
     "random_background": False,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
-"""The paper's settings where they differ from the defaults, which measured best (docs/results.md)."""
+"""The paper's settings where they differ from the defaults, which measured best
+(docs/results.md)."""
 
 GAUSSIAN_AVATARS_SETTINGS = {
     "convention": "gaussian_avatars",
     "lattice": 0,
     "rates": Rates(
-        xyz=5e-3, log_scale=1.7e-2, rotation=1e-3, opacity=5e-2, sh=2.5e-3, sh_rest=1.25e-4, position_end=0.01, end=1.0
+        xyz=5e-3,
+        log_scale=1.7e-2,
+        rotation=1e-3,
+        opacity=5e-2,
+        sh=2.5e-3,
+        sh_rest=1.25e-4,
+        position_end=0.01,
+        end=1.0,
     ),
     "scale_limit": 0.6,
     "distance_weight": 0.01,
@@ -272,23 +313,28 @@ GAUSSIAN_AVATARS_SETTINGS = {
     "random_background": False,
     "growth": 8.0,
 }
-"""GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and released settings)."""
+"""GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and
+released settings)."""
 
 
 def with_budget(settings: TrainingSettings, views: int) -> TrainingSettings:
-    """The settings with the iterations of their preset for so many training views, where they give no budget."""
+    """The settings with the iterations of their preset for so many training views, where they give
+    no budget."""
     if settings.preset is None or settings.seconds is not None or settings.iterations is not None:
         return settings
     return replace(settings, iterations=PRESETS[settings.preset].iterations_for(views))
 
 
 def make_settings(
-    strategy: str | None = None, schedule: str = "default", preset: str | None = None, **changes: Any
+    strategy: str | None = None,
+    schedule: str = "default",
+    preset: str | None = None,
+    **changes: Any,
 ) -> TrainingSettings:
     """TrainingSettings of a strategy, schedule and preset with `changes` on top.
 
-    Without a strategy, the paper schedule trains selectively and the default one by the default strategy.
-    Raises StgaError naming a setting that is not allowed (`validate`).
+    Without a strategy, the paper schedule trains selectively and the default one by the default
+    strategy. Raises StgaError naming a setting that is not allowed (`validate`).
     """
     if strategy is None:
         strategy = "selective" if schedule == "paper" else TrainingSettings.strategy

@@ -1,7 +1,8 @@
-"""Helping processes: the parts of a task are worked on by several at once, with one thread of linear algebra each.
+"""Helping processes: the parts of a task are worked on by several at once, with one thread of
+linear algebra each.
 
-For work that is many small steps of NumPy, which threads do not share: each step holds Python's lock, and BLAS divides
-matrices among threads that are too small for it.
+For work that is many small steps of NumPy, which threads do not share: each step holds Python's
+lock, and BLAS divides matrices among threads that are too small for it.
 """
 
 import hashlib
@@ -29,7 +30,9 @@ from .training_python import own_python
 MAX_HELPERS = 8
 """Each takes some 300 MB."""
 THREADS_VARIABLE = "OMP_NUM_THREADS"
-SINGLE = dict.fromkeys((THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+SINGLE = dict.fromkeys(
+    (THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
+)
 """Environment variables of a helper."""
 REPORT_INTERVAL_S = 0.2
 STEPS_KEY = "steps"
@@ -49,8 +52,9 @@ def processors() -> int:
 class Helpers:
     """Processes that are started when there is work for two, and end with the `with` block.
 
-    count: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to MAX_HELPERS. With one, all work
-    is done in this process. folder: of the results that `map` keeps; None: none is kept.
+    count: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to
+    MAX_HELPERS. With one, all work is done in this process. folder: of the results that `map`
+    keeps; None: none is kept.
     """
 
     def __init__(self, count: int | None = None, folder: Path | None = None) -> None:
@@ -62,7 +66,9 @@ class Helpers:
     def __enter__(self) -> "Helpers":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
         self.end()
 
     def end(self) -> None:
@@ -77,18 +83,26 @@ class Helpers:
         self._processes = []
 
     def map(
-        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None], keep: bool = False
+        self,
+        work: Callable[..., Any],
+        parts: Sequence[tuple],
+        done: Callable[[int], None],
+        keep: bool = False,
     ) -> list[Any]:
         """The results of work(*part, step) of every part, in order.
 
-        work: a function of a module, which calls `step` after each of its steps; parts and results can be pickled.
-        done: is told how many steps there were, of all parts together; what it raises ends the work. keep: results are
-        arrays by name; each is kept in the folder as soon as there is one, and read from there instead of working on an
-        equal part again.
-        Raises what work raises, and StgaError where a helper ends before its work does.
+        work: a function of a module, which calls `step` after each of its steps; parts and results
+        can be pickled.
+        done: is told how many steps there were, of all parts together; what it raises ends the
+        work. keep: results are arrays by name; each is kept in the folder as soon as there is one,
+        and read from there instead of working on an equal part again. Raises what work raises, and
+        StgaError where a helper ends before its work does.
         """
         if keep and self._folder is not None:
-            work, parts = _kept, [(self._folder / f"{_digest(work, part)}.npz", work, part) for part in parts]
+            work, parts = (
+                _kept,
+                [(self._folder / f"{_digest(work, part)}.npz", work, part) for part in parts],
+            )
         count = min(self._count, len(parts))
         if count < 2:
             steps = _Counter()
@@ -96,19 +110,27 @@ class Helpers:
         return self._shared(work, parts, done, count)
 
     def run(self, work: Callable[..., Any], part: tuple, done: Callable[[int], None]) -> Any:
-        """The result of work(*part, step) of one helping process, as `map`; for what is not worth two."""
+        """The result of work(*part, step) of one helping process, as `map`; for what is not worth
+        two."""
         if self._count < 2:
             return self.map(work, [part], done)[0]
         return self._shared(work, [part], done, 1)[0]
 
     def _shared(
-        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None], count: int
+        self,
+        work: Callable[..., Any],
+        parts: Sequence[tuple],
+        done: Callable[[int], None],
+        count: int,
     ) -> list[Any]:
         """The results of so many helping processes."""
         while len(self._processes) < count:
             self._processes.append(_start())
         task = _Task(work, parts)
-        threads = [Thread(target=task.feed, args=(process,), daemon=True) for process in self._processes[:count]]
+        threads = [
+            Thread(target=task.feed, args=(process,), daemon=True)
+            for process in self._processes[:count]
+        ]
         for thread in threads:
             thread.start()
         for thread in threads:
@@ -123,11 +145,16 @@ class Helpers:
 
 def _digest(work: Callable[..., Any], part: tuple) -> str:
     """Changes with any of the arguments."""
-    return hashlib.sha256(pickle.dumps((work.__qualname__, part), pickle.HIGHEST_PROTOCOL)).hexdigest()[:32]
+    return hashlib.sha256(
+        pickle.dumps((work.__qualname__, part), pickle.HIGHEST_PROTOCOL)
+    ).hexdigest()[:32]
 
 
-def _kept(file: Path, work: Callable[..., dict[str, Any]], part: tuple, step: Step) -> dict[str, Any]:
-    """The result of work(*part, step), read from the file where it is there and whole, else written into it."""
+def _kept(
+    file: Path, work: Callable[..., dict[str, Any]], part: tuple, step: Step
+) -> dict[str, Any]:
+    """The result of work(*part, step), read from the file where it is there and whole, else written
+    into it."""
     with suppress(StgaError, KeyError, TypeError):
         found = read_npz(file)
         for _ in range(int(found.pop(STEPS_KEY))):
@@ -157,7 +184,8 @@ class _Counter:
 
 
 class _Task:
-    """What `Helpers.map` does at a time: parts that are left, and results and errors of the others."""
+    """What `Helpers.map` does at a time: parts that are left, and results and errors of the
+    others."""
 
     def __init__(self, work: Callable[..., Any], parts: Sequence[tuple]) -> None:
         self.results: list[Any] = [None] * len(parts)
@@ -177,7 +205,9 @@ class _Task:
             return
         except (EOFError, OSError, pickle.UnpicklingError):
             code = process.poll()
-            self.errors.append(StgaError(f"a helping process ended before its work did (exit status {code})"))
+            self.errors.append(
+                StgaError(f"a helping process ended before its work did (exit status {code})")
+            )
         except BaseException as error:  # raised again by the thread that waits
             self.errors.append(error)
 
@@ -197,12 +227,17 @@ class _Task:
 
 def _start() -> "subprocess.Popen[bytes]":
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    quiet = {"creationflags": 0x08000000} if os.name == "nt" else {"preexec_fn": end_with_this_process()}
+    quiet = (
+        {"creationflags": 0x08000000}
+        if os.name == "nt"
+        else {"preexec_fn": end_with_this_process()}
+    )
     return start_python(own_python(), ["stga_addon.worker.helpers"], SINGLE, **pipes, **quiet)
 
 
 class _Unpickler(pickle.Unpickler):
-    """Finds this package's functions and classes by the name that it has in this process: another one in Blender."""
+    """Finds this package's functions and classes by the name that it has in this process: another
+    one in Blender."""
 
     def find_class(self, module: str, name: str) -> Any:
         own = (__package__ or "").removesuffix(".worker")
@@ -215,9 +250,11 @@ def _send(stream: IO[bytes], message: Any) -> None:
 
 
 def claim_stdout() -> BinaryIO:
-    """Return a stream on standard output, and send whatever else is written there to standard error.
+    """Return a stream on standard output, and send whatever else is written there to standard
+    error.
 
-    Call it before anything that may print is imported: libraries in C write to descriptor 1, whatever `sys.stdout` is.
+    Call it before anything that may print is imported: libraries in C write to descriptor 1,
+    whatever `sys.stdout` is.
     """
     sys.stdout.flush()
     try:
@@ -231,7 +268,8 @@ def claim_stdout() -> BinaryIO:
 
 
 def help_until_closed() -> None:
-    """Work on what comes from standard input, and answer on standard output, until the process that asks has gone."""
+    """Work on what comes from standard input, and answer on standard output, until the process that
+    asks has gone."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks

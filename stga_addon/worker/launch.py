@@ -15,23 +15,26 @@ from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, r
 from .training_python import own_python
 
 CACHE_VARIABLE = "STGA_CACHE"
-"""Environment variable that names the folder. Blender's extension sets it to one that uninstalling removes."""
+"""Environment variable that names the folder. Blender's extension sets it to one that uninstalling
+removes."""
 KERNELS, BUNDLED, BYTECODE, CHARTS = "kernels", "bundled kernels", "bytecode", "matplotlib"
-"""Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with its own
-(`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
+"""Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with
+its own (`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
 PREPARING = "preparing.lock"
 """Held in it by the process that compiles ahead of a training (`jobs.preparation`)."""
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS, BACKGROUND_NICENESS = 5, 15
-"""Added to the nice value of a worker, so that Blender has precedence, and of what runs in the background, so that
-workers have."""
+"""Added to the nice value of a worker, so that Blender has precedence, and of what runs in the
+background, so that workers have."""
 PR_SET_PDEATHSIG = 1
 """Of prctl(2)."""
-# Windows: own process group, so that closing the console does not end the worker; no console window; and
-# BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
+# Windows: own process group, so that closing the console does not end the worker; no console
+# window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
 _DETACHED: dict[str, Any] = (
-    {"creationflags": 0x00000200 | 0x08000000 | 0x00004000} if os.name == "nt" else {"start_new_session": True}
+    {"creationflags": 0x00000200 | 0x08000000 | 0x00004000}
+    if os.name == "nt"
+    else {"start_new_session": True}
 )
 
 
@@ -40,7 +43,8 @@ def cache_folder() -> Path:
     named = os.environ.get(CACHE_VARIABLE)
     if named:
         return Path(named)
-    from platformdirs import user_cache_path  # a Python without it, such as Blender's, has the variable
+    # a Python without it, such as Blender's, has the variable
+    from platformdirs import user_cache_path
 
     return user_cache_path("stga", appauthor=False)
 
@@ -66,17 +70,27 @@ def prepare_status_folder(folder: Path) -> None:
 
 
 def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start `python -m ARGUMENTS…` at low priority in a prepared status folder; it outlives the calling process.
+    """Start `python -m ARGUMENTS…` at low priority in a prepared status folder; it outlives the
+    calling process.
 
-    Raises StgaError where the interpreter cannot be started; then only the status is removed from the folder.
+    Raises StgaError where the interpreter cannot be started; then only the status is removed from
+    the folder.
     """
     try:
         log = os.open(folder / LOG_FILE, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
     except OSError as error:
-        raise StgaError(f"{folder / LOG_FILE}: cannot be written ({error.strerror or error})") from error
+        raise StgaError(
+            f"{folder / LOG_FILE}: cannot be written ({error.strerror or error})"
+        ) from error
     try:
         process = start_python(
-            python, arguments, cwd=folder, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, **_DETACHED
+            python,
+            arguments,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            **_DETACHED,
         )
     except StgaError:
         remove_status_folder(folder)
@@ -88,10 +102,12 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
 
 
 def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start `python -m ARGUMENTS…` at low priority, without a status; what it prints is dropped. Raises StgaError where
-    the interpreter cannot be started."""
+    """Start `python -m ARGUMENTS…` at low priority, without a status; what it prints is dropped.
+    Raises StgaError where the interpreter cannot be started."""
     nothing = subprocess.DEVNULL
-    process = start_python(python, arguments, stdin=nothing, stdout=nothing, stderr=nothing, **_DETACHED)
+    process = start_python(
+        python, arguments, stdin=nothing, stdout=nothing, stderr=nothing, **_DETACHED
+    )
     _give_precedence(process, BACKGROUND_NICENESS)
     return process
 
@@ -100,11 +116,16 @@ def _give_precedence(process: subprocess.Popen[bytes], niceness: int) -> None:
     """Lower the priority of a process on Linux and macOS; Windows starts it with a low one."""
     if os.name != "nt":
         with suppress(OSError):  # the process has ended already
-            os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness)
+            os.setpriority(
+                os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness
+            )
 
 
 def start_python(
-    python: str, arguments: Sequence[str], variables: Mapping[str, str] | None = None, **options: Any
+    python: str,
+    arguments: Sequence[str],
+    variables: Mapping[str, str] | None = None,
+    **options: Any,
 ) -> subprocess.Popen[Any]:
     """Start `python -m ARGUMENTS…` with `worker_environment`.
 
@@ -116,11 +137,14 @@ def start_python(
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
         reason = getattr(error, "strerror", None) or error
-        raise StgaError(f"{python}: cannot be started as a Python interpreter ({reason})") from error
+        raise StgaError(
+            f"{python}: cannot be started as a Python interpreter ({reason})"
+        ) from error
 
 
 def end_with_this_process() -> Callable[[], None] | None:
-    """A `preexec_fn` by which Linux kills the started process when the thread that starts it has gone, killed or not.
+    """A `preexec_fn` by which Linux kills the started process when the thread that starts it has
+    gone, killed or not.
 
     None on other systems, where such a process goes on to its end.
     """
@@ -139,16 +163,21 @@ def end_with_this_process() -> Callable[[], None] | None:
 
 
 def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, str]:
-    """Environment variables for the interpreter `python`: the path of this package, and none of Blender's own Python.
+    """Environment variables for the interpreter `python`: the path of this package, and none of
+    Blender's own Python.
 
-    Another process of this interpreter finds the packages that this process does, and no others: Blender's extensions
-    have a folder for theirs, which its Python does not search by itself, and Blender ignores the user's site-packages.
-    As installed by Blender, these packages have no bytecode; it is kept in the cache folder, if Blender named one.
+    Another process of this interpreter finds the packages that this process does, and no others:
+    Blender's extensions have a folder for theirs, which its Python does not search by itself, and
+    Blender ignores the user's site-packages. As installed by Blender, these packages have no
+    bytecode; it is kept in the cache folder, if Blender named one.
     """
     is_own = python in (sys.executable, own_python())
     cache = variables.get(CACHE_VARIABLE) if is_own else None
     compiled = (
-        {"PYTHONPYCACHEPREFIX": os.path.join(cache, BYTECODE), "MPLCONFIGDIR": os.path.join(cache, CHARTS)}
+        {
+            "PYTHONPYCACHEPREFIX": os.path.join(cache, BYTECODE),
+            "MPLCONFIGDIR": os.path.join(cache, CHARTS),
+        }
         if cache
         else {"PYTHONDONTWRITEBYTECODE": "1"}  # the extension's folder belongs to Blender
     )
@@ -167,5 +196,9 @@ def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, s
 
 
 def same_interpreter_environment(variables: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables for another process of this interpreter: the packages that this process finds."""
-    return {**variables, "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)])}
+    """Environment variables for another process of this interpreter: the packages that this process
+    finds."""
+    return {
+        **variables,
+        "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)]),
+    }

@@ -1,4 +1,5 @@
-"""Lock files that end with the process that holds them; leases, which it renews, where the storage has no locks."""
+"""Lock files that end with the process that holds them; leases, which it renews, where the storage
+has no locks."""
 
 import errno
 import os
@@ -13,27 +14,32 @@ from ..errors import StgaError
 from ..files import file_size
 
 ACQUIRE_TIMEOUT_S = 0.3
-"""How long a lock is waited for: a process that only asks whether it is held has it for a moment."""
+"""How long a lock is waited for: a process that only asks whether it is held has it for a
+moment."""
 PROBE_TIMEOUT_S = 0.03
-"""The same between two processes that only ask; Blender's timer waits that long for a worker of another Blender."""
+"""The same between two processes that only ask; Blender's timer waits that long for a worker of
+another Blender."""
 RETRY_INTERVAL_S = 0.002
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without working locks answers: some NFS and parallel file systems."""
 BEAT_S, EXPIRY_S = 5.0, 30.0
-"""Seconds between two renewals of a lease, and without one until another process takes it: from a holder that was
-killed on another machine, or stands still (a suspended machine, storage that hangs)."""
+"""Seconds between two renewals of a lease, and without one until another process takes it: from a
+holder that was killed on another machine, or stands still (a suspended machine, storage that
+hangs)."""
 LOOK_INTERVAL_S = 0.2
 OWNER_OFFSET = 1
-"""Where the owner's process number starts: on Windows, other processes cannot read the first byte, which is locked."""
+"""Where the owner's process number starts: on Windows, other processes cannot read the first byte,
+which is locked."""
 
 
 @contextmanager
 def hold_lock(path: Path, leased: bool = False) -> Iterator[SoftFileLease | None]:
-    """Hold the lock file for this process, and write the process number into it; a lease where there are no locks.
+    """Hold the lock file for this process, and write the process number into it; a lease where
+    there are no locks.
 
-    leased: hold a lease as well, for storage whose locks other machines do not see. What is yielded is the lease: it
-    has a `compromise` once another process has taken it.
-    Raises BlockingIOError while another process holds it, OSError where it cannot be written or is a symbolic link.
+    leased: hold a lease as well, for storage whose locks other machines do not see. What is yielded
+    is the lease: it has a `compromise` once another process has taken it. Raises BlockingIOError
+    while another process holds it, OSError where it cannot be written or is a symbolic link.
     """
     with ExitStack() as held:
         try:
@@ -63,8 +69,11 @@ def _hold_file_lock(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
-    """Wait until another holder is gone, or has stood still for EXPIRY_S. Raises BlockingIOError when it renews."""
-    lease = SoftFileLease(path, lease_duration=EXPIRY_S, heartbeat_interval=BEAT_S, thread_local=False)
+    """Wait until another holder is gone, or has stood still for EXPIRY_S. Raises BlockingIOError
+    when it renews."""
+    lease = SoftFileLease(
+        path, lease_duration=EXPIRY_S, heartbeat_interval=BEAT_S, thread_local=False
+    )
     before = _renewed_s(path)
     try:
         lease.acquire(
@@ -81,7 +90,8 @@ def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process holds the lock; False where the file is missing or cannot be opened."""
+    """Whether a living process holds the lock; False where the file is missing or cannot be
+    opened."""
     if not path.is_file() or path.is_symlink():
         return False
     try:

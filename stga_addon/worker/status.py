@@ -81,17 +81,21 @@ class WorkerStatus:
 
 @dataclass(frozen=True)
 class WorkerSnapshot:
-    """State and status of a worker at one moment; `log_tail`: the last lines of its log where it failed."""
+    """State and status of a worker at one moment; `log_tail`: the last lines of its log where it
+    failed."""
 
     state: WorkerState = WorkerState.NONE
     status: WorkerStatus = field(default_factory=WorkerStatus)
     log_tail: tuple[str, ...] = ()
 
 
-def derive_state(status: WorkerStatus | None, alive: bool, cancel_requested: bool, started: bool) -> WorkerState:
+def derive_state(
+    status: WorkerStatus | None, alive: bool, cancel_requested: bool, started: bool
+) -> WorkerState:
     """State of a worker.
 
-    status: the latest one, or None. alive: whether the process lives. started: whether one was ever started.
+    status: the latest one, or None. alive: whether the process lives. started: whether one was ever
+    started.
     """
     if status is not None and status.state != WorkerState.WORKING:
         return WorkerState(status.state)
@@ -106,17 +110,23 @@ def derive_state(status: WorkerStatus | None, alive: bool, cancel_requested: boo
 
 
 def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None) -> WorkerSnapshot:
-    """Snapshot of the worker of a status folder; `process`: the worker, where this process started it."""
+    """Snapshot of the worker of a status folder; `process`: the worker, where this process started
+    it."""
     code = None if process is None else process.poll()
-    # The process before the status: one that ends between the two reads has written its final status by then.
+    # The process before the status: one that ends between the two reads has written its final
+    # status by then.
     alive = (process is not None and code is None) or is_locked(folder / LOCK_FILE)
     status = read_status(folder)
-    state = derive_state(status, alive, (folder / CANCEL_FILE).exists(), (folder / LOG_FILE).exists())
+    state = derive_state(
+        status, alive, (folder / CANCEL_FILE).exists(), (folder / LOG_FILE).exists()
+    )
     status = status or WorkerStatus()
     if state == WorkerState.LOST:
         error = describe_lost_worker(folder, code)
         status = replace(status, state=WorkerState.LOST, message="", detail="", error=error)
-    return WorkerSnapshot(state, status, tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ())
+    return WorkerSnapshot(
+        state, status, tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ()
+    )
 
 
 def describe_lost_worker(folder: Path, exit_code: int | None = None) -> str:
@@ -139,14 +149,23 @@ def read_status(folder: Path) -> WorkerStatus | None:
         texts = (status.message, status.detail, status.error, status.traceback)
         machine = status.machine
         figures = {str(name): float(value) for name, value in status.figures.items()}
-        states = (WorkerState.WORKING, WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
-        if status.state not in states or not all(isinstance(text, str) for text in (*texts, machine)):
+        states = (
+            WorkerState.WORKING,
+            WorkerState.FINISHED,
+            WorkerState.CANCELLED,
+            WorkerState.FAILED,
+        )
+        if status.state not in states or not all(
+            isinstance(text, str) for text in (*texts, machine)
+        ):
             return None
         if not 0 <= status.progress <= 1 or not 0 <= status.seconds < math.inf:
             return None
     except (StgaError, TypeError, ValueError, AttributeError):
         return None
-    return WorkerStatus(status.state, float(status.progress), *texts, figures, machine, float(status.seconds))
+    return WorkerStatus(
+        status.state, float(status.progress), *texts, figures, machine, float(status.seconds)
+    )
 
 
 def log_lines(folder: Path, count: int) -> list[str]:
@@ -173,7 +192,8 @@ def failure_report(folder: Path, snapshot: WorkerSnapshot) -> str:
 
 
 def request_cancel(folder: Path) -> None:
-    """Ask the worker to stop and to keep what it has. Raises StgaError where the folder cannot be written."""
+    """Ask the worker to stop and to keep what it has. Raises StgaError where the folder cannot be
+    written."""
     path = folder / CANCEL_FILE
     try:
         with suppress(FileExistsError):
@@ -185,11 +205,14 @@ def request_cancel(folder: Path) -> None:
 def refuse_running_worker(folder: Path) -> None:
     """Raises StgaError while a worker is running in the folder."""
     if is_locked(folder / LOCK_FILE):
-        raise StgaError(f"{folder}: another worker is running here (process {lock_owner(folder / LOCK_FILE)})")
+        raise StgaError(
+            f"{folder}: another worker is running here (process {lock_owner(folder / LOCK_FILE)})"
+        )
 
 
 def remove_status_folder(folder: Path, other_files: Iterable[str] = ()) -> None:
-    """Remove the files of a worker's status and `other_files`, then the folder where nothing else is in it.
+    """Remove the files of a worker's status and `other_files`, then the folder where nothing else
+    is in it.
 
     Raises StgaError while the worker is running, or where a file cannot be removed.
     """
@@ -218,9 +241,14 @@ class StatusWriter:
         self._began_s = time.monotonic()
 
     def update(
-        self, progress: float, message: str, detail: str = "", figures: Callable[[], Mapping[str, float]] = dict
+        self,
+        progress: float,
+        message: str,
+        detail: str = "",
+        figures: Callable[[], Mapping[str, float]] = dict,
     ) -> bool:
-        """Write the status, at most every STATUS_INTERVAL_S; returns whether to stop and keep what there is.
+        """Write the status, at most every STATUS_INTERVAL_S; returns whether to stop and keep what
+        there is.
 
         figures: called when the status is written; numbers that are not finite are left out.
         """
@@ -235,13 +263,17 @@ class StatusWriter:
                 seconds=self._seconds(),
             )  # fmt: skip
             self._written_s = now
-            with suppress(StgaError):  # a missing status stops no work; the work itself reports a full disk
-                write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=0.0)  # the next one comes soon
+            # a missing status stops no work; the work itself reports a full disk
+            with suppress(StgaError):
+                # the next one comes soon
+                write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=0.0)
         return self.cancel_requested
 
     def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:
         """Write the final status."""
-        final = replace(self._status, state=state, error=error, traceback=trace, seconds=self._seconds())
+        final = replace(
+            self._status, state=state, error=error, traceback=trace, seconds=self._seconds()
+        )
         with suppress(StgaError):  # `inspect_worker` reports a worker that is gone
             write_json(self.folder / STATUS_FILE, asdict(final))
 
@@ -251,9 +283,11 @@ class StatusWriter:
 
 @contextmanager
 def status_writer(folder: Path) -> Iterator[StatusWriter]:
-    """Lock the status folder while the block runs, and write the final status when it ends, however it ends.
+    """Lock the status folder while the block runs, and write the final status when it ends, however
+    it ends.
 
-    Raises what the block raises, and StgaError where another worker is in the folder or it cannot be written.
+    Raises what the block raises, and StgaError where another worker is in the folder or it cannot
+    be written.
     """
     with ExitStack() as lock:
         try:

@@ -1,4 +1,5 @@
-"""The Python that tracks and trains: Blender's own where it has the packages, or one that was chosen."""
+"""The Python that tracks and trains: Blender's own where it has the packages, or one that was
+chosen."""
 
 import os
 import sys
@@ -22,13 +23,16 @@ REQUIREMENTS = {
     "av": "av>=14,<19",
     "cv2": "opencv-python-headless>=4.12,<5",
 }
-"""Packages that tracking and training need: imported module -> requirement, which `pyproject.toml` repeats."""
+"""Packages that tracking and training need: imported module -> requirement, which `pyproject.toml`
+repeats."""
 GPU_REQUIREMENT = "wgpu>=0.32,<1"
 """Trains on a GPU; without it, or where it has no driver, the CPU trains."""
 PYTHON_VARIABLE = "STGA_PYTHON"
-"""Environment variable that names the interpreter that tracks and trains, above every other choice: for farms."""
+"""Environment variable that names the interpreter that tracks and trains, above every other choice:
+for farms."""
 BLENDER_VARIABLE = "STGA_BLENDER"
-"""Environment variable with the command that starts Blender on a machine that renders .blend files."""
+"""Environment variable with the command that starts Blender on a machine that renders .blend
+files."""
 
 
 def package_name(requirement: str) -> str:
@@ -37,21 +41,30 @@ def package_name(requirement: str) -> str:
 
 @cache
 def own_python() -> str:
-    """Path of the interpreter whose library this process runs; workers of this Python are started with it.
+    """Path of the interpreter whose library this process runs; workers of this Python are started
+    with it.
 
-    Embedded in Blender, `sys.executable` is what Python finds by its name: beside Blender's library in official builds,
-    but a stranger's where Blender uses the system's library and another program of that name comes first on PATH.
+    Embedded in Blender, `sys.executable` is what Python finds by its name: beside Blender's library
+    in official builds, but a stranger's where Blender uses the system's library and another program
+    of that name comes first on PATH.
     """
     prefix = Path(sys.prefix)
     if Path(sys.executable).is_relative_to(prefix):
         return sys.executable
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    names = ("bin/python.exe", "python.exe") if os.name == "nt" else (f"bin/python{version}", "bin/python3")
-    return next((str(path) for path in (prefix / name for name in names) if path.is_file()), sys.executable)
+    names = (
+        ("bin/python.exe", "python.exe")
+        if os.name == "nt"
+        else (f"bin/python{version}", "bin/python3")
+    )
+    return next(
+        (str(path) for path in (prefix / name for name in names) if path.is_file()), sys.executable
+    )
 
 
 def find_training_python(preferred: str = "") -> str:
-    """The interpreter that tracks and trains: $STGA_PYTHON, else `preferred` (Blender's preferences), else this one.
+    """The interpreter that tracks and trains: $STGA_PYTHON, else `preferred` (Blender's
+    preferences), else this one.
 
     Raises StgaError where this one is left and lacks packages.
     """
@@ -70,4 +83,6 @@ def find_training_python(preferred: str = "") -> str:
 
 def missing_packages() -> list[str]:
     """What tracking and training need and this interpreter lacks, by the names of the packages."""
-    return [package_name(text) for module, text in REQUIREMENTS.items() if find_spec(module) is None]
+    return [
+        package_name(text) for module, text in REQUIREMENTS.items() if find_spec(module) is None
+    ]

@@ -26,7 +26,8 @@ def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Spla
 
 
 def random_mesh(seed: int, vertices: int = 20, faces: int = 30) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 and faces (F, 3) int32 of different corners: a soup of well-shaped triangles."""
+    """Vertices (V, 3) float64 and faces (F, 3) int32 of different corners: a soup of well-shaped
+    triangles."""
     rng = np.random.default_rng(seed)
     corners = rng.permuted(np.tile(np.arange(vertices, dtype=np.int32), (faces, 1)), axis=1)[:, :3]
     return rng.normal(size=(vertices, 3)) * 0.1, np.ascontiguousarray(corners)
@@ -36,7 +37,9 @@ def rendered(world: Splats) -> np.ndarray:
     """(3, 48, 64) picture of world-space splats."""
     from stga_addon.render.render import render
 
-    return np.asarray(render(world, look_at((0.3, 0.2, 1), (0, 0, 0), width=64, height=48, focal_length=90)))
+    return np.asarray(
+        render(world, look_at((0.3, 0.2, 1), (0, 0, 0), width=64, height=48, focal_length=90))
+    )
 
 
 @pytest.fixture
@@ -47,7 +50,13 @@ def avatar() -> Avatar:
         convention="stga",
         neutral=neutral.astype(np.float32),
         faces=faces,
-        settings={"lattice": 2, "rates": {"xyz": 1e-4}, "name": "Zoë", "steps": [1, 2, 3], "resume": None},
+        settings={
+            "lattice": 2,
+            "rates": {"xyz": 1e-4},
+            "name": "Zoë",
+            "steps": [1, 2, 3],
+            "resume": None,
+        },
         regions={"mouth": np.arange(30) < 4, "left eye": np.arange(30) % 5 == 0},
         background=(1.0, 0.5, 0.0),
     )

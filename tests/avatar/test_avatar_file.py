@@ -23,7 +23,11 @@ def test_round_trip_is_exact(tmp_path, avatar):
         np.testing.assert_array_equal(have, want, err_msg=name)
     for name in ("neutral", "faces"):
         np.testing.assert_array_equal(getattr(back, name), getattr(avatar, name), err_msg=name)
-    assert (back.convention, back.settings, back.background) == ("stga", avatar.settings, (1.0, 0.5, 0.0))
+    assert (back.convention, back.settings, back.background) == (
+        "stga",
+        avatar.settings,
+        (1.0, 0.5, 0.0),
+    )
     assert list(back.regions) == ["mouth", "left eye"]
     for name, mask in avatar.regions.items():
         np.testing.assert_array_equal(back.regions[name], mask)
@@ -145,7 +149,9 @@ def test_an_array_larger_than_memory_is_refused(tmp_path, avatar):
         for name, array in content.items():
             with archive.open(f"{name}.npy", "w") as out:
                 huge = {"descr": "<f4", "fortran_order": False, "shape": (10**15, 3)}
-                np.lib.format.write_array_header_1_0(out, huge) if name == "xyz" else np.save(out, array)
+                np.lib.format.write_array_header_1_0(out, huge) if name == "xyz" else np.save(
+                    out, array
+                )
     with pytest.raises(StgaError, match=r"a\.npz"):
         read_avatar(tmp_path / "a.npz")
 

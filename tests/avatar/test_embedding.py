@@ -28,8 +28,11 @@ def heron(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:
     return float(np.sqrt(s * (s - a) * (s - b) * (s - c)))
 
 
-def frame_by_hand(posed: np.ndarray, neutral: np.ndarray, convention: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Origin (3,), axes as columns (3, 3) and scale of one triangle (3, 3), as the two publications define them."""
+def frame_by_hand(
+    posed: np.ndarray, neutral: np.ndarray, convention: str
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Origin (3,), axes as columns (3, 3) and scale of one triangle (3, 3), as the two publications
+    define them."""
     p, q, r = posed
     center = (p + q + r) / 3
     normal = unit(np.cross(q - p, r - p))
@@ -49,7 +52,8 @@ def scipy_rotation(wxyz: np.ndarray) -> Rotation:
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_frames_are_the_published_ones(convention):
-    """Catches swapped axes, a flipped normal, or a scale of the wrong kind, triangle by triangle."""
+    """Catches swapped axes, a flipped normal, or a scale of the wrong kind, triangle by
+    triangle."""
     neutral, faces = random_mesh(0)
     posed = random_mesh(1)[0]
     frames = face_frames(posed, faces, neutral, convention)
@@ -58,7 +62,9 @@ def test_frames_are_the_published_ones(convention):
         np.testing.assert_allclose(frames.origin[i], origin, atol=1e-12)
         np.testing.assert_allclose(frames.rotation[i], axes, atol=1e-9)
         assert frames.scale[i] == pytest.approx(scale, rel=1e-6)
-    np.testing.assert_allclose(scipy_rotation(frames.quaternion).as_matrix(), frames.rotation, atol=1e-12)
+    np.testing.assert_allclose(
+        scipy_rotation(frames.quaternion).as_matrix(), frames.rotation, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -80,7 +86,8 @@ def test_splats_follow_a_rigid_motion_and_a_scaling(convention):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_world_covariance_is_the_transformed_local_one(convention):
-    """Catches quaternions multiplied in the wrong order, or scale applied to the variance instead of sigma."""
+    """Catches quaternions multiplied in the wrong order, or scale applied to the variance instead
+    of sigma."""
     neutral, faces = random_mesh(0)
     frames = face_frames(random_mesh(1)[0], faces, neutral, convention)
     splats = random_splats(3, 40, len(faces))
@@ -92,7 +99,9 @@ def test_world_covariance_is_the_transformed_local_one(convention):
 
     linear = frames.rotation[splats.face] * frames.scale[splats.face, None, None]
     expected = linear @ covariance(splats) @ linear.transpose(0, 2, 1)
-    np.testing.assert_allclose(covariance(world), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        covariance(world), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max()
+    )
     positions = np.einsum("nij,nj->ni", linear, splats.xyz) + frames.origin[splats.face]
     np.testing.assert_allclose(world.xyz, positions, atol=1e-6)
 
@@ -108,7 +117,9 @@ def test_world_and_back_is_the_same_splat(convention):
     np.testing.assert_allclose(back.xyz, splats.xyz, atol=2e-6 / smallest)
     np.testing.assert_allclose(back.log_scale, splats.log_scale, atol=2e-6)
     np.testing.assert_allclose(
-        scipy_rotation(back.rotation).as_matrix(), scipy_rotation(splats.rotation).as_matrix(), atol=2e-6
+        scipy_rotation(back.rotation).as_matrix(),
+        scipy_rotation(splats.rotation).as_matrix(),
+        atol=2e-6,
     )
     np.testing.assert_array_equal(back.face, splats.face)
 
@@ -152,7 +163,9 @@ def test_triangle_without_area_keeps_a_proper_frame(convention, corners):
 def test_areas_are_herons():
     """Catches a forgotten half."""
     neutral, faces = random_mesh(7)
-    np.testing.assert_allclose(face_areas(neutral, faces), [heron(*neutral[f]) for f in faces], rtol=1e-6)
+    np.testing.assert_allclose(
+        face_areas(neutral, faces), [heron(*neutral[f]) for f in faces], rtol=1e-6
+    )
 
 
 def test_quaternion_product_is_scipys():
@@ -168,12 +181,16 @@ def test_quaternion_of_any_rotation_is_scipys():
     axes = rng.normal(size=(200, 3))
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     axes[:3], axes[3:6] = np.eye(3), -np.eye(3)
-    angles = np.concatenate([np.full(50, np.pi), np.pi - rng.exponential(1e-7, 50), rng.uniform(0, np.pi, 100)])
+    angles = np.concatenate(
+        [np.full(50, np.pi), np.pi - rng.exponential(1e-7, 50), rng.uniform(0, np.pi, 100)]
+    )
     rotation = Rotation.from_rotvec(axes * angles[:, None])
     quaternion = from_matrices(rotation.as_matrix())
     np.testing.assert_allclose(np.linalg.norm(quaternion, axis=-1), 1, atol=1e-12)
     assert (quaternion[:, 0] >= 0).all()
-    np.testing.assert_allclose(scipy_rotation(quaternion).as_matrix(), rotation.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        scipy_rotation(quaternion).as_matrix(), rotation.as_matrix(), atol=1e-12
+    )
 
 
 def test_zero_quaternion_counts_as_no_rotation():
@@ -191,23 +208,35 @@ def test_unknown_convention_is_refused():
 
 @pytest.mark.parametrize("part", ["force", "torque", "growth"])
 def test_backward_agrees_with_differences(part: str) -> None:
-    """Catches a gradient that leaves out what turns or grows a triangle, takes an edge for another, or has a wrong
+    """Catches a gradient that leaves out what turns or grows a triangle, takes an edge for another,
+    or has a wrong
     sign: against central differences of the frames in random directions."""
     vertices, faces = random_mesh(4)
     rng = np.random.default_rng(5)
     neutral = vertices + rng.normal(0, 0.01, vertices.shape)
-    given = {name: np.zeros((len(faces), 3)) for name in ("force", "torque")} | {"growth": np.zeros(len(faces))}
+    given = {name: np.zeros((len(faces), 3)) for name in ("force", "torque")} | {
+        "growth": np.zeros(len(faces))
+    }
     given[part] = rng.normal(size=given[part].shape)
     frames = face_frames(vertices, faces, neutral)
     found = frame_backward(vertices, faces, frames, **given)
     step = 1e-7
     for _ in range(3):
         direction = rng.normal(size=vertices.shape)
-        after, before = (face_frames(vertices + sign * step * direction, faces, neutral) for sign in (1, -1))
-        moved = np.einsum("fji,fj->fi", frames.rotation, (after.origin - before.origin) / (2 * step))
-        spun = np.einsum("fji,fjk->fik", frames.rotation, (after.rotation - before.rotation) / (2 * step))
-        turned = np.stack([spun[:, 2, 1], spun[:, 0, 2], spun[:, 1, 0]], -1)  # of a skew-symmetric matrix
+        after, before = (
+            face_frames(vertices + sign * step * direction, faces, neutral) for sign in (1, -1)
+        )
+        moved = np.einsum(
+            "fji,fj->fi", frames.rotation, (after.origin - before.origin) / (2 * step)
+        )
+        spun = np.einsum(
+            "fji,fjk->fik", frames.rotation, (after.rotation - before.rotation) / (2 * step)
+        )
+        # of a skew-symmetric matrix
+        turned = np.stack([spun[:, 2, 1], spun[:, 0, 2], spun[:, 1, 0]], -1)
         grown = np.log(after.scale / before.scale) / (2 * step)
-        expected = sum((given[name] * each).sum() for name, each in (("force", moved), ("torque", turned)))
+        expected = sum(
+            (given[name] * each).sum() for name, each in (("force", moved), ("torque", turned))
+        )
         expected += (given["growth"] * grown).sum()
         assert (found * direction).sum() == pytest.approx(expected, rel=1e-5)

@@ -24,15 +24,20 @@ def test_points_a_triangle(order, count):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_order_4_is_the_corners_and_midpoints_of_the_four_subtriangles(convention):
-    """Catches wrong barycentric weights and a local frame that does not bring the points back onto the triangle."""
+    """Catches wrong barycentric weights and a local frame that does not bring the points back onto
+    the triangle."""
     neutral, faces = random_mesh(1)
     splats = lattice_splats(neutral, faces, 4, convention=convention)
-    world = to_world(splats, face_frames(neutral, faces, neutral, convention)).xyz.reshape(len(faces), 15, 3)
+    world = to_world(splats, face_frames(neutral, faces, neutral, convention)).xyz.reshape(
+        len(faces), 15, 3
+    )
     for points, (a, b, c) in zip(world, neutral[faces], strict=True):
         ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
         corners = [a, b, c, ab, bc, ca]
         edges = [(a, ab), (ab, b), (b, bc), (bc, c), (c, ca), (ca, a), (ab, bc), (bc, ca), (ca, ab)]
-        expected = 0.9 * np.array([*corners, *[(p + q) / 2 for p, q in edges]]) + 0.1 * (a + b + c) / 3
+        expected = (
+            0.9 * np.array([*corners, *[(p + q) / 2 for p, q in edges]]) + 0.1 * (a + b + c) / 3
+        )
         distance = np.linalg.norm(points[:, None] - expected[None], axis=-1)
         assert sorted(distance.argmin(1)) == list(range(15))
         assert distance.min(1).max() < 1e-7
@@ -52,7 +57,8 @@ def test_inset_keeps_neighbors_apart():
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_world_scale_is_flat_along_the_normal(convention):
-    """Catches scale in the wrong unit (triangle units against meters) or flattened along the wrong axis."""
+    """Catches scale in the wrong unit (triangle units against meters) or flattened along the wrong
+    axis."""
     neutral, faces = random_mesh(2)
     splats = lattice_splats(neutral, faces, 2, convention=convention)
     frames = face_frames(neutral, faces, neutral, convention)
@@ -60,7 +66,8 @@ def test_world_scale_is_flat_along_the_normal(convention):
     expected = 0.6 * np.sqrt(2 * face_areas(neutral, faces)) / 2
     normal = np.cross(*(neutral[faces[:, i]] - neutral[faces[:, 0]] for i in (1, 2)))
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    along = np.abs(np.einsum("fij,fi->fj", frames.rotation, normal)).argmax(1)  # local axis that is the normal
+    # local axis that is the normal
+    along = np.abs(np.einsum("fij,fi->fj", frames.rotation, normal)).argmax(1)
     sigma = np.exp(world.log_scale).reshape(len(faces), 6, 3)
     for face, axis in enumerate(along):
         want = np.full(3, expected[face])

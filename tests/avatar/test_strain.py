@@ -43,7 +43,8 @@ def colored(neutral: np.ndarray, seed: int = 0) -> Avatar:
 
 
 def test_an_affine_map_strains_by_its_own_tensor() -> None:
-    """Catches a wrong dual basis, a factor two, transposed maps: E = ½(FᵀF − I) is known, and every triangle's."""
+    """Catches a wrong dual basis, a factor two, transposed maps: E = ½(FᵀF − I) is known, and every
+    triangle's."""
     neutral, rng = sheet(), np.random.default_rng(1)
     deformation = np.eye(3) + rng.normal(0, 0.04, (3, 3))
     tensor = (deformation.T @ deformation - np.eye(3)) / 2
@@ -51,32 +52,46 @@ def test_an_affine_map_strains_by_its_own_tensor() -> None:
     along = (p1 - p0) / np.linalg.norm(p1 - p0, axis=1, keepdims=True)
     normal = np.cross(p1 - p0, p2 - p0)
     across = np.cross(normal / np.linalg.norm(normal, axis=1, keepdims=True), along)
-    # In each triangle's plane; averaged over touching ones the planes differ, so one triangle at a time.
+    # In each triangle's plane; averaged over touching ones the planes differ, so one triangle at a
+    # time.
     for n in range(len(FACES)):
-        strain = face_strain(strain_basis(neutral, FACES[n : n + 1]), neutral @ deformation.T + [3, 1, 2])[0]
-        expected = [along[n] @ tensor @ along[n], across[n] @ tensor @ across[n], along[n] @ tensor @ across[n]]
+        strain = face_strain(
+            strain_basis(neutral, FACES[n : n + 1]), neutral @ deformation.T + [3, 1, 2]
+        )[0]
+        expected = [
+            along[n] @ tensor @ along[n],
+            across[n] @ tensor @ across[n],
+            along[n] @ tensor @ across[n],
+        ]
         np.testing.assert_allclose(strain, 5 * np.array(expected), atol=1e-6)
         assert np.abs(strain).max() > 0.05
 
 
 def test_neighbors_are_averaged_as_vertices_then_triangles() -> None:
-    """Catches weights: a vertex is the plain mean of its triangles, a triangle that of its vertices."""
+    """Catches weights: a vertex is the plain mean of its triangles, a triangle that of its
+    vertices."""
     neutral = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1, 0], [1, 1, 0]]) * 0.01
     faces = np.array([[0, 1, 2], [2, 1, 3]])
     posed = neutral.copy()
     posed[3, 0] += 0.002  # only the second triangle, along x
-    alone = [face_strain(strain_basis(neutral, faces[n : n + 1]), posed)[0].astype(np.float64) for n in range(2)]
+    alone = [
+        face_strain(strain_basis(neutral, faces[n : n + 1]), posed)[0].astype(np.float64)
+        for n in range(2)
+    ]
     assert not alone[0].any()
     assert alone[1].any()
     both = face_strain(strain_basis(neutral, faces), posed)
-    # Triangle 0: vertex 0 is its own, vertices 1 and 2 half the other's: (0 + ½ + ½) / 3 of the other's tensor.
+    # Triangle 0: vertex 0 is its own, vertices 1 and 2 half the other's: (0 + ½ + ½) / 3 of the
+    # other's tensor.
     first, second = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
     edge = np.array([1.0, -1, 0]) / np.sqrt(2)
     side = np.array([1.0, 1, 0]) / np.sqrt(2)
     tensor = alone[1][0] * np.outer(edge, edge) + alone[1][1] * np.outer(side, side)
     tensor += alone[1][2] * (np.outer(edge, side) + np.outer(side, edge))
     np.testing.assert_allclose(both[1], alone[1] * 2 / 3, atol=1e-6)
-    expected = np.array([first @ tensor @ first, second @ tensor @ second, first @ tensor @ second]) / 3
+    expected = (
+        np.array([first @ tensor @ first, second @ tensor @ second, first @ tensor @ second]) / 3
+    )
     np.testing.assert_allclose(both[0], expected, atol=1e-6)
 
 
@@ -107,27 +122,34 @@ def test_broken_triangles_stay_finite(broken: str) -> None:
 
 
 def test_strain_stays_within_what_was_seen() -> None:
-    """Catches colors extrapolated beyond the trained expressions, a range of another triangle or component, and one
-    that leaves out the neutral mesh or clips what was trained."""
+    """Catches colors extrapolated beyond the trained expressions, a range of another triangle or
+    component, and one that leaves out the neutral mesh or clips what was trained."""
     neutral, rng = sheet(), np.random.default_rng(2)
     basis = strain_basis(neutral, FACES)
     seen = [neutral + rng.normal(0, 1e-4, neutral.shape) for _ in range(3)]
     strains = np.stack([face_strain(basis, mesh) for mesh in seen])
     limits = seen_range(basis, seen)
-    np.testing.assert_allclose(limits[:, 0], RANGE_MARGIN * np.minimum(strains.min(0), 0), atol=1e-6)
-    np.testing.assert_allclose(limits[:, 1], RANGE_MARGIN * np.maximum(strains.max(0), 0), atol=1e-6)
+    np.testing.assert_allclose(
+        limits[:, 0], RANGE_MARGIN * np.minimum(strains.min(0), 0), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        limits[:, 1], RANGE_MARGIN * np.maximum(strains.max(0), 0), atol=1e-6
+    )
     limited = strain_basis(neutral, FACES, limits)
     for mesh, strain in zip(seen, strains, strict=True):
         np.testing.assert_array_equal(face_strain(limited, mesh), strain)
     stronger = neutral + 4 * (seen[0] - neutral)
     free = face_strain(basis, stronger)
-    np.testing.assert_array_equal(face_strain(limited, stronger), np.clip(free, limits[:, 0], limits[:, 1]))
+    np.testing.assert_array_equal(
+        face_strain(limited, stronger), np.clip(free, limits[:, 0], limits[:, 1])
+    )
     assert (np.abs(free) > np.abs(face_strain(limited, stronger)) + 0.01).any()
     assert np.abs(seen_range(basis, [30 * neutral])).max() <= MAX_STRAIN
 
 
 def test_the_margin_is_counted_from_rest() -> None:
-    """Catches a margin counted from 0 where a mesh at rest is clipped to less, and one beyond what may be followed."""
+    """Catches a margin counted from 0 where a mesh at rest is clipped to less, and one beyond what
+    may be followed."""
     neutral, rng = sheet(), np.random.default_rng(4)
     allowed = color_range(len(FACES))
     posed = [neutral + rng.normal(0, 3e-4, neutral.shape) for _ in range(3)]
@@ -147,7 +169,8 @@ def test_the_margin_is_counted_from_rest() -> None:
 
 
 def test_the_range_is_in_the_file_and_in_renderings(tmp_path: Path) -> None:
-    """Catches a range lost in the file, one that frames ignore, and one of another shape that is not refused."""
+    """Catches a range lost in the file, one that frames ignore, and one of another shape that is
+    not refused."""
     neutral = sheet()
     stretched = (1.1 * neutral).astype(np.float32)
     limits = np.zeros((len(FACES), 2, 3), np.float32)
@@ -157,7 +180,9 @@ def test_the_range_is_in_the_file_and_in_renderings(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.strain_range, limits)
     assert np.abs(colored(neutral).frames(stretched).strain).max() > 0.1
     assert not found.frames(stretched).strain.any()
-    with pytest.raises(StgaError, match="strain_range is float32 \\(3, 2, 3\\), expected float32 \\(4, 2, 3\\)"):
+    with pytest.raises(
+        StgaError, match="strain_range is float32 \\(3, 2, 3\\), expected float32 \\(4, 2, 3\\)"
+    ):
         write_avatar(tmp_path / "b.npz", replace(avatar, strain_range=limits[1:]))
 
 
@@ -165,7 +190,9 @@ def test_the_file_keeps_it_and_reads_avatars_without(tmp_path: Path) -> None:
     """Catches strain colors lost in the file, and files from before they existed being refused."""
     avatar = colored(sheet())
     write_avatar(tmp_path / "a.npz", avatar)
-    np.testing.assert_array_equal(read_avatar(tmp_path / "a.npz").splats.strain_color, avatar.splats.strain_color)
+    np.testing.assert_array_equal(
+        read_avatar(tmp_path / "a.npz").splats.strain_color, avatar.splats.strain_color
+    )
     with np.load(tmp_path / "a.npz") as arrays:
         np.savez(tmp_path / "old.npz", **{n: a for n, a in arrays.items() if n != "strain_color"})
     assert read_avatar(tmp_path / "old.npz").splats.strain_color.shape == (len(avatar.splats), 0, 3)
@@ -183,7 +210,10 @@ def test_baking_keeps_the_picture() -> None:
     baked = to_world(avatar.splats, avatar.frames(posed))
     assert baked.strain_color.shape[1] == 0
     np.testing.assert_allclose(render(baked, camera, white), drawn, atol=2e-5)
-    plain = replace(avatar, splats=replace(avatar.splats, strain_color=np.zeros_like(avatar.splats.strain_color)))
+    plain = replace(
+        avatar,
+        splats=replace(avatar.splats, strain_color=np.zeros_like(avatar.splats.strain_color)),
+    )
     assert np.abs(render_avatar(plain, posed, camera, white) - drawn).max() > 0.05
     undeformed = face_frames(posed, FACES, neutral)
     np.testing.assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
@@ -193,43 +223,67 @@ def following(neutral: np.ndarray, seed: int = 0) -> Avatar:
     """An avatar without strain colors whose triangles' splats move by millimeters with strain."""
     splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
     position = np.random.default_rng(seed).normal(0, 3e-3, (len(FACES), 3, 3)).astype(np.float32)
-    return Avatar(splats, "stga", neutral.astype(np.float32), FACES, driven_offsets={"strain_position": position})
+    return Avatar(
+        splats,
+        "stga",
+        neutral.astype(np.float32),
+        FACES,
+        driven_offsets={"strain_position": position},
+    )
 
 
 def test_neighbors_share_an_edge() -> None:
-    """Catches triangles that touch at a corner only, an edge of three triangles, and one that is its own neighbor."""
+    """Catches triangles that touch at a corner only, an edge of three triangles, and one that is
+    its own neighbor."""
     fan = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [4, 1, 5], [5, 6, 7], [8, 8, 9]])
     indptr, indices = edge_neighbors(fan)
     found = [sorted(indices[indptr[f] : indptr[f + 1]].tolist()) for f in range(len(fan))]
-    edges = [{frozenset((int(a), int(b))) for a, b in zip(face, np.roll(face, -1), strict=True)} for face in fan]
-    expected = [[g for g in range(len(fan)) if g != f and edges[f] & edges[g]] for f in range(len(fan))]
+    edges = [
+        {frozenset((int(a), int(b))) for a, b in zip(face, np.roll(face, -1), strict=True)}
+        for face in fan
+    ]
+    expected = [
+        [g for g in range(len(fan)) if g != f and edges[f] & edges[g]] for f in range(len(fan))
+    ]
     assert found == expected == [[1, 2], [0, 2], [0, 1, 3], [2], [], []]
 
 
 def finned_sheet(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh with a boundary, an edge of three triangles, and a vertex without any."""
+    """Vertices and triangles of a mesh with a boundary, an edge of three triangles, and a vertex
+    without any."""
     faces = np.concatenate([FACES[[2, 0]], [[2, 1, 5]], FACES[[3, 1]]])
     return np.concatenate([sheet(seed), [[0.01, 0.006, 0.012], [1, 1, 1]]]), faces
 
 
 def test_strain_is_averaged_over_whatever_touches() -> None:
-    """Catches lists of another vertex or triangle, and a weight that is not one over their length: plain loops over a
-    mesh with a boundary, an edge of three triangles, and a vertex that no triangle touches."""
+    """Catches lists of another vertex or triangle, and a weight that is not one over their length:
+    plain loops over a mesh with a boundary, an edge of three triangles, and a vertex that no
+    triangle touches."""
     (neutral, faces), (posed, _) = finned_sheet(), finned_sheet(3)
     axes, tensors = [], []
     for face in faces:
         first, second = neutral[face[1]] - neutral[face[0]], neutral[face[2]] - neutral[face[0]]
         normal = np.cross(first, second)
-        axes.append((first / np.linalg.norm(first), np.cross(normal, first) / np.linalg.norm(np.cross(normal, first))))
+        axes.append(
+            (
+                first / np.linalg.norm(first),
+                np.cross(normal, first) / np.linalg.norm(np.cross(normal, first)),
+            )
+        )
         (along, across), edges = axes[-1], np.stack([first, second, normal], 1)
         moved = np.stack([posed[face[1]] - posed[face[0]], posed[face[2]] - posed[face[0]]], 1)
         deformation = moved @ np.linalg.pinv(edges[:, :2])
         plane = np.outer(along, along) + np.outer(across, across)
         tensors.append((deformation.T @ deformation - plane) / 2)
-    at_vertex = [np.mean([t for t, face in zip(tensors, faces, strict=True) if v in face], 0) for v in range(6)]
+    at_vertex = [
+        np.mean([t for t, face in zip(tensors, faces, strict=True) if v in face], 0)
+        for v in range(6)
+    ]
     for f, (along, across) in enumerate(axes):
         mean = np.mean([at_vertex[v] for v in faces[f]], 0)
-        expected = 5 * np.array([along @ mean @ along, across @ mean @ across, along @ mean @ across])
+        expected = 5 * np.array(
+            [along @ mean @ along, across @ mean @ across, along @ mean @ across]
+        )
         assert np.abs(expected).max() > 0.1
         found = face_strain(strain_basis(neutral, faces), posed)[f]
         np.testing.assert_allclose(found, np.clip(expected, -MAX_STRAIN, MAX_STRAIN), atol=1e-5)
@@ -244,7 +298,9 @@ def test_smoothed_strain_is_averaged_over_edges() -> None:
     for f in range(len(faces)):
         members = [g for g in range(len(faces)) if len(set(faces[f]) & set(faces[g])) >= 2]
         average[f, members] = 1 / len(members)
-    expected = np.linalg.matrix_power(average, AVERAGING_ROUNDS) @ (strain - [-MIN_COMPRESSION, -MIN_COMPRESSION, 0])
+    expected = np.linalg.matrix_power(average, AVERAGING_ROUNDS) @ (
+        strain - [-MIN_COMPRESSION, -MIN_COMPRESSION, 0]
+    )
     np.testing.assert_allclose(smoothed_strain(basis, strain), expected, atol=1e-6)
     assert np.abs(expected).max() > 0.1
     turned = neutral @ Rotation.from_rotvec([0.3, 1, -2]).as_matrix().T
@@ -253,7 +309,8 @@ def test_smoothed_strain_is_averaged_over_edges() -> None:
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_positions_follow_strain(convention: str, tmp_path: Path) -> None:
-    """Catches a shift in other axes or units than the splats', one lost in the file, and a mesh at rest that moves."""
+    """Catches a shift in other axes or units than the splats', one lost in the file, and a mesh at
+    rest that moves."""
     neutral, posed = sheet(), sheet(3)
     avatar = replace(following(neutral), convention=convention)
     write_avatar(tmp_path / "a.npz", avatar)
@@ -262,20 +319,30 @@ def test_positions_follow_strain(convention: str, tmp_path: Path) -> None:
     smoothed = smoothed_strain(basis, face_strain(basis, posed)).astype(np.float64)
     moves = avatar.driven_offsets["strain_position"]
     shift = [sum(smoothed[f, k] * moves[f, k] for k in range(3)) for f in range(len(FACES))]
-    shifted = replace(avatar.splats, xyz=(avatar.splats.xyz + np.array(shift)[avatar.splats.face]).astype(np.float32))
+    shifted = replace(
+        avatar.splats,
+        xyz=(avatar.splats.xyz + np.array(shift)[avatar.splats.face]).astype(np.float32),
+    )
     plain = face_frames(posed, FACES, neutral, convention)
     baked = to_world(found.splats, found.frames(posed))
     np.testing.assert_allclose(baked.xyz, to_world(shifted, plain).xyz, atol=1e-7)
     np.testing.assert_array_equal(baked.rotation, to_world(shifted, plain).rotation)
     assert np.abs(baked.xyz - to_world(avatar.splats, plain).xyz).max() > 1e-4
     still = to_world(avatar.splats, face_frames(neutral, FACES, neutral, convention))
-    np.testing.assert_allclose(to_world(found.splats, found.frames(neutral)).xyz, still.xyz, atol=1e-7)
-    with pytest.raises(StgaError, match="strain_position is float32 \\(3, 3, 3\\), expected float32 \\(4, 3, 3\\)"):
-        write_avatar(tmp_path / "b.npz", replace(avatar, driven_offsets={"strain_position": moves[1:]}))
+    np.testing.assert_allclose(
+        to_world(found.splats, found.frames(neutral)).xyz, still.xyz, atol=1e-7
+    )
+    with pytest.raises(
+        StgaError, match="strain_position is float32 \\(3, 3, 3\\), expected float32 \\(4, 3, 3\\)"
+    ):
+        write_avatar(
+            tmp_path / "b.npz", replace(avatar, driven_offsets={"strain_position": moves[1:]})
+        )
 
 
 def test_positions_stay_near_where_the_mesh_is_torn() -> None:
-    """Catches positions that leave with strain beyond its range, and NaN of triangles without area."""
+    """Catches positions that leave with strain beyond its range, and NaN of triangles without
+    area."""
     neutral = sheet()
     avatar = following(neutral)
     farthest = MAX_STRAIN * np.abs(avatar.driven_offsets["strain_position"]).sum((1, 2))
@@ -287,5 +354,8 @@ def test_positions_stay_near_where_the_mesh_is_torn() -> None:
         assert np.isfinite(moved.origin).all()
         assert (away <= farthest * plain.scale + 1e-9).all()
     assert (
-        np.linalg.norm(avatar.frames(far).origin - face_frames(far, FACES, neutral).origin, axis=1).max() < 1e-7
+        np.linalg.norm(
+            avatar.frames(far).origin - face_frames(far, FACES, neutral).origin, axis=1
+        ).max()
+        < 1e-7
     )  # strain of float32

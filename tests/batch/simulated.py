@@ -18,11 +18,14 @@ def finished(job: Job) -> tuple[WorkerState | None, str]:
 
 
 class SimulatedEngine:
-    """Ends each job at the next question, with the state and error of `outcome`; None: its worker was killed."""
+    """Ends each job at the next question, with the state and error of `outcome`; None: its worker
+    was killed."""
 
     interval_s = 0.0
 
-    def __init__(self, outcome: Outcome = finished, room: int = 1 << 30, takes_all: bool = False) -> None:
+    def __init__(
+        self, outcome: Outcome = finished, room: int = 1 << 30, takes_all: bool = False
+    ) -> None:
         self.outcome, self.room, self.takes_all = outcome, room, takes_all
         self.submitted: list[str] = []
         self.most = 0
@@ -68,13 +71,16 @@ class InProcessEngine(SimulatedEngine):
 
 
 def empty_jobs(base: Path, count: int, again: bool = False, **jobs: Any) -> Plan:
-    """A plan of `count` analyses, which write no file but their result; again: each by another job after it as well;
-    and of further jobs."""
+    """A plan of `count` analyses, which write no file but their result; again: each by another job
+    after it as well; and of further jobs."""
     (base / "capture").mkdir(exist_ok=True)
     for number in range(count):
         jobs[f"look-{number:05d}"] = {"request": "analyze", "capture": "capture"}
         if again:
-            jobs[f"again-{number:05d}"] = {"request": "analyze", "capture": f"runs/look-{number:05d}"}
+            jobs[f"again-{number:05d}"] = {
+                "request": "analyze",
+                "capture": f"runs/look-{number:05d}",
+            }
     return make_plan({"out": "runs", "job": jobs}, base, "plan")
 
 

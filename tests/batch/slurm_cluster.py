@@ -1,4 +1,5 @@
-"""A SLURM cluster of two nodes on this host, for tests: munged, slurmctld and two slurmd with files of their own."""
+"""A SLURM cluster of two nodes on this host, for tests: munged, slurmctld and two slurmd with files
+of their own."""
 
 import os
 import pwd
@@ -75,9 +76,16 @@ class Cluster:
         user, host = pwd.getpwuid(os.geteuid()).pw_name, socket.gethostname()
         text = CONFIGURATION.format(folder=self.folder, user=user, host=host, **ports)
         (self.folder / "slurm.conf").write_text(text)
-        names = {"socket": "munge.socket", "pid-file": "munge.pid", "log-file": "munge.log", "seed-file": "munge.seed"}
+        names = {
+            "socket": "munge.socket",
+            "pid-file": "munge.pid",
+            "log-file": "munge.log",
+            "seed-file": "munge.seed",
+        }
         files = [f"--{option}={self.folder / name}" for option, name in names.items()]
-        self._others.append(self._spawn(["munged", "--foreground", "--force", f"--key-file={key}", *files]))
+        self._others.append(
+            self._spawn(["munged", "--foreground", "--force", f"--key-file={key}", *files])
+        )
         self._await(lambda: (self.folder / "munge.socket").exists(), "munged")
         self._others.append(self._spawn(["slurmctld", "-D"]))
         for name in ("one", "two"):
@@ -104,8 +112,11 @@ class Cluster:
                 continue
 
     def start_delayed(self) -> None:
-        """Start what waits for its time only: SLURM holds back jobs of a lost node for two minutes."""
-        waiting = self._run("squeue", "--noheader", "--states=PENDING", "--format=%i %r").splitlines()
+        """Start what waits for its time only: SLURM holds back jobs of a lost node for two
+        minutes."""
+        waiting = self._run(
+            "squeue", "--noheader", "--states=PENDING", "--format=%i %r"
+        ).splitlines()
         for job, reason in (line.split(maxsplit=1) for line in waiting):
             if reason == "BeginTime":
                 self._run("scontrol", "update", f"JobId={job}", "StartTime=now")
@@ -128,13 +139,18 @@ class Cluster:
 
     def _spawn(self, command: list[str]) -> subprocess.Popen[bytes]:
         with (self.folder / f"{command[0]}.out").open("ab") as out:
-            return subprocess.Popen(command, env=self.variables, stdout=out, stderr=out, start_new_session=True)
+            return subprocess.Popen(
+                command, env=self.variables, stdout=out, stderr=out, start_new_session=True
+            )
 
     def _await(self, is_there: Callable[[], bool], what: str) -> None:
         deadline = time.monotonic() + START_TIMEOUT_S
         while not is_there():
             if time.monotonic() > deadline:
-                logs = "\n".join(p.read_text(errors="replace")[-1500:] for p in self.folder.glob("*.[lo][ou][gt]"))
+                logs = "\n".join(
+                    p.read_text(errors="replace")[-1500:]
+                    for p in self.folder.glob("*.[lo][ou][gt]")
+                )
                 raise TimeoutError(f"{what} did not start:\n{logs}")
             time.sleep(0.2)
 

@@ -1,4 +1,5 @@
-"""Frames of an animation on workers, by a real Blender, which the command in STGA_BLENDER starts (docs/blender.md)."""
+"""Frames of an animation on workers, by a real Blender, which the command in STGA_BLENDER starts
+(docs/blender.md)."""
 
 import os
 import shlex
@@ -61,17 +62,22 @@ sys.exit(main(["batch", sys.argv[1], "--engine", "ray"]))
 
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with an animated head in a .blend file, and pictures of it by one Blender: frames 0 to 4 in `whole`."""
+    """A folder with an animated head in a .blend file, and pictures of it by one Blender: frames 0
+    to 4 in `whole`."""
     folder = tmp_path_factory.mktemp("shot")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BLENDER_USER_RESOURCES", str(folder / "profile"))
         patch.setenv("STGA_PYTHON", sys.executable)
         archive = build_zip(folder)
-        blender("--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
+        blender(
+            "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive
+        )
         capture = open_capture(write_mesh_capture(folder / "capture", (0, 1, 3, 4), range(4)))
         faces = capture.faces.astype(np.int32)
         splats = lattice_splats(capture.neutral, faces, order=0)
-        write_avatar(folder / "avatar.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), faces))
+        write_avatar(
+            folder / "avatar.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), faces)
+        )
         (folder / "make.py").write_text(MAKE.format(folder=str(folder)))
         blender("--background", "--python-exit-code", "1", "--python", folder / "make.py")
         names = folder / "whole/######"
@@ -83,7 +89,9 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def blender(*arguments: object) -> None:
-    done = subprocess.run([*BLENDER, *map(str, arguments)], capture_output=True, text=True, timeout=600, cwd=ROOT)
+    done = subprocess.run(
+        [*BLENDER, *map(str, arguments)], capture_output=True, text=True, timeout=600, cwd=ROOT
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
@@ -97,7 +105,9 @@ def check(shot: Path, engine: str) -> None:
     for name, picture in whole.items():
         np.testing.assert_array_equal(found[name], picture)
     assert any((whole["000000.png"] != picture).any() for picture in whole.values())  # it moves
-    assert sorted(path.name for path in (shot / engine).glob("film-*")) == [f"film-{first}" for first in (0, 2, 4)]
+    assert sorted(path.name for path in (shot / engine).glob("film-*")) == [
+        f"film-{first}" for first in (0, 2, 4)
+    ]
 
 
 def plan_of(shot: Path, engine: str) -> Path:
@@ -107,7 +117,8 @@ def plan_of(shot: Path, engine: str) -> Path:
 
 
 def test_frames_through_the_local_engine(shot: Path) -> None:
-    """Catches frames that a worker's Blender renders with another engine, leaves out, or renders again."""
+    """Catches frames that a worker's Blender renders with another engine, leaves out, or renders
+    again."""
     plan = read_plan(plan_of(shot, "local"))
     batch, _ = carry_out(plan, LocalEngine(2, 8.0))
     assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}, batch.failures
@@ -121,6 +132,8 @@ def test_frames_through_ray(shot: Path) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     command = [sys.executable, "-c", COMMAND, str(plan_of(shot, "ray"))]
     variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=500, cwd=ROOT)
+    done = subprocess.run(
+        command, env=variables, capture_output=True, text=True, timeout=500, cwd=ROOT
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     check(shot, "ray")

@@ -1,4 +1,5 @@
-"""The engine of this machine with real workers: results, kills, Ctrl-C, the command and its report."""
+"""The engine of this machine with real workers: results, kills, Ctrl-C, the command and its
+report."""
 
 import os
 import random
@@ -28,11 +29,19 @@ pytest.importorskip("torch")
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 KILLS = int(os.environ.get("STGA_BATCH_KILLS", 2))
-"""Workers that are killed, every second one with a checkpoint; 20 in the measurement of docs/batch.md."""
+"""Workers that are killed, every second one with a checkpoint; 20 in the measurement of
+docs/batch.md."""
 
 
-def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str], resumable: list[str]) -> None:
-    """Kill workers, none more than four times: in turn at a random moment, and when there is a checkpoint.
+def killer(
+    jobs: tuple[Job, ...],
+    kills: int,
+    ended: threading.Event,
+    killed: list[str],
+    resumable: list[str],
+) -> None:
+    """Kill workers, none more than four times: in turn at a random moment, and when there is a
+    checkpoint.
 
     resumable: those that had one.
     """
@@ -40,9 +49,15 @@ def killer(jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: li
     while len(killed) < kills and not ended.wait(chance.uniform(0.2, 1.5)):
         folders = {job.name: job.request_folder for job in jobs}
         alive = {name: lock_owner(folder / LOCK_FILE) for name, folder in folders.items()}
-        found = [(name, process) for name, process in alive.items() if process and killed.count(name) < 4]
+        found = [
+            (name, process) for name, process in alive.items() if process and killed.count(name) < 4
+        ]
         if len(killed) % 2:
-            found = [(name, process) for name, process in found if (folders[name].parent / CHECKPOINT).exists()]
+            found = [
+                (name, process)
+                for name, process in found
+                if (folders[name].parent / CHECKPOINT).exists()
+            ]
         if found:
             name, process = chance.choice(found)
             try:
@@ -80,7 +95,8 @@ def test_killed_workers_resume_to_the_same_bits(
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a batch whose failure nobody sees, Ctrl-C that loses work, and a report that needs more than itself."""
+    """Catches a batch whose failure nobody sees, Ctrl-C that loses work, and a report that needs
+    more than itself."""
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path))
     report = (tmp_path / "runs/report.html").read_text()
@@ -96,16 +112,33 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_captures_of_the_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches options that are forgotten where captures are given, or silently ignored where a plan is."""
+    """Catches options that are forgotten where captures are given, or silently ignored where a plan
+    is."""
     monkeypatch.setattr("stga_addon.batch.engines.make_engine", lambda *_: InProcessEngine())
     tiny_plan(tmp_path)
     capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
-    options = ["--iterations", "2", "--device", "cpu", "--threads", "1", "--principal-point", "opencv", "--seed", "5"]
+    options = [
+        "--iterations",
+        "2",
+        "--device",
+        "cpu",
+        "--threads",
+        "1",
+        "--principal-point",
+        "opencv",
+        "--seed",
+        "5",
+    ]
     assert main(["batch", capture, "--out", out, *options]) == 0
     assert "1 of 1 jobs finished" in capsys.readouterr().out
     run = read_run(tmp_path / "out/train-capture")
     settings = run.settings
-    assert (run.principal_point, settings.iterations, settings.seed, run.device) == ("opencv", 2, 5, "cpu")
+    assert (run.principal_point, settings.iterations, settings.seed, run.device) == (
+        "opencv",
+        2,
+        5,
+        "cpu",
+    )
     assert main(["batch", capture, "--preset", "draft"]) == 2
     assert "--out: is missing" in capsys.readouterr().err
     assert main(["batch", capture, "--out", out]) == 2
@@ -116,7 +149,8 @@ def test_captures_of_the_command(
 
 
 def test_commands_carry_out_the_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches commands that a shell elsewhere cannot run, jobs in another order than theirs, and finished ones."""
+    """Catches commands that a shell elsewhere cannot run, jobs in another order than theirs, and
+    finished ones."""
     write_mesh_capture(tmp_path / "a capture")
     look = '[job.{}]\nrequest = "select"\ncapture = "a capture"\nafter = {}\n'
     plan = tmp_path / "plan.toml"

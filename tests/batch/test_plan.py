@@ -59,14 +59,21 @@ def plan_of(base: Path, text: str = PLAN) -> Plan:
 
 
 def test_jobs_of_a_plan(base: Path) -> None:
-    """Catches fields that do not reach a request, and a job that begins before what it reads is there."""
+    """Catches fields that do not reach a request, and a job that begins before what it reads is
+    there."""
     plan, runs = plan_of(base), base / "runs"
     jobs = {job.name: job for job in plan.jobs}
     assert [*jobs] == ["tracked", "anna", "anna-val", "smile"]
-    assert jobs["tracked"].request == Track(base / "footage/anna", base / "head.npz", runs / "tracked")
+    assert jobs["tracked"].request == Track(
+        base / "footage/anna", base / "head.npz", runs / "tracked"
+    )
     default = make_settings(iterations=1).selection
     settings = make_settings(
-        iterations=30, seed=7, effects={}, sh_steps=(0.5,), selection=replace(default, threshold=0.02)
+        iterations=30,
+        seed=7,
+        effects={},
+        sh_steps=(0.5,),
+        selection=replace(default, threshold=0.02),
     )
     training = jobs["anna"]
     assert training.request == Train(runs / "anna", runs / "tracked", settings)
@@ -82,15 +89,24 @@ def test_jobs_of_a_plan(base: Path) -> None:
 
 
 def test_captures_make_a_plan(base: Path) -> None:
-    """Catches captures that do not come out as `stga train` would train them: with a preset, its iterations."""
+    """Catches captures that do not come out as `stga train` would train them: with a preset, its
+    iterations."""
     captures = [base / "footage/anna", base / "footage/ben"]
     plan = plan_of_captures(captures, base / "out", {"preset": "draft"}, {"device": "cpu"})
     assert [job.name for job in plan.jobs] == ["train-anna", "train-ben"]
     request = plan.jobs[1].request
     assert isinstance(request, Train)
-    assert (request.settings.preset, request.settings.seconds, request.settings.lattice) == ("draft", None, 1)
+    assert (request.settings.preset, request.settings.seconds, request.settings.lattice) == (
+        "draft",
+        None,
+        1,
+    )
     assert request.settings.effects == {}
-    assert (request.run, request.capture, request.device) == (base / "out/train-ben", captures[1], "cpu")
+    assert (request.run, request.capture, request.device) == (
+        base / "out/train-ben",
+        captures[1],
+        "cpu",
+    )
 
 
 def test_names_of_captures(base: Path) -> None:
@@ -98,7 +114,9 @@ def test_names_of_captures(base: Path) -> None:
     folders = ["anna/take", "ben/take", "_anna", "_é_ben", "film/東京", "film/大阪", "c 1"]
     for name in folders:
         (base / name).mkdir(parents=True)
-    plan = plan_of_captures([base / name for name in folders], base / "out", {"preset": "draft"}, {})
+    plan = plan_of_captures(
+        [base / name for name in folders], base / "out", {"preset": "draft"}, {}
+    )
     names = ["anna-take", "ben-take", "anna", "ben", "film", "film_2", "c-1"]
     assert {job.name: job.request.capture for job in plan.jobs} == {
         f"train-{name}": base / folder for name, folder in zip(names, folders, strict=True)
@@ -158,9 +176,13 @@ def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
 
 
 def test_what_changed_is_done_again(base: Path) -> None:
-    """Catches work that is repeated although nothing changed, and results of old inputs or settings that are kept."""
+    """Catches work that is repeated although nothing changed, and results of old inputs or settings
+    that are kept."""
     before = job_digests(plan_of(base))
-    assert changed(before, job_digests(plan_of(base, PLAN.replace("threads = 2", "threads = 1")))) == set()
+    assert (
+        changed(before, job_digests(plan_of(base, PLAN.replace("threads = 2", "threads = 1"))))
+        == set()
+    )
     (base / "footage/ben/take.mp4").write_text("new")
     assert changed(before, job_digests(plan_of(base))) == {"smile"}
     (base / "footage/ben/take.mp4").unlink()
@@ -171,7 +193,8 @@ def test_what_changed_is_done_again(base: Path) -> None:
 
 
 def test_a_run_counts_by_its_content(base: Path) -> None:
-    """Catches an evaluation that is repeated because it wrote its figures into the run that it read."""
+    """Catches an evaluation that is repeated because it wrote its figures into the run that it
+    read."""
     run = base / "run"
     run.mkdir()
     for name in ("run.json", "avatar.npz"):
@@ -185,8 +208,8 @@ def test_a_run_counts_by_its_content(base: Path) -> None:
 
 
 def test_texts_that_name_files(base: Path) -> None:
-    """Catches a region file or a folder of mattes that is looked for where the worker happens to run, or whose change
-    goes unnoticed; and names that are taken for files."""
+    """Catches a region file or a folder of mattes that is looked for where the worker happens to
+    run, or whose change goes unnoticed; and names that are taken for files."""
     text = """
 out = "runs"
 """ + "".join(
@@ -197,8 +220,14 @@ out = "runs"
     (base / "mattes").mkdir()
     (base / "brow.JSON").write_text("{}")
     jobs = {job.name: job.request for job in plan_of(base, text).jobs}
-    assert [jobs[f"track-{name}"].mattes for name in ("none", "mattes")] == ["none", str(base / "mattes")]
-    assert [jobs[f"refine-{name}"].region for name in ("mouth", "brow")] == ["mouth", str(base / "brow.JSON")]
+    assert [jobs[f"track-{name}"].mattes for name in ("none", "mattes")] == [
+        "none",
+        str(base / "mattes"),
+    ]
+    assert [jobs[f"refine-{name}"].region for name in ("mouth", "brow")] == [
+        "mouth",
+        str(base / "brow.JSON"),
+    ]
     before = job_digests(plan_of(base, text))
     (base / "brow.JSON").write_text("{ }")
     (base / "mattes/0.png").touch()
@@ -209,8 +238,8 @@ out = "runs"
 
 
 def test_options_inside_a_request(tmp_path):
-    """Catches renderings and exports that a plan cannot ask for, because their options of a motion have no plain
-    default; and options that are left out counted as missing."""
+    """Catches renderings and exports that a plan cannot ask for, because their options of a motion
+    have no plain default; and options that are left out counted as missing."""
     text = """
 out = "runs"
 [job.film]

@@ -1,4 +1,5 @@
-"""The Ray engine on a cluster that is started here, with its token; skipped by name where Ray is not installed."""
+"""The Ray engine on a cluster that is started here, with its token; skipped by name where Ray is
+not installed."""
 
 import os
 import secrets
@@ -14,7 +15,14 @@ from stga_addon.batch.engines import ray as ray_engine
 from stga_addon.errors import StgaError
 
 from .conftest import TrainedHere
-from .tiny import ITERATIONS, check_interrupted, interrupt_batch, ray_variables, splats_of, tiny_plan
+from .tiny import (
+    ITERATIONS,
+    check_interrupted,
+    interrupt_batch,
+    ray_variables,
+    splats_of,
+    tiny_plan,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = """
@@ -73,14 +81,20 @@ print(killed, "nodes killed,", resumable, "of them when a job had a checkpoint",
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
 KILLS = int(os.environ.get("STGA_BATCH_NODE_KILLS", 2))
-"""Nodes that are killed, every second one when a job has a checkpoint; 6 in the measurement of docs/batch.md."""
+"""Nodes that are killed, every second one when a job has a checkpoint; 6 in the measurement of
+docs/batch.md."""
 
 
 def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
     """Lines that a script prints in a process of its own, which Ray leaves its settings to."""
     command = [sys.executable, "-c", script, str(ROOT), *map(str, arguments)]
     done = subprocess.run(
-        command, env={**ray_variables(), **variables}, capture_output=True, text=True, timeout=1200, cwd=ROOT
+        command,
+        env={**ray_variables(), **variables},
+        capture_output=True,
+        text=True,
+        timeout=1200,
+        cwd=ROOT,
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     return done.stdout.splitlines()
@@ -88,14 +102,20 @@ def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
 
 @pytest.mark.slow
 def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: TrainedHere) -> None:
-    """Catches a cluster with a token that cannot be used, jobs that are lost with a node or train something else, and
-    two workers on one."""
+    """Catches a cluster with a token that cannot be used, jobs that are lost with a node or train
+    something else, and two workers on one."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     seeds, iterations = max(1, KILLS // 2), max(ITERATIONS, 200 * KILLS)
-    variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "STGA_CHECKPOINT_S": "0.3"}
+    variables = {
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "STGA_CHECKPOINT_S": "0.3",
+    }
     killed, states = run_script(NODES, tmp_path, KILLS, seeds, iterations, **variables)[-2:]
-    names = sorted(f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds))
+    names = sorted(
+        f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds)
+    )
     assert states == str([(name, "finished", "") for name in names])
     print(killed)
     assert int(killed.split()[0]) >= KILLS // 2
@@ -107,7 +127,8 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
 
 @pytest.mark.slow
 def test_a_cluster_of_this_machine_is_its_users(tmp_path: Path) -> None:
-    """Catches a cluster that anyone on this machine may use, and jobs that are not carried out there."""
+    """Catches a cluster that anyone on this machine may use, and jobs that are not carried out
+    there."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     write_mesh_capture(tmp_path / "capture")
     assert run_script(BATCH, tmp_path)[-1] == str([("look", "finished", "")])
@@ -115,7 +136,8 @@ def test_a_cluster_of_this_machine_is_its_users(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_through_ray(tmp_path: Path) -> None:
-    """Catches Ctrl-C that Ray's tasks do not hear, or that takes the cluster away before they have saved."""
+    """Catches Ctrl-C that Ray's tasks do not hear, or that takes the cluster away before they have
+    saved."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     tiny_plan(tmp_path)

@@ -1,4 +1,5 @@
-"""Running batches on an engine that does no work: order, failures, kills, and what a second start does."""
+"""Running batches on an engine that does no work: order, failures, kills, and what a second start
+does."""
 
 import errno
 import json
@@ -27,7 +28,11 @@ from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, in
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
 
-LAST = {"request": "analyze", "capture": "capture", "after": [f"again-{number:05d}" for number in range(3)]}
+LAST = {
+    "request": "analyze",
+    "capture": "capture",
+    "after": [f"again-{number:05d}" for number in range(3)],
+}
 
 
 def states(batch: Batch) -> dict[str, JobState]:
@@ -36,7 +41,8 @@ def states(batch: Batch) -> dict[str, JobState]:
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) -> None:
-    """Catches work that is repeated, and work that is not although its input or its result has changed."""
+    """Catches work that is repeated, and work that is not although its input or its result has
+    changed."""
     plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
     engine = SimulatedEngine(room=2 if not takes_all else 99, takes_all=takes_all)
     batch, _ = carry_out(plan, engine)
@@ -70,7 +76,11 @@ def test_a_batch_that_writes_into_what_it_reads(tmp_path: Path) -> None:
 
     (tmp_path / "capture").mkdir()
     look = {"request": "analyze", "capture": "capture"}
-    face = {"request": "convert-motion", "source": "capture", "output": str(tmp_path / "capture/face.csv")}
+    face = {
+        "request": "convert-motion",
+        "source": "capture",
+        "output": str(tmp_path / "capture/face.csv"),
+    }
     plan = make_plan({"out": "capture/runs", "job": {"look": look, "face": face}}, tmp_path, "plan")
     for submitted in (["look", "face"], [], ["look", "face"]):
         if not submitted:
@@ -94,7 +104,10 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
     (tmp_path / "shot.blend").touch()
     both = ["film-1", "film-3"]
     film = {"request": "render-blend", "blend": "shot.blend"}
-    jobs = {name: {**film, "frames": frames} for name, frames in zip(both, ([1, 2], [3, 4]), strict=True)}
+    jobs = {
+        name: {**film, "frames": frames}
+        for name, frames in zip(both, ([1, 2], [3, 4]), strict=True)
+    }
     plan = make_plan({"out": "runs", "job": jobs}, tmp_path, "plan")
     for gone, submitted in ((None, both), ("film-3/000004.png", both[1:])):
         if gone is not None:
@@ -106,7 +119,8 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_a_failed_job_fails_alone(tmp_path: Path, takes_all: bool) -> None:
-    """Catches a failure that stops other actors' jobs, or is passed on as if the next job had failed by itself."""
+    """Catches a failure that stops other actors' jobs, or is passed on as if the next job had
+    failed by itself."""
 
     def outcome(job: Job) -> tuple[WorkerState, str]:
         failed = job.name == "look-00001" or (takes_all and job.name == "again-00001")
@@ -141,12 +155,17 @@ def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
     assert states(batch)["look-00000"] == JobState.FINISHED
     assert states(batch)["look-00001"] == JobState.FAILED
     assert "Worker exited unexpectedly" in batch.entries["look-00001"].error
-    assert Counter(engine.submitted) == {"look-00000": 3, "look-00001": 1 + MAX_RETRIES, "look-00002": 1}
+    assert Counter(engine.submitted) == {
+        "look-00000": 3,
+        "look-00001": 1 + MAX_RETRIES,
+        "look-00002": 1,
+    }
 
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
-    """Catches times and forecasts that grow with a cluster's queue, and with the pauses of a batch."""
+    """Catches times and forecasts that grow with a cluster's queue, and with the pauses of a
+    batch."""
     queue_s, work_s, waited = 0.8, 0.2, []
 
     class Queued(SimulatedEngine):
@@ -170,7 +189,8 @@ def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
 
 
 def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
-    """Catches an interrupted batch that starts further jobs, or forgets those that were finished."""
+    """Catches an interrupted batch that starts further jobs, or forgets those that were
+    finished."""
     plan = empty_jobs(tmp_path, 4)
 
     def outcome(job: Job) -> tuple[WorkerState, str]:
@@ -189,7 +209,8 @@ def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_files_of_others_stay(tmp_path: Path, takes_all: bool) -> None:
-    """Catches a batch that moves or overwrites a folder which no job of a batch wrote, or starts the jobs after it."""
+    """Catches a batch that moves or overwrites a folder which no job of a batch wrote, or starts
+    the jobs after it."""
     plan = empty_jobs(tmp_path, 2, again=True)
     own = tmp_path / "runs/look-00000/run.json"
     own.parent.mkdir(parents=True)
@@ -217,12 +238,19 @@ def test_a_damaged_record_is_no_result(tmp_path: Path) -> None:
 
 
 def test_room_on_this_machine(tmp_path: Path) -> None:
-    """Catches more workers than the machine has processors or memory for, and one that never fits."""
+    """Catches more workers than the machine has processors or memory for, and one that never
+    fits."""
     engine = LocalEngine(cores=4, memory_gb=8.0)
 
     def job(name: str, **needs: float) -> Job:
         found = empty_jobs(tmp_path, 1).jobs[0]
-        return Job(name, "look", found.request, tmp_path / name, resources=Resources(**{"threads": 1, **needs}))
+        return Job(
+            name,
+            "look",
+            found.request,
+            tmp_path / name,
+            resources=Resources(**{"threads": 1, **needs}),
+        )
 
     assert engine.has_room(job("huge", threads=64, memory_gb=100.0))
     engine.adopt(job("a", threads=2, memory_gb=3.0, gpu=True))
@@ -234,12 +262,18 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("windows", "ending", "is_lost"),
-    [(False, "kill -9 $$", True), (False, "exit 1", False), (True, "exit 1", True), (True, "exit 2", False)],
+    [
+        (False, "kill -9 $$", True),
+        (False, "exit 1", False),
+        (True, "exit 1", True),
+        (True, "exit 2", False),
+    ],
 )
 def test_a_killed_worker_is_told_from_a_mistake(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, windows: bool, ending: str, is_lost: bool
 ) -> None:
-    """Catches a killed worker that is not tried again on Windows, where a kill is an exit status like others."""
+    """Catches a killed worker that is not tried again on Windows, where a kill is an exit status
+    like others."""
     monkeypatch.setattr(local, "IS_WINDOWS", windows)
     python = tmp_path / "python"
     python.write_text(f"#!/bin/sh\n{ending}\n")
@@ -259,14 +293,24 @@ def test_tables(tmp_path: Path) -> None:
     plan = empty_jobs(tmp_path, 30)
     batch = Batch(plan)
     batch.set_forecasts({entry.name: 60.0 for entry in plan.jobs[:10]})
-    assert plan_lines(batch, 5)[-1].startswith("30 jobs, 30 to do; 10 min of work, about 2 min on this machine; of 20 ")
+    assert plan_lines(batch, 5)[-1].startswith(
+        "30 jobs, 30 to do; 10 min of work, about 2 min on this machine; of 20 "
+    )
     entries = list(batch.entries.values())
     for number, entry in enumerate(entries):
-        entry.state = JobState.FINISHED if number < 20 else JobState.RUNNING if number < 24 else JobState.FAILED
+        entry.state = (
+            JobState.FINISHED
+            if number < 20
+            else JobState.RUNNING
+            if number < 24
+            else JobState.FAILED
+        )
         entry.status = WorkerStatus(seconds=10.0)
     running = entries[20]
     running.machine = "node7"
-    running.status = WorkerStatus(progress=0.25, message="Training", figures={"psnr": 31.25}, seconds=30.0)
+    running.status = WorkerStatus(
+        progress=0.25, message="Training", figures={"psnr": 31.25}, seconds=30.0
+    )
     lines = table_lines(batch)
     assert lines[0].startswith("20 of 30 jobs finished, 4 running, 6 failed; about 90 s left")
     assert "node7" in lines[1]
@@ -287,8 +331,11 @@ def _hold(folder: str, held: Any) -> None:
 
 
 @pytest.mark.parametrize("locks", ["work", "fail"])
-def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches two batches that write into each other's jobs, also where the storage knows no file locks."""
+def test_two_batches_cannot_take_one_folder(
+    tmp_path: Path, locks: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches two batches that write into each other's jobs, also where the storage knows no file
+    locks."""
     if locks == "fail":
 
         def no_lock(path: Path) -> None:
@@ -304,7 +351,9 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
     try:
         assert held.wait(30)
         with (
-            pytest.raises(StgaError, match=r"another batch is working in this folder \(process \d+"),
+            pytest.raises(
+                StgaError, match=r"another batch is working in this folder \(process \d+"
+            ),
             hold_folder(tmp_path),
         ):
             pass
@@ -320,7 +369,8 @@ def test_two_batches_cannot_take_one_folder(tmp_path: Path, locks: str, monkeypa
 
 
 def test_a_lease_that_was_taken_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a batch that goes on in a folder which another machine's batch took while this one was suspended."""
+    """Catches a batch that goes on in a folder which another machine's batch took while this one
+    was suspended."""
     monkeypatch.setattr(lock, "BEAT_S", 0.05)
     plan = empty_jobs(tmp_path, 1)
 
@@ -359,15 +409,23 @@ JOBS = int(os.environ.get("STGA_BATCH_JOBS", 2000))
 def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
     """Catches time or memory that grows faster than the number of jobs.
 
-    Processor time, in a process of its own, whose peak no other test has raised; that of getrusage is inherited.
+    Processor time, in a process of its own, whose peak no other test has raised; that of getrusage
+    is inherited.
     """
     if not Path("/proc/self/status").exists():
         pytest.skip("peak memory of a process is read from Linux's /proc")
     tests, few = Path(__file__).resolve().parents[1], JOBS // 8
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]), "TMPDIR": str(tmp_path)}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]),
+        "TMPDIR": str(tmp_path),
+    }
     command = [sys.executable, "-c", COST, str(few), str(JOBS)]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    (small_s, small_kb), (large_s, large_kb) = (map(float, line.split()) for line in run.stdout.splitlines())
-    print(f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; {large_s / small_s:.2f}")
+    (small_s, small_kb), (large_s, large_kb) = (
+        map(float, line.split()) for line in run.stdout.splitlines()
+    )
+    print(
+        f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; {large_s / small_s:.2f}"
+    )
     assert large_s < 1.8 * small_s
     assert large_kb - small_kb < 30 * (JOBS - few)

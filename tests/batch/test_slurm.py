@@ -38,9 +38,11 @@ def on_cluster(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
 
 
 @pytest.mark.needs("slurm")
-def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere) -> None:
-    """Catches jobs that begin before those they come after, or train something else than on this machine; and a killed
-    worker whose job is lost."""
+def test_same_results_through_slurm(
+    on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere
+) -> None:
+    """Catches jobs that begin before those they come after, or train something else than on this
+    machine; and a killed worker whose job is lost."""
     there = tiny_plan(tmp_path)
     machines: set[str] = set()
     killed: list[int] = []
@@ -61,14 +63,17 @@ def test_same_results_through_slurm(on_cluster: Cluster, tmp_path: Path, trained
     assert killed
     assert machines == {"one", "two"}
     for seed in range(2):
-        assert splats_of(there, f"train-seed{seed}") == splats_of(trained_here(), f"train-seed{seed}")
+        assert splats_of(there, f"train-seed{seed}") == splats_of(
+            trained_here(), f"train-seed{seed}"
+        )
 
 
 @pytest.mark.needs("slurm")
 def test_jobs_of_a_dead_node_resume_elsewhere(
     on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a job that is lost with its machine, or is another one when it was resumed on the next."""
+    """Catches a job that is lost with its machine, or is another one when it was resumed on the
+    next."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     there = tiny_plan(tmp_path)
     killed: list[str] = []
@@ -92,12 +97,15 @@ def test_jobs_of_a_dead_node_resume_elsewhere(
     assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}, batch.failures
     assert killed
     for seed in range(2):
-        assert splats_of(there, f"train-seed{seed}") == splats_of(trained_here(), f"train-seed{seed}")
+        assert splats_of(there, f"train-seed{seed}") == splats_of(
+            trained_here(), f"train-seed{seed}"
+        )
 
 
 @pytest.mark.needs("slurm")
 def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Path) -> None:
-    """Catches an array that one failed job takes down, and jobs after it that count as failed themselves."""
+    """Catches an array that one failed job takes down, and jobs after it that count as failed
+    themselves."""
     plan = tiny_plan(tmp_path, iterations=3)
     name = "train-seed1"
     (plan.out / name).mkdir(parents=True)
@@ -110,7 +118,8 @@ def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Pat
 
 @pytest.mark.needs("slurm")
 def test_ctrl_c_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
-    """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they have saved."""
+    """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they have
+    saved."""
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "slurm"))
 
@@ -126,10 +135,14 @@ def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -
     assert "sbatch: " in batch.entries["huge"].error
 
 
-def test_what_waits_in_the_queue_is_submitted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a batch that ends because squeue failed once, and jobs that the next start submits again while they wait.
+def test_what_waits_in_the_queue_is_submitted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a batch that ends because squeue failed once, and jobs that the next start submits
+    again while they wait.
 
-    Programs of the names of SLURM's stand in for it: a queue in which nothing begins, and which is down at first.
+    Programs of the names of SLURM's stand in for it: a queue in which nothing begins, and which is
+    down at first.
     """
     queue, down, calls = tmp_path / "queue", tmp_path / "down", tmp_path / "calls"
     programs = {
@@ -177,10 +190,14 @@ def test_what_waits_in_the_queue_is_submitted_once(tmp_path: Path, monkeypatch: 
 
 
 def test_arrays_wait_for_earlier_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an array that waits for itself, as where a request reads what another of its kind writes; and a job that
-    is in no array, in two, or in one of more jobs than SLURM takes."""
+    """Catches an array that waits for itself, as where a request reads what another of its kind
+    writes; and a job that is in no array, in two, or in one of more jobs than SLURM takes."""
     calls = tmp_path / "calls"
-    for name, text in {"sbatch": f'echo "$@" >>{calls}; wc -l <{calls}', "squeue": "", "scancel": ""}.items():
+    for name, text in {
+        "sbatch": f'echo "$@" >>{calls}; wc -l <{calls}',
+        "squeue": "",
+        "scancel": "",
+    }.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
@@ -202,5 +219,7 @@ def test_without_slurm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slurm.shutil, "which", lambda name: None)
     with pytest.raises(StgaError, match="--engine slurm: the program sbatch was not found"):
         make_engine("slurm")
-    with pytest.raises(StgaError, match="--address: is that of a Ray cluster; expected --engine ray, got slurm"):
+    with pytest.raises(
+        StgaError, match="--address: is that of a Ray cluster; expected --engine ray, got slurm"
+    ):
         make_engine("slurm", "host:1")

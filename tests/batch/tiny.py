@@ -26,13 +26,14 @@ RAY_SETTINGS = {
     "worker_niceness": "0", "health_check_initial_delay_ms": "1000", "health_check_period_ms": "1000",
     "health_check_failure_threshold": "3", "health_check_timeout_ms": "10000",
 }  # fmt: skip
-"""Tasks have the priority of the tests beside them (Ray's own is 15 lower, and takes minutes then); a killed node is
-noticed after 3 s, and a node that is only slow has 10 s to answer."""
+"""Tasks have the priority of the tests beside them (Ray's own is 15 lower, and takes minutes then);
+a killed node is noticed after 3 s, and a node that is only slow has 10 s to answer."""
 SETTINGS = {"strategy": "selective", "hull_points": False}
 
 
 def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
-    """Trainings of one capture with several seeds, and an evaluation after each; results into `base`/runs."""
+    """Trainings of one capture with several seeds, and an evaluation after each; results into
+    `base`/runs."""
     if not (base / "capture").exists():
         write_mesh_capture(base / "capture", (0, 1, 3, 4), range(4))
     train = {
@@ -41,15 +42,22 @@ def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
     }  # fmt: skip
     jobs: dict[str, Any] = {}
     for seed in range(seeds):
-        jobs[f"train-seed{seed}"] = {**train, "settings": {**SETTINGS, "iterations": iterations, "seed": seed}}
-        jobs[f"evaluate-seed{seed}"] = {"request": "evaluate", "run": f"runs/train-seed{seed}", "minutes": 0.1}
+        jobs[f"train-seed{seed}"] = {
+            **train,
+            "settings": {**SETTINGS, "iterations": iterations, "seed": seed},
+        }
+        jobs[f"evaluate-seed{seed}"] = {
+            "request": "evaluate",
+            "run": f"runs/train-seed{seed}",
+            "minutes": 0.1,
+        }
     resources = {"threads": 1, "memory_gb": 0.5}
     return make_plan({"out": "runs", "resources": resources, "job": jobs}, base, "plan")
 
 
 def splats_of(plan: Plan, name: str) -> dict[str, bytes]:
-    """The arrays of a run's avatar as bytes; without its header, whose figures of the light depend in their last bits
-    on the threads of the linear algebra."""
+    """The arrays of a run's avatar as bytes; without its header, whose figures of the light depend
+    in their last bits on the threads of the linear algebra."""
     path = plan.out / name / AVATAR
     read_avatar(path)
     return {key: array.tobytes() for key, array in read_npz(path).items() if key != "header"}
@@ -62,8 +70,8 @@ def ray_variables() -> dict[str, str]:
 
 
 def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
-    """Exit code and output of `stga batch` on `base`/plan.toml after Ctrl-C, which came when its job `train-good` was
-    training and its job `train-bad` had failed."""
+    """Exit code and output of `stga batch` on `base`/plan.toml after Ctrl-C, which came when its
+    job `train-good` was training and its job `train-bad` had failed."""
     (base / "bad").mkdir()
     (base / "plan.toml").write_text(
         'out = "runs"\n[resources]\nthreads = 1\nmemory_gb = 0.5\n'
@@ -76,7 +84,12 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     )
     command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]
     started = subprocess.Popen(
-        command, cwd=ROOT, env=ray_variables(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command,
+        cwd=ROOT,
+        env=ray_variables(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
@@ -91,7 +104,8 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
 
 
 def check_interrupted(base: Path, code: int, output: str) -> None:
-    """What `interrupt_batch` has to leave: the failure of one job, and a checkpoint of the other."""
+    """What `interrupt_batch` has to leave: the failure of one job, and a checkpoint of the
+    other."""
     assert code == 130, output
     assert "train-good: stopped" in output
     assert re.search(r"train-bad: failed: .*bad", output)

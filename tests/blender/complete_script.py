@@ -1,7 +1,9 @@
-"""Runs inside a real Blender with the complete edition, started by test_real_blender.py: a newcomer's first training.
+"""Runs inside a real Blender with the complete edition, started by test_real_blender.py: a
+newcomer's first training.
 
-`blender --background --python complete_script.py -- RESULT WAIT BUDGET`, where BUDGET is an argument of Train, as
-`iterations=60`, and RESULT the JSON file that says what was seen. WAIT: 0 to leave while the worker trains.
+`blender --background --python complete_script.py -- RESULT WAIT BUDGET`, where BUDGET is an
+argument of Train, as `iterations=60`, and RESULT the JSON file that says what was seen. WAIT: 0 to
+leave while the worker trains.
 """
 
 import json
@@ -26,7 +28,9 @@ def watch(job: Path, clicked: float) -> None:
     seen["stages"] = stages
     while not (job / "preview.npz").exists():
         with suppress(OSError, ValueError):  # not written yet
-            stages.setdefault(json.loads((job / "status.json").read_text())["message"], time.monotonic() - clicked)
+            stages.setdefault(
+                json.loads((job / "status.json").read_text())["message"], time.monotonic() - clicked
+            )
         time.sleep(0.05)
     seen["preview_s"] = time.monotonic() - clicked
 
@@ -57,7 +61,9 @@ budget = {name: float(value) if name == "minutes" else int(value)}
 if WAIT == "0":
     # What a window does, which returns while the worker starts.
     start = sys.modules[f"{module}.operators.request"].start_worker
-    sys.modules[f"{module}.operators.request"].start_worker = lambda *given: leave(start(*given).pid)
+    sys.modules[f"{module}.operators.request"].start_worker = lambda *given: leave(
+        start(*given).pid
+    )
 timed("train_s", bpy.ops.stga.train, directory=str(run), python=own_python(), **budget)
 timed("show_s", bpy.ops.stga.show_avatar, filepath=settings.avatar)
 seen["splats"] = len(settings.splats.data.vertices)

@@ -24,7 +24,8 @@ def _factory_settings():
 
 @pytest.fixture(autouse=True)
 def empty_scene(_factory_settings):
-    """As after factory settings, in a fifth of the time: Blender's own add-ons are not registered anew."""
+    """As after factory settings, in a fifth of the time: Blender's own add-ons are not registered
+    anew."""
     import bpy
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
@@ -32,9 +33,11 @@ def empty_scene(_factory_settings):
 
 @pytest.fixture(scope="session")
 def extension():
-    """The checkout as a package of its own, as Blender imports an extension: only relative imports find their way.
+    """The checkout as a package of its own, as Blender imports an extension: only relative imports
+    find their way.
 
-    Its kernels are those of `stga_addon`: under another name they would be compiled again, which takes a minute.
+    Its kernels are those of `stga_addon`: under another name they would be compiled again, which
+    takes a minute.
     """
     name = "stga_checkout"
     if not missing_packages():
@@ -42,7 +45,9 @@ def extension():
         sys.modules[f"{name}.{kernels.__name__}"] = kernels
         for _, part, _ in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
             sys.modules[f"{name}.{part}"] = importlib.import_module(part)
-    spec = importlib.util.spec_from_file_location(name, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
+    spec = importlib.util.spec_from_file_location(
+        name, ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
+    )
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.register()
@@ -62,7 +67,8 @@ def zip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A capture that holds its FLAME file, in place of the demo in a zip of the complete edition."""
+    """A capture that holds its FLAME file, in place of the demo in a zip of the complete
+    edition."""
     folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
     model.rename(folder / OWN_MODELS[0])
     return folder

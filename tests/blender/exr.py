@@ -9,7 +9,8 @@ MULTI_PART = 0x1000
 
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Channel name -> (H, W) float32, top row first, of scanlines without compression, in one part or in several."""
+    """Channel name -> (H, W) float32, top row first, of scanlines without compression, in one part
+    or in several."""
     data = path.read_bytes()
     magic, version = struct.unpack_from("<2i", data)
     assert magic == 20000630
@@ -29,7 +30,9 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         for start in struct.unpack_from(f"<{height}q", data, at):
             start += 4 * bool(version & MULTI_PART)  # the part's number
             (y,) = struct.unpack_from("<i", data, start)
-            rows[y - y0] = np.frombuffer(data, "<f4", len(names) * width, start + 8).reshape(len(names), width)
+            rows[y - y0] = np.frombuffer(data, "<f4", len(names) * width, start + 8).reshape(
+                len(names), width
+            )
         at += 8 * height
         found |= {name: rows[:, index] for index, name in enumerate(names)}
     return found

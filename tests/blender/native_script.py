@@ -1,7 +1,8 @@
-"""Runs in any Blender, or with bpy, started by test_native_splats.py: writes what native splats are drawn from.
+"""Runs in any Blender, or with bpy, started by test_native_splats.py: writes what native splats are
+drawn from.
 
-`python native_script.py -- AVATAR HEAD OUT`: the avatar's file, the head's vertices (.npy) and the .npz file of the
-attributes of each case. Before Blender 5.3 the points stay points.
+`python native_script.py -- AVATAR HEAD OUT`: the avatar's file, the head's vertices (.npy) and the
+.npz file of the attributes of each case. Before Blender 5.3 the points stay points.
 """
 
 import sys
@@ -36,7 +37,9 @@ found: dict[str, Any] = {}
 
 def read(case: str) -> None:
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    (cloud,) = [each.object.data for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"]
+    (cloud,) = [
+        each.object.data for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"
+    ]
     found[f"{case}/type"] = getattr(cloud, "type", "")
     for attribute in cloud.attributes:
         if attribute.data_type in FIELDS:
@@ -51,7 +54,8 @@ mesh = bpy.data.meshes.new("head")
 mesh.from_pydata(np.load(HEAD).tolist(), [], avatar.faces.tolist())
 head = bpy.data.objects.new("head", mesh)
 bpy.context.scene.collection.objects.link(head)
-head.vertex_groups.new(name=f"{tags.GROUP_PREFIX}{bpy.context.scene.frame_current}")  # selects no triangle
+# selects no triangle
+head.vertex_groups.new(name=f"{tags.GROUP_PREFIX}{bpy.context.scene.frame_current}")
 shown = show_avatar(avatar, head)
 set_input(shown, splat_nodes.DISPLAY, NATIVE)
 set_input(shown, splat_nodes.SIZE, 1.5)
@@ -63,7 +67,9 @@ set_input(shown, splat_nodes.SHOW_SELECTION, True)
 read("gray")
 set_input(shown, splat_nodes.SHOW_SELECTION, False)
 relit = np.random.default_rng(0).uniform(0, 2, (len(avatar.splats), 4)).astype(np.float32)
-shown.data.attributes.new(RELIT_COLOR, "FLOAT_COLOR", "POINT").data.foreach_set("color", relit.ravel())
+shown.data.attributes.new(RELIT_COLOR, "FLOAT_COLOR", "POINT").data.foreach_set(
+    "color", relit.ravel()
+)
 shown.data.update()
 read("relit")
 np.savez(OUT, **found)

@@ -26,7 +26,8 @@ def chosen(extension, tmp_path):
 
 
 def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
-    """Catches an empty analysis, choices that are lost by analyzing again, and ones that training does not get."""
+    """Catches an empty analysis, choices that are lost by analyzing again, and ones that training
+    does not get."""
     from types import SimpleNamespace
 
     row = chosen.effects.add()  # as an earlier analysis leaves it
@@ -37,7 +38,9 @@ def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
     assert (rows["exposure"].on, rows["exposure"].choice) == (False, "auto")
     assert "255 levels" in rows["exposure"].reason
     assert (rows["strain-color"].on, rows["strain-color"].choice) == (True, "on")
-    effects = " ".join(extension.operators.analyze.chosen_effects(SimpleNamespace(effects=chosen.effects)))
+    effects = " ".join(
+        extension.operators.analyze.chosen_effects(SimpleNamespace(effects=chosen.effects))
+    )
     assert effects == "strain-color=on"
     seconds = json.loads(chosen.preset_timing)
     assert list(seconds) == list(PRESETS)
@@ -47,8 +50,13 @@ def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
     bpy.ops.stga.train(directory=str(out), iterations=3, effects=effects, preset=chosen.preset)
     run = read_run(out)
     assert run.settings.strain_color
-    assert (run.settings.preset, run.settings.lattice) == ("draft", PRESETS["draft"].changes["lattice"])
-    assert {decision.effect: decision.choice for decision in run.effect_plan}["strain-color"] == "on"
+    assert (run.settings.preset, run.settings.lattice) == (
+        "draft",
+        PRESETS["draft"].changes["lattice"],
+    )
+    assert {decision.effect: decision.choice for decision in run.effect_plan}[
+        "strain-color"
+    ] == "on"
 
 
 def test_another_head_clears_the_analysis(chosen):
@@ -83,7 +91,8 @@ def answer(**values):
 
 
 def write_interpreter(path: Path, body: str) -> str:
-    """A program that stands in for the Python of the training Python, given the folder of a request."""
+    """A program that stands in for the Python of the training Python, given the folder of a
+    request."""
     path.write_text(f"#!{sys.executable}\n{WORKER}{body}\n")
     path.chmod(0o755)
     return str(path)
@@ -117,9 +126,12 @@ def tick_until_done(extension, kind: Kind = Kind.ANALYSIS) -> None:
 
 
 def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
-    """Catches a worker that waits for ever because nobody reads its pipes before it ends: they hold some 64 kB."""
+    """Catches a worker that waits for ever because nobody reads its pipes before it ends: they hold
+    some 64 kB."""
     rows = {"effect": "jaw", "choice": "auto", "on": True, "reason": "x" * 200_000, "cost": ""}
-    analyze(f"sys.stderr.write('warning ' * 100_000); answer(kind='Analyzed', plan=[{rows}], seconds={{}})")
+    analyze(
+        f"sys.stderr.write('warning ' * 100_000); answer(kind='Analyzed', plan=[{rows}], seconds={{}})"
+    )
     assert not bpy.ops.stga.analyze_capture.poll()
     tick_until_done(extension)
     assert [row.name for row in chosen.effects] == ["jaw"]
@@ -137,7 +149,8 @@ def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
     ],
 )
 def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentence):
-    """Catches a timer that ends with a traceback, and a panel that says nothing; earlier results stay."""
+    """Catches a timer that ends with a traceback, and a panel that says nothing; earlier results
+    stay."""
     chosen.effects.add().name = "jaw"
     analyze(body)
     tick_until_done(extension)
@@ -160,7 +173,9 @@ def test_analysis_can_be_cancelled(chosen, extension, analyze):
 def test_a_worker_that_cannot_be_started_leaves_nothing(chosen, extension, monkeypatch, tmp_path):
     """Catches a temporary folder that is left behind for each attempt."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(extension.operators.analyze, "training_python", lambda context: str(tmp_path / "none"))
+    monkeypatch.setattr(
+        extension.operators.analyze, "training_python", lambda context: str(tmp_path / "none")
+    )
     before = set(tmp_path.iterdir())
     with pytest.raises(RuntimeError, match="cannot be started as a Python interpreter"):
         bpy.ops.stga.analyze_capture()

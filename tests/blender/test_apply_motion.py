@@ -50,7 +50,9 @@ class Reenacted:
         np.savez(self.file, **self.other)
 
     def mesh(self, **values: np.ndarray) -> np.ndarray:
-        return flame_forward(self.own.model, self.own.shape, FlameFrame(**values), self.own.static_offset)
+        return flame_forward(
+            self.own.model, self.own.shape, FlameFrame(**values), self.own.static_offset
+        )
 
     def theirs(self, row: int) -> dict[str, np.ndarray]:
         return {name: value[row] for name, value in self.other.items() if name != "shape"}
@@ -74,14 +76,17 @@ def show_avatar(folder: Path, scene: Reenacted) -> Avatar:
     """Trained on this person: its neutral mesh is the one of the tracked identity."""
     faces = ball()[1].astype(np.int32)
     neutral = open_capture(scene.folder, scene.model_file).neutral
-    avatar = Avatar(lattice_splats(neutral, faces, order=0), "stga", neutral.astype(np.float32), faces)
+    avatar = Avatar(
+        lattice_splats(neutral, faces, order=0), "stga", neutral.astype(np.float32), faces
+    )
     write_avatar(folder / "a.npz", avatar)
     bpy.ops.stga.show_avatar(filepath=str(folder / "a.npz"))
     return avatar
 
 
 def test_a_file_from_a_start_frame(scene):
-    """Catches the other's identity, a shifted frame, and a scene that stops playing before the motion ends."""
+    """Catches the other's identity, a shifted frame, and a scene that stops playing before the
+    motion ends."""
     assert bpy.ops.stga.apply_motion(filepath=str(scene.file), start=10) == {"FINISHED"}
     for row in range(5):
         np.testing.assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
@@ -96,19 +101,23 @@ def write_refined(folder: Path, capture: Capture, rng: np.random.Generator) -> N
 
 
 def test_a_runs_refined_tracking(scene, tmp_path):
-    """Catches a head that does not get to where its avatar was trained: timesteps 0, 1 and 3, refined."""
+    """Catches a head that does not get to where its avatar was trained: timesteps 0, 1 and 3,
+    refined."""
     capture = open_capture(scene.folder, scene.model_file)
     write_refined(tmp_path, capture, np.random.default_rng(0))
     shown = with_refined_tracking(capture, tmp_path)
     assert np.abs(at(3) - shown.mesh(3)).max() > 1e-3
-    assert bpy.ops.stga.apply_motion(filepath=str(tmp_path / "tracking.npz"), start=0) == {"FINISHED"}
+    assert bpy.ops.stga.apply_motion(filepath=str(tmp_path / "tracking.npz"), start=0) == {
+        "FINISHED"
+    }
     for timestep in scene.own.timesteps:
         np.testing.assert_allclose(at(timestep), shown.mesh(timestep), atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("place", ["action", "strip"])
 def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
-    """Catches a head that loses what was tracked beside the parameters, also where another motion had exchanged it."""
+    """Catches a head that loses what was tracked beside the parameters, also where another motion
+    had exchanged it."""
     rng = np.random.default_rng(7)
     folder, model = write_flame_capture(tmp_path / "own")
     for path in (folder / "flame_param").glob("*.npz"):
@@ -130,7 +139,8 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
 
 
 def test_tooltips_say_whose_motion(extension):
-    """Catches two buttons that do different things and explain themselves alike, or an empty tooltip."""
+    """Catches two buttons that do different things and explain themselves alike, or an empty
+    tooltip."""
     operator = extension.operators.apply_motion.ApplyMotion
     refined_tracking = operator.description(bpy.context, SimpleNamespace(own_offsets=True))
     assert "refined by training" in refined_tracking
@@ -175,7 +185,8 @@ def test_recorded_at_another_rate(scene):
 
 
 def test_a_capture_and_another_head(scene, tmp_path):
-    """Catches a folder that is not taken as a motion, and a head whose hand-made animation is not what is applied."""
+    """Catches a folder that is not taken as a motion, and a head whose hand-made animation is not
+    what is applied."""
     folder, model = write_flame_capture(tmp_path / "second", timesteps=(0, 1, 2))
     name = the_head().name
     bpy.ops.stga.apply_motion(filepath=str(folder), start=20)
@@ -187,7 +198,9 @@ def test_a_capture_and_another_head(scene, tmp_path):
     rig_of(second).pose.bones["neck"].rotation_quaternion = (np.cos(0.2), 0, np.sin(0.2), 0)
     rig_of(second).pose.bones["neck"].keyframe_insert("rotation_quaternion", frame=0)
     bpy.context.scene.stga.head = bpy.data.objects[name]
-    assert bpy.ops.stga.apply_motion(source=second.name, start=40, head=False, jaw=False, eyes=False) == {"FINISHED"}
+    assert bpy.ops.stga.apply_motion(
+        source=second.name, start=40, head=False, jaw=False, eyes=False
+    ) == {"FINISHED"}
     # What is not taken stays: frame 42 lies behind the last keyframe of before, which holds.
     own = expected | {"expr": read_row(2)["expr"], "neck_pose": np.array([0, 0.4, 0])}
     np.testing.assert_allclose(at(42), scene.mesh(**own), atol=TOLERANCE)
@@ -213,7 +226,10 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
         "nothing": ({}, "no path given"),
         "no head": ({"source": "nobody"}, "nobody: is not an imported head"),
         "itself": ({"source": the_head().name}, "is this head itself"),
-        "far": ({"filepath": str(tmp_path / "long.npz"), "start": 1_048_573}, "Blender's last frame is"),
+        "far": (
+            {"filepath": str(tmp_path / "long.npz"), "start": 1_048_573},
+            "Blender's last frame is",
+        ),
     }
     for arguments, message in wrong.values():
         with pytest.raises(RuntimeError, match=message):
@@ -228,12 +244,15 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
 def test_heads_without_a_rig_are_told_what_is_needed(tmp_path):
     """Catches an operator that starts on a head it cannot animate."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    with pytest.raises(RuntimeError, match=r"has no FLAME rig.*splats follow whatever moves its mesh"):
+    with pytest.raises(
+        RuntimeError, match=r"has no FLAME rig.*splats follow whatever moves its mesh"
+    ):
         bpy.ops.stga.apply_motion(filepath=str(tmp_path / "other.npz"))
 
 
 def test_splats_follow_what_is_keyframed_by_hand(scene, tmp_path):
-    """Catches splats that know tracked frames only: sliders, bones and identity must move them at once."""
+    """Catches splats that know tracked frames only: sliders, bones and identity must move them at
+    once."""
     avatar = show_avatar(tmp_path, scene)
     rig, keys = rig_of(the_head()), the_head().data.shape_keys.key_blocks
     rig.animation_data.action = the_head().data.shape_keys.animation_data.action = None
@@ -241,11 +260,23 @@ def test_splats_follow_what_is_keyframed_by_hand(scene, tmp_path):
         keys["expr_001"].value, keys["identity_000"].value = 2 * amount, 3 * amount
         keys["expr_001"].keyframe_insert("value", frame=frame)
         keys["identity_000"].keyframe_insert("value", frame=frame)
-        rig.pose.bones["jaw"].rotation_quaternion = (np.cos(0.2 * amount), np.sin(0.2 * amount), 0, 0)
+        rig.pose.bones["jaw"].rotation_quaternion = (
+            np.cos(0.2 * amount),
+            np.sin(0.2 * amount),
+            0,
+            0,
+        )
         rig.pose.bones["jaw"].keyframe_insert("rotation_quaternion", frame=frame)
     bpy.context.scene.frame_set(40)
-    frame = vars(scene.own.frame(0)) | {"expr": np.array([keys["expr_000"].value, 2.0]), "rotation": np.zeros(3)}
-    frame |= {"jaw_pose": np.array([0.4, 0, 0]), "neck_pose": np.zeros(3), "translation": np.zeros(3)}
+    frame = vars(scene.own.frame(0)) | {
+        "expr": np.array([keys["expr_000"].value, 2.0]),
+        "rotation": np.zeros(3),
+    }
+    frame |= {
+        "jaw_pose": np.array([0.4, 0, 0]),
+        "neck_pose": np.zeros(3),
+        "translation": np.zeros(3),
+    }
     shape = scene.own.shape + 3 * np.eye(4)[0]
     for bone in rig.pose.bones:
         if bone.name in ("root", "neck", "left_eye", "right_eye"):
@@ -254,7 +285,8 @@ def test_splats_follow_what_is_keyframed_by_hand(scene, tmp_path):
     xyz, _, scale = evaluated_splats(bpy.context.scene.stga.splats)
     posed = to_world(avatar.splats, face_frames(expected, avatar.faces, avatar.neutral))
     np.testing.assert_allclose(xyz, posed.xyz, atol=1e-5)
-    # Canonical areas stay those of the person who was trained: another identity stretches the splats with the skin.
+    # Canonical areas stay those of the person who was trained: another identity stretches the
+    # splats with the skin.
     np.testing.assert_allclose(scale, np.exp(posed.log_scale), rtol=2e-3)
 
 
@@ -264,8 +296,12 @@ def test_exports_hold_what_plays_in_the_scene(scene, tmp_path):
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=3)
     the_head().data.shape_keys.key_blocks["identity_001"].value = 1.5
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 3, 7
-    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "plys"), format="ply-sequence") == {"FINISHED"}
-    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "plys"), format="ply-sequence") == {
+        "FINISHED"
+    }
+    assert bpy.ops.stga.export_avatar(
+        filepath=str(tmp_path / "pair"), format="gaussian-avatars"
+    ) == {"FINISHED"}
     shape = scene.own.shape + 1.5 * np.eye(4)[1]
     pair = read_motion(tmp_path / "pair/flame_param.npz", scene.own.model)
     np.testing.assert_allclose(pair.shape, shape, atol=1e-6)
@@ -273,6 +309,10 @@ def test_exports_hold_what_plays_in_the_scene(scene, tmp_path):
         theirs = FlameFrame(**scene.theirs(row))
         expected = flame_forward(scene.own.model, shape, theirs, scene.own.static_offset)
         posed = to_world(avatar.splats, face_frames(expected, avatar.faces, avatar.neutral))
-        np.testing.assert_allclose(read_ply(tmp_path / f"plys/{3 + row:05d}.ply").xyz, posed.xyz, atol=1e-5)
+        np.testing.assert_allclose(
+            read_ply(tmp_path / f"plys/{3 + row:05d}.ply").xyz, posed.xyz, atol=1e-5
+        )
         for name in ("expr", "translation", "rotation", "jaw_pose", "neck_pose", "eyes_pose"):
-            np.testing.assert_allclose(getattr(pair.frame(row), name), scene.theirs(row)[name], atol=1e-5)
+            np.testing.assert_allclose(
+                getattr(pair.frame(row), name), scene.theirs(row)[name], atol=1e-5
+            )

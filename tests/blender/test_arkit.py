@@ -1,4 +1,5 @@
-"""Face performances in Blender: Apply Motion, ARKit controls, and heads with shape keys of ARKit's names."""
+"""Face performances in Blender: Apply Motion, ARKit controls, and heads with shape keys of ARKit's
+names."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,20 +31,30 @@ RNG = np.random.default_rng(4)
 
 @pytest.fixture
 def scene(tmp_path: Path) -> SimpleNamespace:
-    """The small head of another identity, imported from its own short motion; a performance of 7 rows at 30 Hz."""
+    """The small head of another identity, imported from its own short motion; a performance of 7
+    rows at 30 Hz."""
     model = small_head(0)
     write_flame(model, tmp_path / "flame.npz")
     shape = np.linspace(-0.5, 0.5, model.n_identity)
-    np.savez(tmp_path / "own.npz", expr=RNG.normal(0, 0.3, (3, 10)), jaw_pose=np.zeros((3, 3)), shape=shape)
+    np.savez(
+        tmp_path / "own.npz",
+        expr=RNG.normal(0, 0.3, (3, 10)),
+        jaw_pose=np.zeros((3, 3)),
+        shape=shape,
+    )
     weights = RNG.random((7, 52)) * (RNG.random((7, 52)) < 0.4)
     weights[0] = 0
     head = RNG.normal(0, 0.2, (7, 3))
     write_performance(tmp_path / "take.csv", Performance(np.arange(7) / 30, weights, head, 30.0))
     bpy.context.scene.render.fps = 30
-    bpy.ops.stga.import_motion(filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz"))
+    bpy.ops.stga.import_motion(
+        filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz")
+    )
     bpy.context.scene.render.fps = 30
     own = FlameSequence(model, shape, None, (), {}.__getitem__)
-    return SimpleNamespace(own=own, map=head_map(own, "demo"), weights=weights, turns=head, take=tmp_path / "take.csv")
+    return SimpleNamespace(
+        own=own, map=head_map(own, "demo"), weights=weights, turns=head, take=tmp_path / "take.csv"
+    )
 
 
 def the_head():
@@ -56,7 +67,9 @@ def at(frame: int) -> np.ndarray:
 
 
 def expected(scene, row: int, turned: bool) -> np.ndarray:
-    take = Performance(np.zeros(1), scene.weights[row][None], scene.turns[row][None] if turned else None, 30.0)
+    take = Performance(
+        np.zeros(1), scene.weights[row][None], scene.turns[row][None] if turned else None, 30.0
+    )
     return flame_forward(scene.own.model, scene.own.shape, scene.map.frames(take)[0])
 
 
@@ -71,8 +84,8 @@ def test_apply_a_performance(scene):
 
 
 def test_controls(scene):
-    """Catches a control that moves something else than the map says, needs Python at playback, or stays behind; and a
-    neck that loses the head's rotation, or turns where it was not chosen."""
+    """Catches a control that moves something else than the map says, needs Python at playback, or
+    stays behind; and a neck that loses the head's rotation, or turns where it was not chosen."""
     before = at(1)
     assert bpy.ops.stga.add_arkit_controls() == {"FINISHED"}
     head = the_head()
@@ -81,7 +94,9 @@ def test_controls(scene):
     assert all(driver.driver.is_simple_expression and driver.driver.is_valid for driver in drivers)
     zero = np.zeros(3)
     neutral = FlameFrame(np.zeros(10), zero, zero, zero, zero, np.zeros(6))
-    np.testing.assert_allclose(at(1), flame_forward(scene.own.model, scene.own.shape, neutral), atol=TOLERANCE_M)
+    np.testing.assert_allclose(
+        at(1), flame_forward(scene.own.model, scene.own.shape, neutral), atol=TOLERANCE_M
+    )
     for row in (1, 2):
         for name in ARKIT_SHAPES:
             rig[name] = float(scene.weights[row, COLUMN[name]])
@@ -96,28 +111,38 @@ def test_controls(scene):
     np.testing.assert_allclose(at(1), before, atol=1e-7)
     bpy.ops.stga.add_arkit_controls()
     for start, place in ((10, "action"), (20, "strip")):
-        assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=start, place=place) == {"FINISHED"}
+        assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=start, place=place) == {
+            "FINISHED"
+        }
         np.testing.assert_allclose(at(start + 3), expected(scene, 3, True), atol=2 * TOLERANCE_M)
 
 
 def test_curves_come_back_from_an_action(scene, tmp_path):
-    """Catches an action whose curves, exported again, are other than the file that it was made of. The small head's ten
-    expressions cannot tell all shapes apart, so what the weights do is compared."""
+    """Catches an action whose curves, exported again, are other than the file that it was made of.
+    The small head's ten expressions cannot tell all shapes apart, so what the weights do is
+    compared."""
     weights = np.zeros((7, 52))
-    for column, name in enumerate(("jawOpen", "mouthSmileLeft", "browInnerUp", "eyeLookUpLeft", "mouthPucker")):
+    for column, name in enumerate(
+        ("jawOpen", "mouthSmileLeft", "browInnerUp", "eyeLookUpLeft", "mouthPucker")
+    ):
         weights[:, COLUMN[name]] = np.linspace(0, 0.3 + 0.1 * column, 7)
-    write_performance(tmp_path / "plain.csv", Performance(np.arange(7) / 30, weights, scene.turns, 30.0))
+    write_performance(
+        tmp_path / "plain.csv", Performance(np.arange(7) / 30, weights, scene.turns, 30.0)
+    )
     bpy.ops.stga.apply_motion(filepath=str(tmp_path / "plain.csv"), start=1)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 7
     assert bpy.ops.stga.export_performance(filepath=str(tmp_path / "back.csv")) == {"FINISHED"}
     back = read_performance(tmp_path / "back.csv")
     assert back.fps == pytest.approx(30, rel=1e-3)
-    np.testing.assert_allclose(scene.map.parameters(back.weights), scene.map.parameters(weights), atol=0.02)
+    np.testing.assert_allclose(
+        scene.map.parameters(back.weights), scene.map.parameters(weights), atol=0.02
+    )
     np.testing.assert_allclose(back.head, scene.turns, atol=1e-4)
 
 
 def test_a_head_with_shape_keys(scene, tmp_path):
-    """Catches a head of another model that has ARKit's shapes, in its own spelling, and cannot be driven."""
+    """Catches a head of another model that has ARKit's shapes, in its own spelling, and cannot be
+    driven."""
     from capture.factory import write_mesh_capture
 
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "ball")))
@@ -127,15 +152,23 @@ def test_a_head_with_shape_keys(scene, tmp_path):
         head.shape_key_add(name="Basis")
     for name in ("JawOpen", "mouthSmile_L"):
         head.shape_key_add(name=name, from_mix=False).value = 0
-    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1, strength=0.5) == {"FINISHED"}
+    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1, strength=0.5) == {
+        "FINISHED"
+    }
     bpy.context.scene.frame_set(4)
     keys = head.data.shape_keys.key_blocks
-    assert keys["JawOpen"].value == pytest.approx(0.5 * scene.weights[3, COLUMN["jawOpen"]], abs=1e-5)
-    assert keys["mouthSmile_L"].value == pytest.approx(0.5 * scene.weights[3, COLUMN["mouthSmileLeft"]], abs=1e-5)
+    assert keys["JawOpen"].value == pytest.approx(
+        0.5 * scene.weights[3, COLUMN["jawOpen"]], abs=1e-5
+    )
+    assert keys["mouthSmile_L"].value == pytest.approx(
+        0.5 * scene.weights[3, COLUMN["mouthSmileLeft"]], abs=1e-5
+    )
     gains = {"shape_gains": "jawOpen=0.25, mouthSmileLeft=0", "face_gain": 2.0}
     assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1, **gains) == {"FINISHED"}
     bpy.context.scene.frame_set(4)
-    assert keys["JawOpen"].value == pytest.approx(0.25 * scene.weights[3, COLUMN["jawOpen"]], abs=1e-5)
+    assert keys["JawOpen"].value == pytest.approx(
+        0.25 * scene.weights[3, COLUMN["jawOpen"]], abs=1e-5
+    )
     assert keys["mouthSmile_L"].value == 0
     with pytest.raises(RuntimeError, match="'jawOpne' names none of face, jaw, eyes, head"):
         bpy.ops.stga.apply_motion(filepath=str(scene.take), shape_gains="jawOpne=1")

@@ -1,4 +1,5 @@
-"""Avatar from Video: its request, the folder that it proposes, and its way from a video to splats on a head."""
+"""Avatar from Video: its request, the folder that it proposes, and its way from a video to splats
+on a head."""
 
 import sys
 from importlib import import_module
@@ -28,7 +29,9 @@ def asked(extension, monkeypatch):
     """The requests that the operator starts, which are not carried out."""
     requests: list[object] = []
     monkeypatch.setattr(
-        extension.operators.avatar_from_video, "start", lambda scene, request, python: requests.append(request)
+        extension.operators.avatar_from_video,
+        "start",
+        lambda scene, request, python: requests.append(request),
     )
     return requests
 
@@ -43,10 +46,13 @@ def begin(requests):
 def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path, monkeypatch):
     """Catches a second way to an avatar, with other settings than `stga avatar VIDEO`."""
     out = tmp_path / "out"
-    assert bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(out), minutes=0.05, focal=2308.3) == {
-        "FINISHED"
-    }
-    main, commands = (import_module(f"{extension.__name__}.stga_addon.cli.{name}") for name in ("main", "commands"))
+    assert bpy.ops.stga.avatar_from_video(
+        filepath=str(video), folder=str(out), minutes=0.05, focal=2308.3
+    ) == {"FINISHED"}
+    main, commands = (
+        import_module(f"{extension.__name__}.stga_addon.cli.{name}")
+        for name in ("main", "commands")
+    )
     made: list[object] = []
     monkeypatch.setattr(commands, "carry_out", made.append)
     options = ["--out", str(out), "--budget", "3s", "--focal", "2308.3", "--no-blend"]
@@ -55,8 +61,8 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
 
 
 def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
-    """Catches an avatar of one video continued with another or begun anew each time, and a folder far from the file
-    that shows it."""
+    """Catches an avatar of one video continued with another or begun anew each time, and a folder
+    far from the file that shows it."""
 
     def make(path: Path) -> Path:
         assert bpy.ops.stga.avatar_from_video(filepath=str(path)) == {"FINISHED"}
@@ -75,31 +81,40 @@ def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
 
 
 def test_what_was_begun_is_continued_by_its_folder(asked, video, tmp_path):
-    """Catches a Continue in the panel that asks for the video again, or continues as with other options."""
+    """Catches a Continue in the panel that asks for the video again, or continues as with other
+    options."""
     assert bpy.ops.stga.avatar_from_video(filepath=str(video), focal=900.0) == {"FINISHED"}
     begin(asked)
-    assert bpy.ops.stga.avatar_from_video("INVOKE_DEFAULT", folder=str(tmp_path / "anna avatar")) == {"FINISHED"}
+    assert bpy.ops.stga.avatar_from_video(
+        "INVOKE_DEFAULT", folder=str(tmp_path / "anna avatar")
+    ) == {"FINISHED"}
     assert asked[1] == asked[0]
 
 
 def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
-    """Catches a worker that is started for nothing, and the request of another video in a folder."""
+    """Catches a worker that is started for nothing, and the request of another video in a
+    folder."""
     with pytest.raises(RuntimeError, match=r"gone\.mp4: is not a file; expected a video"):
         bpy.ops.stga.avatar_from_video(filepath=str(tmp_path / "gone.mp4"))
     (tmp_path / "out/capture").mkdir(parents=True)
     (tmp_path / "out/inputs.json").write_text('{"footage": "/shots/ben.mp4", "model": null}')
     with pytest.raises(RuntimeError, match=r"footage: .*out began with .*ben\.mp4"):
-        bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(tmp_path / "out"), python=sys.executable)
+        bpy.ops.stga.avatar_from_video(
+            filepath=str(video), folder=str(tmp_path / "out"), python=sys.executable
+        )
 
 
 @pytest.mark.slow
 def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
-    """Catches a head or splats that do not arrive, a run that the Train panel does not continue, splats on a head that
-    is not the refined one, and a tracking that shows nothing while it runs."""
+    """Catches a head or splats that do not arrive, a run that the Train panel does not continue,
+    splats on a head that is not the refined one, and a tracking that shows nothing while it
+    runs."""
     pytest.importorskip("torch")
     video = tmp_path / "head.mp4"
     write_head_video(video, 6)
-    assert bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable) == {"FINISHED"}
+    assert bpy.ops.stga.avatar_from_video(
+        filepath=str(video), minutes=0.05, python=sys.executable
+    ) == {"FINISHED"}
     settings, out = bpy.context.scene.stga, tmp_path / "head avatar"
     assert settings.head[tags.CAPTURE] == str(out / "capture")
     assert settings.splats[tags.RUN] == settings.run_folder == str(out / "run")
@@ -110,6 +125,8 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     pixels, *_ = extension.operators.monitor.curve(out / "run")
     assert pixels.shape == (256, 256, 4)
     # Again: nothing is left to do but to show it
-    assert bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable) == {"FINISHED"}
+    assert bpy.ops.stga.avatar_from_video(
+        filepath=str(video), minutes=0.05, python=sys.executable
+    ) == {"FINISHED"}
     heads = [thing for thing in bpy.data.objects if thing.get(tags.KIND) == tags.HEAD]
     assert heads == [settings.head]

@@ -25,13 +25,19 @@ def add_camera(name, position, **values):
     camera = bpy.data.objects.new(name, data)
     bpy.context.collection.objects.link(camera)
     camera.rotation_mode = "QUATERNION"
-    camera.matrix_world = Matrix.Translation(position) @ Vector(position).to_track_quat("Z", "Y").to_matrix().to_4x4()
+    camera.matrix_world = (
+        Matrix.Translation(position) @ Vector(position).to_track_quat("Z", "Y").to_matrix().to_4x4()
+    )
     return camera
 
 
 def scene_with_cameras():
     render = bpy.context.scene.render
-    render.resolution_x, render.resolution_y, render.resolution_percentage = 2 * WIDTH, 2 * HEIGHT, 50
+    render.resolution_x, render.resolution_y, render.resolution_percentage = (
+        2 * WIDTH,
+        2 * HEIGHT,
+        50,
+    )
     add_camera("left", (-1, -1, 0.3), lens=45, shift_x=0.1, shift_y=-0.05)
     add_camera("Camera.001", (0.2, -1.4, 0), lens=60, sensor_fit="VERTICAL", sensor_height=20)
     parent = bpy.data.objects.new("rail", None)
@@ -42,7 +48,8 @@ def scene_with_cameras():
 
 
 def test_points_project_as_in_blender(tmp_path):
-    """Catches lens shift, sensor fit, resolution percentage or a scaled parent lost on the way to the footage."""
+    """Catches lens shift, sensor fit, resolution percentage or a scaled parent lost on the way to
+    the footage."""
     scene_with_cameras()
     assert bpy.ops.stga.export_cameras(filepath=str(tmp_path / "transforms.json")) == {"FINISHED"}
     for name in ("left", "Camera.001", "on rail"):
@@ -56,8 +63,12 @@ def test_points_project_as_in_blender(tmp_path):
     assert footage.keeps_world
     points = np.random.default_rng(2).normal(0, 0.1, (12, 3))
     for camera in footage.cameras:
-        pixels, depths = camera.camera.project(points[:, [0, 2, 1]] * [1, 1, -1])  # captures are y up
-        seen = [world_to_camera_view(bpy.context.scene, bpy.data.objects[camera.name], Vector(p)) for p in points]
+        # captures are y up
+        pixels, depths = camera.camera.project(points[:, [0, 2, 1]] * [1, 1, -1])
+        seen = [
+            world_to_camera_view(bpy.context.scene, bpy.data.objects[camera.name], Vector(p))
+            for p in points
+        ]
         expected = [(x * WIDTH, (1 - y) * HEIGHT) for x, y, _ in seen]
         np.testing.assert_allclose(pixels, expected, atol=2e-3, err_msg=camera.name)
         np.testing.assert_allclose(depths, [z for _, _, z in seen], atol=1e-5)
@@ -69,7 +80,9 @@ def test_selected_cameras(tmp_path):
     bpy.data.objects["left"].select_set(True)
     path = tmp_path / "cameras.json"
     bpy.ops.stga.export_cameras(filepath=str(path), selected_only=True)
-    assert [frame["camera_id"] for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]] == ["left"]
+    assert [
+        frame["camera_id"] for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]
+    ] == ["left"]
     bpy.data.objects["left"].select_set(False)
     with pytest.raises(RuntimeError, match="No cameras to export"):
         bpy.ops.stga.export_cameras(filepath=str(tmp_path / "none.json"), selected_only=True)
@@ -79,7 +92,10 @@ def test_selected_cameras(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda camera: setattr(camera, "scale", (-1, 1, 1)), "left: is mirrored by a negative scale"),
+        (
+            lambda camera: setattr(camera, "scale", (-1, 1, 1)),
+            "left: is mirrored by a negative scale",
+        ),
         (lambda camera: setattr(camera.data, "type", "ORTHO"), "left: is not a perspective camera"),
     ],
 )

@@ -23,7 +23,9 @@ from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 @pytest.fixture
 def stga(extension):
     """Run a command as Blender hands it over; returns the exit code."""
-    return lambda *arguments: extension.operators.command_line._run([str(argument) for argument in arguments])
+    return lambda *arguments: extension.operators.command_line._run(
+        [str(argument) for argument in arguments]
+    )
 
 
 @pytest.fixture
@@ -39,7 +41,12 @@ def save_and_open(path: Path) -> None:
 
 def show_avatar(path: Path, capture) -> Avatar:
     faces = ball()[1].astype(np.int32)
-    avatar = Avatar(lattice_splats(capture.neutral, faces, order=0), "stga", capture.neutral.astype(np.float32), faces)
+    avatar = Avatar(
+        lattice_splats(capture.neutral, faces, order=0),
+        "stga",
+        capture.neutral.astype(np.float32),
+        faces,
+    )
     write_avatar(path, avatar)
     bpy.ops.stga.show_avatar(filepath=str(path))
     return avatar
@@ -55,7 +62,8 @@ def test_without_a_head_everything_is_named(stga, folder, capsys):
 
 
 def test_the_open_head_stands_in_for_the_capture(stga, folder, tmp_path, capfd):
-    """Catches a command that works on nothing, or on the open head although another capture is named."""
+    """Catches a command that works on nothing, or on the open head although another capture is
+    named."""
     bpy.ops.stga.import_capture(directory=str(folder))
     save_and_open(tmp_path / "head.blend")
     assert stga("select", "--threshold", 0.0005) == 0
@@ -81,10 +89,19 @@ def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
     keys.key_blocks["expr_001"].value = 4.0
     save_and_open(tmp_path / "head.blend")
     assert stga("export", "--format", "ply-sequence", "--out", tmp_path / "plys") == 0
-    assert stga("export", tmp_path / "a.npz", "--format", "gaussian-avatars", "--out", tmp_path / "pair") == 0
-    assert sorted(path.name for path in (tmp_path / "plys").glob("*.ply")) == [f"{t:05d}.ply" for t in range(4)]
+    assert (
+        stga(
+            "export", tmp_path / "a.npz", "--format", "gaussian-avatars", "--out", tmp_path / "pair"
+        )
+        == 0
+    )
+    assert sorted(path.name for path in (tmp_path / "plys").glob("*.ply")) == [
+        f"{t:05d}.ply" for t in range(4)
+    ]
     bpy.context.scene.frame_set(2)  # not among the tracked timesteps
-    frames = face_frames(evaluated_vertices(bpy.context.scene.stga.head), avatar.faces, avatar.neutral)
+    frames = face_frames(
+        evaluated_vertices(bpy.context.scene.stga.head), avatar.faces, avatar.neutral
+    )
     expected = to_world(avatar.splats, frames).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
     with np.load(tmp_path / "pair/flame_param.npz") as pair:
@@ -102,7 +119,8 @@ def here(extension):
 
 @pytest.mark.slow
 def test_render_of_the_open_head(stga, here, tmp_path):
-    """Catches a render verb that cannot find avatar or capture in the file, or draws another motion."""
+    """Catches a render verb that cannot find avatar or capture in the file, or draws another
+    motion."""
     pytest.importorskip("numba")
     folder, model = write_flame_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
@@ -117,7 +135,8 @@ def test_render_of_the_open_head(stga, here, tmp_path):
     assert stga("render", tmp_path / "a.npz", "--capture", folder, "--flame", model, "--cameras", cameras,
                 "--out", tmp_path / "tracked") == 0  # fmt: skip
     pictures, there, tracked = (
-        [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))] for name in ("here", "there", "tracked")
+        [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))]
+        for name in ("here", "there", "tracked")
     )
     assert len(pictures) == 2
     assert pictures == there
@@ -126,31 +145,48 @@ def test_render_of_the_open_head(stga, here, tmp_path):
 
 def test_missing_training_python(stga, extension, folder, monkeypatch, capsys):
     """Catches a traceback, or success, where nothing can train."""
-    monkeypatch.setattr(extension.stga_addon.worker.training_python, "missing_packages", lambda: ["torch"])
+    monkeypatch.setattr(
+        extension.stga_addon.worker.training_python, "missing_packages", lambda: ["torch"]
+    )
     assert stga("train", folder, "--out", folder / "run") == 2
-    assert "Install the complete edition of the add-on, or choose a Python" in capsys.readouterr().err
+    assert (
+        "Install the complete edition of the add-on, or choose a Python" in capsys.readouterr().err
+    )
     bpy.ops.stga.import_capture(directory=str(folder))
     assert stga("select") == 0  # needs none
 
 
 @pytest.mark.parametrize("command", ["train", "track", "avatar"])
 def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monkeypatch, command):
-    """Catches a command in Blender's own Python, which can train but perhaps not track, although another was chosen."""
+    """Catches a command in Blender's own Python, which can train but perhaps not track, although
+    another was chosen."""
     chosen = tmp_path / "python"
     chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
     chosen.chmod(0o755)
     monkeypatch.setenv(extension.stga_addon.worker.training_python.PYTHON_VARIABLE, str(chosen))
-    arguments = [command, "FOOTAGE", *([] if command == "train" else ["--model", "HEAD"]), "--out", "OUT"]
+    arguments = [
+        command,
+        "FOOTAGE",
+        *([] if command == "train" else ["--model", "HEAD"]),
+        "--out",
+        "OUT",
+    ]
     more = ["--iterations", "2"] if command != "track" else []
     assert stga(*arguments, *more) == 7
-    expected = ["-m", "stga_addon", *arguments, *more, *(["--no-blend"] if command == "avatar" else [])]
+    expected = [
+        "-m",
+        "stga_addon",
+        *arguments,
+        *more,
+        *(["--no-blend"] if command == "avatar" else []),
+    ]
     assert (tmp_path / "asked").read_text().split() == expected
 
 
 @pytest.mark.slow
 def test_training_is_the_panels(stga, here, folder, tmp_path):
-    """Catches a headless run, or a worker of the panel's, that ignores painted groups or settings: with the same seed,
-    all give the same numbers."""
+    """Catches a headless run, or a worker of the panel's, that ignores painted groups or settings:
+    with the same seed, all give the same numbers."""
     pytest.importorskip("torch")
     bpy.ops.stga.import_capture(directory=str(folder))
     bpy.ops.stga.select(threshold=0.0005)
@@ -161,7 +197,9 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
     save_and_open(tmp_path / "head.blend")
     options = {"iterations": 8, "strategy": "selective", "seed": 3}
     by_worker = {"wait": True, "python": sys.executable}
-    assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options) == {"FINISHED"}
+    assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options) == {
+        "FINISHED"
+    }
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
     assert here("train", "--out", tmp_path / "headless", *arguments) == 0
     assert stga("train", "--out", tmp_path / "delegated", *arguments) == 0
@@ -177,8 +215,12 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
 
 
 def test_a_farms_python_comes_first(extension, monkeypatch):
-    """Catches a farm's variable that Blender ignores, or that overrules the Python an operator was given."""
-    operators, worker = extension.operators.training_python, extension.stga_addon.worker.training_python
+    """Catches a farm's variable that Blender ignores, or that overrules the Python an operator was
+    given."""
+    operators, worker = (
+        extension.operators.training_python,
+        extension.stga_addon.worker.training_python,
+    )
     monkeypatch.setenv(worker.PYTHON_VARIABLE, "/farm/python")
     assert operators.training_python(bpy.context) == "/farm/python"
     assert operators.training_python(bpy.context, "/given/python") == "/given/python"
@@ -186,7 +228,8 @@ def test_a_farms_python_comes_first(extension, monkeypatch):
 
 @pytest.mark.slow
 def test_an_avatar_from_footage(stga, take, tmp_path, capfd):
-    """Catches a .blend file that is missing because the Python that trains has no Blender, or one without links."""
+    """Catches a .blend file that is missing because the Python that trains has no Blender, or one
+    without links."""
     given = [take / "footage", "--model", take / "head.npz", "--landmarks", take / "points"]
     more = ["--iterations", "4", "--effect", "tracking=on"]
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0

@@ -1,4 +1,5 @@
-"""The complete edition in a Blender whose Python has nothing but numpy, without a network: it tracks and trains."""
+"""The complete edition in a Blender whose Python has nothing but numpy, without a network: it
+tracks and trains."""
 
 import json
 import os
@@ -75,19 +76,26 @@ print("RESULT " + json.dumps(result))
 
 @pytest.fixture(scope="module")
 def target() -> Target:
-    return Target(this_platform(), f"{sys.version_info[0]}.{sys.version_info[1]}", ("4.2.0", "5.1.0"))
+    return Target(
+        this_platform(), f"{sys.version_info[0]}.{sys.version_info[1]}", ("4.2.0", "5.1.0")
+    )
 
 
 @pytest.fixture(scope="module")
 def archive(
-    target: Target, demo: Path, kernel_bundle: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory
+    target: Target,
+    demo: Path,
+    kernel_bundle: tuple[Path, str],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
     try:
         check_wheels(collect_wheels(wheel_folder(target), target), target)
     except StgaError as error:
         pytest.skip(f"wheels not present and not downloadable: {error}")
     kernels = sorted(kernel_bundle[0].glob("*/*"))
-    return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo, kernels=kernels)
+    return build_zip(
+        tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo, kernels=kernels
+    )
 
 
 def bare_python(folder: Path) -> Path:
@@ -103,14 +111,30 @@ def bare_python(folder: Path) -> Path:
 
 @pytest.mark.slow
 def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> None:
-    """Catches a missing wheel, a worker that needs another Python or a network, and files that uninstalling leaves."""
+    """Catches a missing wheel, a worker that needs another Python or a network, and files that
+    uninstalling leaves."""
     python, video = bare_python(tmp_path / "bare"), tmp_path / "head.mp4"
     write_head_video(video, 6)
     offline = OFFLINE if subprocess.run([*OFFLINE, "true"], check=False).returncode == 0 else []
     profile = {"BLENDER_USER_RESOURCES": str(tmp_path / "profile"), "HOME": str(tmp_path)}
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "NUMBA_"))}
-    command = [*offline, str(python), "-c", SCRIPT, str(archive), str(tmp_path), str(ITERATIONS), str(video)]
-    done = subprocess.run(command, cwd=tmp_path, env=kept | profile, capture_output=True, text=True, check=False)
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "NUMBA_"))
+    }
+    command = [
+        *offline,
+        str(python),
+        "-c",
+        SCRIPT,
+        str(archive),
+        str(tmp_path),
+        str(ITERATIONS),
+        str(video),
+    ]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=kept | profile, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))
     result = json.loads(line.removeprefix("RESULT "))
@@ -128,12 +152,15 @@ def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> N
     assert (tmp_path / "avatar/avatar.blend").is_file()
     settings = make_settings("global", iterations=ITERATIONS, effects={})  # as the operator
     perform(Train(tmp_path / "here", demo, settings), ignore, print)
-    found, expected = (read_metrics(run)[-1]["psnr"] for run in (Path(result["run"]), tmp_path / "here"))
+    found, expected = (
+        read_metrics(run)[-1]["psnr"] for run in (Path(result["run"]), tmp_path / "here")
+    )
     assert abs(found - expected) < MAX_DIFFERENCE_DB
 
 
 def test_bundled_wheels_are_unmodified(archive: Path, target: Target) -> None:
-    """Catches a wheel that the build changes, and a zip whose manifest names others than it holds."""
+    """Catches a wheel that the build changes, and a zip whose manifest names others than it
+    holds."""
     with zipfile.ZipFile(archive) as made:
         names = {name for name in made.namelist() if name.startswith("wheels/")}
         for name in names:

@@ -1,4 +1,5 @@
-"""Refine and Extend from Blender: what is painted or selected reaches the worker, and the preview stays in place."""
+"""Refine and Extend from Blender: what is painted or selected reaches the worker, and the preview
+stays in place."""
 
 import tempfile
 
@@ -46,9 +47,12 @@ def run(tmp_path):
 
 
 def test_painted_group_becomes_the_region(head, asked, run):
-    """Catches a region of other triangles than those painted, and settings of the panel that are lost."""
+    """Catches a region of other triangles than those painted, and settings of the panel that are
+    lost."""
     chosen = {"device": "gpu", "adapter": "Card (Vulkan)", "seconds": 7, "growth": 0.5}
-    assert bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, **chosen) == {"FINISHED"}
+    assert bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, **chosen) == {
+        "FINISHED"
+    }
     new = run.with_name("run_2")
     (wanted,) = asked
     assert (wanted.run, wanted.parent, wanted.device) == (new, run, "gpu:Card (Vulkan)")
@@ -60,7 +64,8 @@ def test_painted_group_becomes_the_region(head, asked, run):
 
 
 def test_faces_selected_in_edit_mode_become_the_region(head, asked, run):
-    """Catches a selection as it was before Edit Mode, and a vertex group used although faces are selected."""
+    """Catches a selection as it was before Edit Mode, and a vertex group used although faces are
+    selected."""
     head.hide_set(False)
     bpy.context.view_layer.objects.active = head
     for polygon in head.data.polygons:
@@ -86,8 +91,16 @@ def test_mistakes_are_sentences(head, asked, run, tmp_path):
     """Catches tracebacks, and folders begun for what cannot be trained."""
     for operator, arguments, sentence in (
         (bpy.ops.stga.refine, {"group": "chin"}, "has no vertex group 'chin'"),
-        (bpy.ops.stga.refine, {"group": "faint"}, "no triangle has all its corners in the vertex group 'faint'"),
-        (bpy.ops.stga.refine, {"directory": str(tmp_path / "none"), "group": "cheek"}, "holds no trained avatar"),
+        (
+            bpy.ops.stga.refine,
+            {"group": "faint"},
+            "no triangle has all its corners in the vertex group 'faint'",
+        ),
+        (
+            bpy.ops.stga.refine,
+            {"directory": str(tmp_path / "none"), "group": "cheek"},
+            "holds no trained avatar",
+        ),
         (bpy.ops.stga.extend, {"take": str(tmp_path / "none")}, "is not a folder"),
         (bpy.ops.stga.extend, {"take": ""}, "take: no path given"),
     ):
@@ -97,7 +110,8 @@ def test_mistakes_are_sentences(head, asked, run, tmp_path):
 
 
 def test_residuals_are_shown_on_the_head(head, run, extension):
-    """Catches a heat map of other triangles than those with the error, and unknown ones that are shown as bad."""
+    """Catches a heat map of other triangles than those with the error, and unknown ones that are
+    shown as bad."""
     residual = np.full(len(head.data.polygons), 0.01, np.float32)
     residual[7], residual[9] = 0.2, np.nan
     extension.stga_addon.training.run.folder.write_residuals(run, residual)
@@ -105,7 +119,9 @@ def test_residuals_are_shown_on_the_head(head, run, extension):
     shown = np.array([item.value for item in head.data.attributes["stga_residual"].data])
     assert shown.argmax() == 7
     assert shown[9] == 0
-    red = np.array([item.color[0] for item in head.data.attributes["stga_heat"].data]).reshape(-1, 3)
+    red = np.array([item.color[0] for item in head.data.attributes["stga_heat"].data]).reshape(
+        -1, 3
+    )
     assert red[7] == pytest.approx(0.9, abs=0.01)
     assert bpy.ops.stga.heat_map(show=False) == {"FINISHED"}
     assert not {"stga_residual", "stga_heat"} & set(head.data.attributes.keys())
@@ -123,11 +139,14 @@ def answer(extension, tmp_path, selection) -> str:
 
 
 def test_what_an_extension_would_train_is_selected(head, run, extension, monkeypatch, tmp_path):
-    """Catches a selection of other frames or triangles than the worker found, and a failure that shows nowhere."""
+    """Catches a selection of other frames or triangles than the worker found, and a failure that
+    shows nowhere."""
     selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
     selection[3] = ~selection[3]
     program = write_interpreter(tmp_path / "python", answer(extension, tmp_path, selection))
-    monkeypatch.setattr(extension.operators.select_extension, "training_python", lambda context: program)
+    monkeypatch.setattr(
+        extension.operators.select_extension, "training_python", lambda context: program
+    )
     settings = bpy.context.scene.stga
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     shown = extension.stga_addon.scene.vertex_groups.read_selection(head)
@@ -142,8 +161,11 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, monkeyp
     assert error_of(extension, Kind.SELECTION) == "no such run"
 
 
-def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, extension, monkeypatch, tmp_path):
-    """Catches a selection written to the head imported meanwhile, and files that a cancelled command leaves."""
+def test_selection_of_another_head_or_cancelled_changes_nothing(
+    head, run, extension, monkeypatch, tmp_path
+):
+    """Catches a selection written to the head imported meanwhile, and files that a cancelled
+    command leaves."""
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -151,7 +173,9 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, exten
     wait = f"while not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
     program = write_interpreter(tmp_path / "python", wait + given)
     settings = bpy.context.scene.stga
-    monkeypatch.setattr(extension.operators.select_extension, "training_python", lambda context: program)
+    monkeypatch.setattr(
+        extension.operators.select_extension, "training_python", lambda context: program
+    )
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     assert any(temporary.iterdir())
@@ -169,15 +193,20 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(head, run, exten
 
 
 def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypatch, tmp_path):
-    """Catches a result lost because the head is edited, a failure held back, and an old error beside a new command."""
+    """Catches a result lost because the head is edited, a failure held back, and an old error
+    beside a new command."""
     given = answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)})
     program = write_interpreter(tmp_path / "python", given)
     monitor = extension.operators.monitor
-    monkeypatch.setattr(extension.operators.select_extension, "training_python", lambda context: program)
+    monkeypatch.setattr(
+        extension.operators.select_extension, "training_python", lambda context: program
+    )
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
-    monitor._states[bpy.context.scene.session_uid, Kind.SELECTION] = RequestState(Kind.SELECTION, error="of last time")
+    monitor._states[bpy.context.scene.session_uid, Kind.SELECTION] = RequestState(
+        Kind.SELECTION, error="of last time"
+    )
     assert bpy.ops.stga.select_extension(directory=str(run)) == {"FINISHED"}
     assert error_of(extension, Kind.SELECTION) == ""
     state = monitor.state_of(bpy.context.scene, Kind.SELECTION)
@@ -199,18 +228,23 @@ def test_selection_waits_for_the_end_of_edit_mode(head, run, extension, monkeypa
 
 @pytest.mark.slow
 def test_refine_and_extend_end_to_end(head, tmp_path):
-    """Catches a job that the worker does not understand, and an avatar that is not that of the continued run."""
+    """Catches a job that the worker does not understand, and an avatar that is not that of the
+    continued run."""
     pytest.importorskip("torch")
     run = tmp_path / "run"
     assert bpy.ops.stga.train(directory=str(run), iterations=6, device="cpu") == {"FINISHED"}
     assert bpy.ops.stga.refine(directory=str(run), group="cheek", iterations=4) == {"FINISHED"}
-    before, after = (read_avatar(tmp_path / name / "avatar.npz").splats for name in ("run", "run_2"))
+    before, after = (
+        read_avatar(tmp_path / name / "avatar.npz").splats for name in ("run", "run_2")
+    )
     same = (before.sh == after.sh).all((1, 2))
     assert not same.all()
     assert same[before.face >= 80].all()
     take = write_mesh_capture(tmp_path / "take")
     bpy.ops.stga.import_capture(directory=str(take))
     assert bpy.ops.stga.select_extension(directory=str(tmp_path / "run_2")) == {"FINISHED"}
-    assert bpy.ops.stga.extend(directory=str(tmp_path / "run_2"), take=str(take), iterations=4) == {"FINISHED"}
+    assert bpy.ops.stga.extend(directory=str(tmp_path / "run_2"), take=str(take), iterations=4) == {
+        "FINISHED"
+    }
     assert len(read_run(tmp_path / "run_3").takes) == 1
     assert bpy.context.scene.stga.avatar == str(tmp_path / "run_3" / "avatar.npz")

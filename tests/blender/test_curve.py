@@ -26,12 +26,15 @@ def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
 
 
 def test_curve_agrees_with_its_axes():
-    """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not after the curve."""
+    """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not
+    after the curve."""
     pixels, axes, detail = curve_image(lines())
     assert detail == ""
     low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
     inner = SIZE - 2 * MARGIN
-    for second, color in [(second, CURVE_COLOR) for second in (15, 30, 50, 75)] + [(90, FORECAST_COLOR)]:
+    for second, color in [(second, CURVE_COLOR) for second in (15, 30, 50, 75)] + [
+        (90, FORECAST_COLOR)
+    ]:
         column = int(MARGIN + second / 100 * inner)
         at = (column + 0.5 - MARGIN) / inner * 100
         like = np.abs(pixels[:, column, :3] - np.array(color)).sum(-1)
@@ -51,10 +54,16 @@ def test_short_and_constant_curves():
 
 
 def test_detail_difference_is_drawn_with_the_best_at_the_top():
-    """Catches the measure by which the avatar is kept left out, upside down, or with another range than its text."""
-    measured = [{**line, "detail_difference": 0.08 - 0.01 * row} for row, line in enumerate(lines(forecast=False))]
+    """Catches the measure by which the avatar is kept left out, upside down, or with another range
+    than its text."""
+    measured = [
+        {**line, "detail_difference": 0.08 - 0.01 * row}
+        for row, line in enumerate(lines(forecast=False))
+    ]
     pixels, _, text = curve_image(measured)
-    worst, best = map(float, re.fullmatch(r"Detail difference (\S+) to (\S+) \(green\)", text).groups())
+    worst, best = map(
+        float, re.fullmatch(r"Detail difference (\S+) to (\S+) \(green\)", text).groups()
+    )
     assert (worst, best) == (0.072, 0.03)  # a tenth of the time is 8 s
     rows, columns = np.nonzero(np.abs(pixels[..., :3] - np.array(DETAIL_COLOR)).sum(-1) < 0.05)
     assert rows[columns > columns.max() - 5].mean() > rows[columns < columns.mean()].mean() + 30
@@ -62,17 +71,20 @@ def test_detail_difference_is_drawn_with_the_best_at_the_top():
 
 
 def test_preview_follows_the_evaluations(extension, tmp_path):
-    """Catches an image that is not updated, one of an empty curve, a panel that fails on a damaged file, and images
-    that are saved in the .blend file."""
+    """Catches an image that is not updated, one of an empty curve, a panel that fails on a damaged
+    file, and images that are saved in the .blend file."""
     bpy = pytest.importorskip("bpy")
     curve, monitor = extension.ui.curve, extension.operators.monitor
     drawn = []
     layout = SimpleNamespace(
-        column=lambda **_: SimpleNamespace(template_icon=lambda *_, **__: None, label=lambda text: drawn.append(text))
+        column=lambda **_: SimpleNamespace(
+            template_icon=lambda *_, **__: None, label=lambda text: drawn.append(text)
+        )
     )
 
     def draw() -> list[str]:
-        """Read the run's evaluations as the training monitor does, and draw; the texts below the picture."""
+        """Read the run's evaluations as the training monitor does, and draw; the texts below the
+        picture."""
         drawn.clear()
         monitor._curves[tmp_path] = monitor._read_curve(tmp_path)
         curve.draw_curve(layout, tmp_path)
@@ -87,6 +99,8 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     assert [len(texts) for texts in seen] == [0, 1, 1]
     painted = np.array(curve._previews[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
     np.testing.assert_allclose(painted, curve_image(lines())[0], atol=1 / 255)
-    file.write_text('{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n')
+    file.write_text(
+        '{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n'
+    )
     assert draw() == []
     assert len(bpy.data.images) == 0

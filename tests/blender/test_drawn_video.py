@@ -38,7 +38,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch, video: DrawnVideo, shades: list[float
 
 @pytest.mark.slow
 def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
-    """Catches a view transform, an order, a size or a rate of the encoded video that is not that of the images."""
+    """Catches a view transform, an order, a size or a rate of the encoded video that is not that of
+    the images."""
     scenes = len(bpy.data.scenes)
     (tmp_path / "drawn").mkdir()
     video = DrawnVideo(tmp_path / "drawn", tmp_path / "out.mp4", None)
@@ -48,7 +49,10 @@ def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
     with av.open(str(tmp_path / "out.mp4")) as container:
         stream = container.streams.video[0]
         assert float(stream.average_rate) == pytest.approx(24.0)
-        means = [frame.to_ndarray(format="rgb24")[8:40, 8:56].mean() / 255 for frame in container.decode(stream)]
+        means = [
+            frame.to_ndarray(format="rgb24")[8:40, 8:56].mean() / 255
+            for frame in container.decode(stream)
+        ]
         assert (stream.width, stream.height) == (64, 48)
     np.testing.assert_allclose(means, shades, atol=0.03)
     assert len(bpy.data.scenes) == scenes

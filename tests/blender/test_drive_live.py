@@ -1,4 +1,5 @@
-"""Driving a head live in Blender: what a source sends on the head, and what stays when it is stopped."""
+"""Driving a head live in Blender: what a source sends on the head, and what stays when it is
+stopped."""
 
 import gc
 import socket
@@ -36,7 +37,9 @@ def live(tmp_path: Path, extension) -> SimpleNamespace:
     rng = np.random.default_rng(4)
     jaw = np.linspace([0, 0, 0], [0.2, 0, 0], 5)
     np.savez(tmp_path / "own.npz", expr=rng.normal(0, 0.3, (5, 10)), jaw_pose=jaw, shape=shape)
-    bpy.ops.stga.import_motion(filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz"))
+    bpy.ops.stga.import_motion(
+        filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz")
+    )
     settings = bpy.context.scene.stga.drive
     settings.port, settings.takes = free_port(), str(tmp_path / "takes")
     own = FlameSequence(model, shape, None, (), {}.__getitem__)
@@ -89,14 +92,17 @@ def half(seed: int) -> dict[str, float]:
 
 
 def test_the_head_follows_and_comes_back(live):
-    """Catches a pose that is another than a file's, keyframes that nobody asked for, and a head that stays posed."""
+    """Catches a pose that is another than a file's, keyframes that nobody asked for, and a head
+    that stays posed."""
     bpy.context.scene.frame_set(1)
     before, actions = mesh(), sorted(bpy.data.actions.keys())
     assert bpy.ops.stga.drive_live() == {"FINISHED"}
     for number in range(3):
         weights = half(number)
         assert 0 < live.send(weights, number, head=(0.1, 0.2, -0.1)) <= 1 / 60
-        np.testing.assert_allclose(mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M)
+        np.testing.assert_allclose(
+            mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M
+        )
     bpy.context.scene.frame_set(2)  # its own animation does not come between two packets
     np.testing.assert_allclose(mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M)
     bpy.context.scene.frame_set(1)
@@ -108,7 +114,8 @@ def test_the_head_follows_and_comes_back(live):
 
 
 def test_a_rendered_animation_keeps_its_own_pose(live):
-    """Catches an animation rendered while the head is driven, each frame of which shows the last live pose."""
+    """Catches an animation rendered while the head is driven, each frame of which shows the last
+    live pose."""
     rendered = {}
 
     class Recorder(bpy.types.RenderEngine):
@@ -152,7 +159,8 @@ def test_controls_follow(live):
 
 
 def test_record_with_a_calibrated_face(live):
-    """Catches a take that is not what the head did, has the resting face in it, or is not kept as a file."""
+    """Catches a take that is not what the head did, has the resting face in it, or is not kept as a
+    file."""
     bpy.ops.stga.drive_live()
     live.send({"jawOpen": 0.2}, 0)
     bpy.ops.stga.calibrate_live()
@@ -174,7 +182,9 @@ def test_record_with_a_calibrated_face(live):
     np.testing.assert_allclose(mesh(), shown, atol=TOLERANCE_M)
     bpy.context.scene.frame_set(10)  # at rest, as the head itself was recorded
     quiet = exchanged_neutral(live.map.frames(take), None, quiet_neutral(live.frames))[0]
-    np.testing.assert_allclose(mesh(), flame_forward(live.own.model, live.own.shape, quiet), atol=TOLERANCE_M)
+    np.testing.assert_allclose(
+        mesh(), flame_forward(live.own.model, live.own.shape, quiet), atol=TOLERANCE_M
+    )
 
 
 def test_stopped_in_the_middle_of_a_recording(live):
@@ -188,7 +198,8 @@ def test_stopped_in_the_middle_of_a_recording(live):
 
 
 def test_the_trained_range(live):
-    """Catches a meter that says inside where nobody trained, and a live pose that is not led back."""
+    """Catches a meter that says inside where nobody trained, and a live pose that is not led
+    back."""
     bpy.context.scene.frame_set(2)
     bpy.ops.stga.measure_range()
     from stga_addon.scene.rig.motion import outside_now, stored_range

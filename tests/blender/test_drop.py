@@ -1,4 +1,5 @@
-"""Files dropped into the viewport: which operator a handler calls, and what that makes of the file."""
+"""Files dropped into the viewport: which operator a handler calls, and what that makes of the
+file."""
 
 import numpy as np
 import pytest
@@ -30,7 +31,8 @@ def head(tmp_path):
 
 @pytest.mark.parametrize("name", HANDLERS)
 def test_handlers_call_operators_that_take_a_file(name):
-    """Catches a handler whose operator does not exist, or has no property for the path that Blender passes."""
+    """Catches a handler whose operator does not exist, or has no property for the path that Blender
+    passes."""
     handler = getattr(bpy.types, name)
     extensions, operator = HANDLERS[name]
     assert (handler.bl_file_extensions, handler.bl_import_operator) == (extensions, operator)
@@ -58,12 +60,15 @@ def test_transforms_file_stands_for_its_capture(tmp_path):
         (folder / name).write_text("{}")
         with pytest.raises(RuntimeError, match=rf"{name}: is not a transforms file; choose"):
             bpy.ops.stga.import_capture(filepath=str(folder / name))
-    assert bpy.ops.stga.import_capture(filepath=str(folder / "transforms_train.json")) == {"FINISHED"}
+    assert bpy.ops.stga.import_capture(filepath=str(folder / "transforms_train.json")) == {
+        "FINISHED"
+    }
     assert bpy.context.scene.stga.head["stga_capture"] == str(folder)
 
 
 def test_avatar_is_shown(head, tmp_path):
-    """Catches an avatar that is taken for a motion: both are .npz files with an array `rotation`."""
+    """Catches an avatar that is taken for a motion: both are .npz files with an array
+    `rotation`."""
     assert bpy.ops.stga.open_npz(filepath=str(ball_avatar(tmp_path / "a.npz"))) == {"FINISHED"}
     assert bpy.context.scene.stga.splats is not None
 
@@ -77,7 +82,8 @@ def test_motion_is_applied_to_the_head(head, tmp_path):
 
 
 def test_motion_without_a_head_needs_a_model(tmp_path):
-    """Catches a motion that cannot be dropped into an empty scene, and a traceback where the model is missing."""
+    """Catches a motion that cannot be dropped into an empty scene, and a traceback where the model
+    is missing."""
     with pytest.raises(RuntimeError, match=r"^Error: .*smile\.npz: .* choose your FLAME model"):
         bpy.ops.stga.open_npz(filepath=str(write_motion(tmp_path / "smile.npz")))
 
@@ -89,7 +95,8 @@ def test_avatar_without_a_head_is_a_sentence(tmp_path):
 
 
 def test_other_files_are_refused(tmp_path):
-    """Catches a traceback, or an error about FLAME, for a file that is neither avatar nor motion."""
+    """Catches a traceback, or an error about FLAME, for a file that is neither avatar nor
+    motion."""
     np.savez(tmp_path / "other.npz", values=np.zeros(3))
     (tmp_path / "noise.npz").write_bytes(b"no archive")
     for name, sentence in (

@@ -12,7 +12,8 @@ pytest.importorskip("bpy")
 
 ROOT = Path(__file__).resolve().parents[2]
 MAX_ENABLE_WORK = 20
-"""Processor time of enabling, by that of compiling a module of the standard library in the same process."""
+"""Processor time of enabling, by that of compiling a module of the standard library in the same
+process."""
 ENABLE = """
 import importlib.util, inspect, json, sys, time
 import bpy, numpy, bpy_extras.io_utils
@@ -46,19 +47,24 @@ print("RESULT " + json.dumps([took / reference, panels]))
 
 
 def test_enabling_needs_numpy_alone_and_no_time(tmp_path: Path) -> None:
-    """Catches an import that a plain Blender cannot satisfy, and one that makes every start of Blender slower.
+    """Catches an import that a plain Blender cannot satisfy, and one that makes every start of
+    Blender slower.
 
-    The time is that of the processor, and compared with other work of the same process: a busy or slow machine does
-    not count. The first start compiles bytecode.
+    The time is that of the processor, and compared with other work of the same process: a busy or
+    slow machine does not count. The first start compiles bytecode.
     """
-    variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    variables = {
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    }
     variables["PYTHONPYCACHEPREFIX"] = str(tmp_path)
     share = float("inf")
     for _ in range(3):
         if share < MAX_ENABLE_WORK:
             break
         command = [sys.executable, "-c", ENABLE, str(ROOT)]
-        done = subprocess.run(command, env=variables, capture_output=True, text=True, cwd=ROOT / "tests")
+        done = subprocess.run(
+            command, env=variables, capture_output=True, text=True, cwd=ROOT / "tests"
+        )
         line = next((line for line in done.stdout.splitlines() if line.startswith("RESULT ")), None)
         assert line is not None, done.stderr[-2000:]
         share, panels = json.loads(line.removeprefix("RESULT "))

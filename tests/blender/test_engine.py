@@ -39,7 +39,8 @@ TOLERANCE = 1 / 255
 
 @pytest.fixture(autouse=True)
 def _engine(empty_scene):
-    # The extension that other tests enable has an engine of this name, too: only one can be registered.
+    # The extension that other tests enable has an engine of this name, too: only one can be
+    # registered.
     other = bpy.types.RenderEngine.bl_rna_get_subclass_py(engine.ENGINE, None)
     if other is not None:
         bpy.utils.unregister_class(other)
@@ -92,7 +93,11 @@ def multilayer(settings: object) -> None:
     """Choose files that hold all passes in float."""
     if hasattr(settings, "media_type"):
         settings.media_type = "MULTI_LAYER_IMAGE"
-    settings.file_format, settings.color_depth, settings.exr_codec = "OPEN_EXR_MULTILAYER", "32", "NONE"
+    settings.file_format, settings.color_depth, settings.exr_codec = (
+        "OPEN_EXR_MULTILAYER",
+        "32",
+        "NONE",
+    )
 
 
 def render(folder: Path) -> dict[str, np.ndarray]:
@@ -101,26 +106,48 @@ def render(folder: Path) -> dict[str, np.ndarray]:
     bpy.context.scene.render.filepath = str(folder / "image.exr")
     bpy.ops.render.render(write_still=True)
     passes = read_exr(folder / "image.exr")
-    wanted = {"R": "Combined.R", "G": "Combined.G", "B": "Combined.B", "A": "Combined.A", "Depth": "Depth.Z"}
-    return {short: next(v for k, v in passes.items() if k.endswith(long)) for short, long in wanted.items()}
+    wanted = {
+        "R": "Combined.R",
+        "G": "Combined.G",
+        "B": "Combined.B",
+        "A": "Combined.A",
+        "Depth": "Depth.Z",
+    }
+    return {
+        short: next(v for k, v in passes.items() if k.endswith(long))
+        for short, long in wanted.items()
+    }
 
 
 def displayed(passes: dict[str, np.ndarray], background: float) -> np.ndarray:
     """(3, H, W) sRGB values of an image with alpha over a gray sRGB background."""
     alpha = passes["A"]
     straight = np.stack([passes[c] for c in "RGB"]) / np.maximum(alpha, 1e-12)
-    srgb = np.where(straight <= 0.0031308, straight * 12.92, 1.055 * np.maximum(straight, 0) ** (1 / 2.4) - 0.055)
+    srgb = np.where(
+        straight <= 0.0031308,
+        straight * 12.92,
+        1.055 * np.maximum(straight, 0) ** (1 / 2.4) - 0.055,
+    )
     return np.clip(srgb * alpha + (1 - alpha) * background, 0, 1)
 
 
-def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT, focal: float | None = None) -> Camera:
-    """The expected camera, in the space of the splats: focal length in pixels, shift in sensor widths."""
+def expected_camera(
+    camera, shown, width: int = WIDTH, height: int = HEIGHT, focal: float | None = None
+) -> Camera:
+    """The expected camera, in the space of the splats: focal length in pixels, shift in sensor
+    widths."""
     bpy.context.view_layer.update()
     data = camera.data
-    across = width if data.sensor_fit == "HORIZONTAL" or (data.sensor_fit == "AUTO" and width >= height) else height
+    across = (
+        width
+        if data.sensor_fit == "HORIZONTAL" or (data.sensor_fit == "AUTO" and width >= height)
+        else height
+    )
     sensor = data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width
     focal = data.lens / sensor * across
-    pose = np.linalg.inv(np.array(shown.matrix_world, np.float64)) @ np.array(camera.matrix_world, np.float64)
+    pose = np.linalg.inv(np.array(shown.matrix_world, np.float64)) @ np.array(
+        camera.matrix_world, np.float64
+    )
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     cx, cy = width / 2 - data.shift_x * across, height / 2 + data.shift_y * across
     return Camera(width, height, focal, focal, cx, cy, flip @ np.linalg.inv(pose))
@@ -132,13 +159,17 @@ def strained() -> Avatar:
     colors = rng.normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
     positions = rng.normal(0, 0.004, (len(avatar.faces), 3, 3)).astype(np.float32)
     splats = replace(avatar.splats, strain_color=colors)
-    return replace(avatar, splats=splats, driven_offsets={"strain_position": positions}, antialiased=True)
+    return replace(
+        avatar, splats=splats, driven_offsets={"strain_position": positions}, antialiased=True
+    )
 
 
 def moved_by_strain() -> Avatar:
     """An avatar whose splats follow strain without strain colors."""
     avatar = textured(avatar_of("gaussian_avatars"))
-    positions = np.random.default_rng(5).normal(0, 0.4, (len(avatar.faces), 3, 3)).astype(np.float32)
+    positions = (
+        np.random.default_rng(5).normal(0, 0.4, (len(avatar.faces), 3, 3)).astype(np.float32)
+    )
     return replace(avatar, driven_offsets={"strain_position": positions})
 
 
@@ -164,15 +195,18 @@ def without_filter(avatar: Avatar) -> Avatar:
     ],
 )
 def test_image_equals_render_avatar(make, background, losses, tmp_path):
-    """Catches another camera, color, order or pose than `stga render`'s, alpha that does not match the color, and parts
-    of an avatar that are lost when it is stored in Blender and read back."""
+    """Catches another camera, color, order or pose than `stga render`'s, alpha that does not match
+    the color, and parts of an avatar that are lost when it is stored in Blender and read back."""
     avatar = make()
     shown, head = show(avatar)
     camera, mesh = expected_camera(camera_at(), shown), evaluated_vertices(head)
     expected = render_avatar(avatar, mesh, camera, (background,) * 3)
     assert losses or np.abs(expected - background).max(0).mean() > 0.1, "nothing to compare"
     for lost in losses:
-        assert np.abs(expected - render_avatar(lost(avatar), mesh, camera, (background,) * 3)).max() > 2 * TOLERANCE
+        assert (
+            np.abs(expected - render_avatar(lost(avatar), mesh, camera, (background,) * 3)).max()
+            > 2 * TOLERANCE
+        )
     assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
 
 
@@ -194,7 +228,10 @@ def with_light(avatar: Avatar) -> Avatar:
     transfer, occlusion = transfer_of(avatar.neutral, avatar.faces, 32)
     radiance = uniform(np.full(3, 0.3)).astype(np.float32)
     roughness = np.zeros(len(occlusion), np.float32)
-    return replace(avatar, light=AvatarLight(radiance, transfer, occlusion, transfer @ radiance, roughness, 0.05))
+    return replace(
+        avatar,
+        light=AvatarLight(radiance, transfer, occlusion, transfer @ radiance, roughness, 0.05),
+    )
 
 
 @pytest.fixture
@@ -210,8 +247,8 @@ def lighting():
 
 @pytest.mark.parametrize("device", ["GPU", "CPU"])
 def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
-    """Catches an avatar that is not lit by the scene, from another side, or in another mode than the panel's; and one
-    as recorded of which a single bit changes because it could be lit."""
+    """Catches an avatar that is not lit by the scene, from another side, or in another mode than
+    the panel's; and one as recorded of which a single bit changes because it could be lit."""
     if device == "CPU":
         monkeypatch.setattr(engine, "has_gpu_context", lambda: False)
     avatar = textured(avatar_of("stga"))
@@ -231,8 +268,15 @@ def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
         assert np.array_equal(recorded[name], values), name
     lighting.mode, lighting.exposure = "scene", 0.5
     camera, mesh = expected_camera(camera_object, shown), evaluated_vertices(head)
-    shines = np.linalg.inv(np.array(shown.matrix_world))[:3, :3] @ np.array(sun.matrix_world)[:3, :3] @ [0, 0, -1]
-    light = Lighting(lights=(Light("sun", np.full(3, 4.0), direction=shines, angle=sun.data.angle),), exposure=0.5)
+    shines = (
+        np.linalg.inv(np.array(shown.matrix_world))[:3, :3]
+        @ np.array(sun.matrix_world)[:3, :3]
+        @ [0, 0, -1]
+    )
+    light = Lighting(
+        lights=(Light("sun", np.full(3, 4.0), direction=shines, angle=sun.data.angle),),
+        exposure=0.5,
+    )
     colors = Relighter(avatar).colors(mesh.astype(np.float64), camera.position, light)
     splats = replace(avatar.splats, sh=((colors - 0.5) / SH_C0)[:, None].astype(np.float32))
     expected = render_avatar(replace(avatar, splats=splats), mesh, camera, (0.0,) * 3)
@@ -253,10 +297,15 @@ def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
 )
 @pytest.mark.parametrize("portrait", [False, True])
 def test_camera_settings_are_applied(changes, portrait, tmp_path):
-    """Catches a wrong sensor fit, shifts of the wrong sign or unit, and the resolution's percentage."""
+    """Catches a wrong sensor fit, shifts of the wrong sign or unit, and the resolution's
+    percentage."""
     scene = bpy.context.scene
     width, height = (HEIGHT, WIDTH) if portrait else (WIDTH, HEIGHT)
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 2 * width, 2 * height, 50
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = (
+        2 * width,
+        2 * height,
+        50,
+    )
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
     camera = expected_camera(camera_at(45.0, **changes), shown, width, height)
@@ -277,16 +326,22 @@ def test_render_region(crop, tmp_path):
     rows, columns = slice(HEIGHT - int(0.77 * HEIGHT), HEIGHT - int(0.2 * HEIGHT)), slice(28, 68)
     part = render(tmp_path)["R"]
     assert whole[rows, columns].max() > 0.1
-    np.testing.assert_allclose(part if crop else part[rows, columns], whole[rows, columns], atol=1e-4)
+    np.testing.assert_allclose(
+        part if crop else part[rows, columns], whole[rows, columns], atol=1e-4
+    )
 
 
 def test_world_color_is_the_background(tmp_path):
-    """Catches a background that is blended in linear light although the splats were trained in sRGB."""
+    """Catches a background that is blended in linear light although the splats were trained in
+    sRGB."""
     scene = bpy.context.scene
     scene.render.film_transparent = False
     scene.world = bpy.data.worlds.new("world")
     background = enable_nodes(scene.world).nodes["Background"].inputs
-    background["Color"].default_value, background["Strength"].default_value = (0.4, 0.1, 0.2, 1), 0.5
+    background["Color"].default_value, background["Strength"].default_value = (
+        (0.4, 0.1, 0.2, 1),
+        0.5,
+    )
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
@@ -316,15 +371,16 @@ def test_depth_in_meters(tmp_path):
 
 
 def test_objects_are_sorted_together(tmp_path):
-    """Catches objects composited one after the other, and wrong directions or sizes of a transformed object."""
+    """Catches objects composited one after the other, and wrong directions or sizes of a
+    transformed object."""
     rng = np.random.default_rng(6)
     scans = []
     for seed, count in ((0, 300), (1, 200)):
         splats = random_splats(1, count, degree=2)
         xyz = rng.normal(0, 0.1, (count, 3)).astype(np.float32)
         sh = np.random.default_rng(seed).normal(0, 0.1, (count, 9, 3)).astype(np.float32)
-        # The rasterizer leaves out the splat that would bring a pixel's transmittance to 1e-4, the GPU draws it. Of an
-        # opacity below 0.96 that is less than 1/255.
+        # The rasterizer leaves out the splat that would bring a pixel's transmittance to 1e-4, the
+        # GPU draws it. Of an opacity below 0.96 that is less than 1/255.
         opacity = np.minimum(splats.opacity, 3)
         log_scale = np.full((count, 3), -3.5, np.float32)
         scans.append(replace(splats, xyz=xyz, sh=sh, log_scale=log_scale, opacity=opacity))
@@ -333,7 +389,8 @@ def test_objects_are_sorted_together(tmp_path):
     show_world_splats(scans[1], "moved").matrix_world = place
     camera = active_camera((0, 0, 1.2))
     bpy.context.view_layer.update()
-    # By hand: splats moved to the world, harmonics evaluated in the direction that their own space sees.
+    # By hand: splats moved to the world, harmonics evaluated in the direction that their own space
+    # sees.
     spaces = [np.eye(4), np.array(place, np.float64)]
     reference = _merged(scans, spaces, np.array(camera.matrix_world, np.float64)[:3, 3])
     view = expected_camera(camera, bpy.data.objects["still"])
@@ -342,7 +399,8 @@ def test_objects_are_sorted_together(tmp_path):
 
 
 def _merged(scans, spaces, eye):
-    """World splats of several sets, with colors for one camera position: constant coefficients only."""
+    """World splats of several sets, with colors for one camera position: constant coefficients
+    only."""
     parts = []
     for splats, space in zip(scans, spaces, strict=True):
         turn = space[:3, :3]
@@ -356,12 +414,17 @@ def _merged(scans, spaces, eye):
         color = np.einsum("nk,nkc->nc", basis[:, :9], splats.sh) / SH_C0
         parts.append(replace(world, sh=color[:, None].astype(np.float32)))
     names = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound", "strain_color")
-    return type(parts[0])(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    return type(parts[0])(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    )
 
 
 def test_scaled_objects(tmp_path):
     """Catches splats that keep their size where their object grows."""
-    splats = replace(random_splats(1, 200), xyz=np.random.default_rng(0).normal(0, 0.1, (200, 3)).astype(np.float32))
+    splats = replace(
+        random_splats(1, 200),
+        xyz=np.random.default_rng(0).normal(0, 0.1, (200, 3)).astype(np.float32),
+    )
     splats = replace(splats, log_scale=np.full((200, 3), -4.5, np.float32))
     shown = show_world_splats(splats, "scan")
     camera = active_camera((0, 0, 3))
@@ -390,13 +453,19 @@ def test_display_settings_apply_to_renders(tmp_path):
     cases = {
         splat_nodes.OPACITY_THRESHOLD: (0.5, 0.0, avatar.splats.rows(~faint)),
         splat_nodes.SELECTED_ONLY: (True, False, avatar.splats.rows(~frozen)),
-        splat_nodes.VIEW_DEPENDENT: (False, True, replace(avatar.splats, sh=avatar.splats.sh[:, :1])),
+        splat_nodes.VIEW_DEPENDENT: (
+            False,
+            True,
+            replace(avatar.splats, sh=avatar.splats.sh[:, :1]),
+        ),
         splat_nodes.SIZE: (2.0, 1.0, larger),
         splat_nodes.PERCENTAGE: (0.0, 100.0, avatar.splats.rows(np.zeros(3000, bool))),
     }
     for name, (value, default, splats) in cases.items():
         set_input(shown, name, value)
-        expected = render_avatar(replace(avatar, splats=splats), evaluated_vertices(head), camera, (0.0,) * 3)
+        expected = render_avatar(
+            replace(avatar, splats=splats), evaluated_vertices(head), camera, (0.0,) * 3
+        )
         assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE, name
         set_input(shown, name, default)
     set_input(shown, splat_nodes.SHOW_SELECTION, True)
@@ -410,7 +479,9 @@ def test_display_settings_apply_to_renders(tmp_path):
 def test_only_visible_objects_are_rendered(tmp_path):
     """Catches hidden objects in the image, and missing collection instances."""
     splats = replace(
-        random_splats(1, 50), xyz=np.zeros((50, 3), np.float32), log_scale=np.full((50, 3), -4, np.float32)
+        random_splats(1, 50),
+        xyz=np.zeros((50, 3), np.float32),
+        log_scale=np.full((50, 3), -4, np.float32),
     )
     shown = show_world_splats(splats, "scan")
     active_camera((0, 0, 1))
@@ -432,9 +503,12 @@ def test_only_visible_objects_are_rendered(tmp_path):
 
 
 def test_keyframes_of_visibility_count_in_animations(tmp_path):
-    """Catches a keyframed *Disable in Renders* that is read before the frame's animation, of splats and instances."""
+    """Catches a keyframed *Disable in Renders* that is read before the frame's animation, of splats
+    and instances."""
     splats = replace(
-        random_splats(1, 50), xyz=np.zeros((50, 3), np.float32), log_scale=np.full((50, 3), -4, np.float32)
+        random_splats(1, 50),
+        xyz=np.zeros((50, 3), np.float32),
+        log_scale=np.full((50, 3), -4, np.float32),
     )
     shown = show_world_splats(splats, "scan")
     active_camera((0, 0, 1))
@@ -447,7 +521,9 @@ def test_keyframes_of_visibility_count_in_animations(tmp_path):
     scene.render.filepath = str(tmp_path / "image_####.exr")
     bpy.ops.render.render(animation=True)
     images = [read_exr(tmp_path / f"image_{frame:04d}.exr") for frame in (1, 2, 3)]
-    alphas = [next(v for k, v in passes.items() if k.endswith("Combined.A")).max() for passes in images]
+    alphas = [
+        next(v for k, v in passes.items() if k.endswith("Combined.A")).max() for passes in images
+    ]
     assert [bool(alpha > 0.5) for alpha in alphas] == [True, False, True]
 
 
@@ -473,7 +549,8 @@ def _png(path: Path) -> np.ndarray:
 
 @pytest.mark.needs("adapter")
 def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
-    """Catches F12 that renders on the CPU where the preferences say GPU, another picture, and a silent failure."""
+    """Catches F12 that renders on the CPU where the preferences say GPU, another picture, and a
+    silent failure."""
     from raster import gpu_device
 
     from stga_addon.raster.gpu import compose as on_gpu

@@ -23,7 +23,9 @@ def test_unsupported_cameras_are_refused(kind):
     """Catches a perspective image from a camera of another type."""
     if kind is not None:
         camera_at(type=kind)
-    with pytest.raises(RuntimeError, match="no camera" if kind is None else "camera: is not a perspective camera"):
+    with pytest.raises(
+        RuntimeError, match="no camera" if kind is None else "camera: is not a perspective camera"
+    ):
         bpy.ops.render.render()
 
 
@@ -44,7 +46,9 @@ def test_a_head_in_edit_mode_is_named():
     _, head = show(avatar_of("stga", 10))
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
-    with pytest.raises(StgaError, match="head: is in Edit Mode; head splats is drawn again when you leave it"):
+    with pytest.raises(
+        StgaError, match="head: is in Edit Mode; head splats is drawn again when you leave it"
+    ):
         visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
     bpy.ops.object.mode_set(mode="OBJECT")
     assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1
@@ -54,12 +58,23 @@ def test_a_head_in_edit_mode_is_named():
     ("stage", "raised", "message"),
     [
         ("visible_layers", StgaError("head: is broken"), "^Error: head: is broken$"),
-        ("visible_layers", ValueError("of bones"), r"Unexpected error \(ValueError: of bones\); see the console"),
-        ("combined", MemoryError("of pixels"), r"Unexpected error \(MemoryError: of pixels\); see the console"),
+        (
+            "visible_layers",
+            ValueError("of bones"),
+            r"Unexpected error \(ValueError: of bones\); see the console",
+        ),
+        (
+            "combined",
+            MemoryError("of pixels"),
+            r"Unexpected error \(MemoryError: of pixels\); see the console",
+        ),
     ],
 )
-def test_failed_render_is_an_error_and_an_empty_image(stage, raised, message, tmp_path, monkeypatch):
-    """Catches an image without passes, which Blender cannot save or crashes over, and a failure saved as an image."""
+def test_failed_render_is_an_error_and_an_empty_image(
+    stage, raised, message, tmp_path, monkeypatch
+):
+    """Catches an image without passes, which Blender cannot save or crashes over, and a failure
+    saved as an image."""
 
     def fail(*_: object) -> None:
         raise raised
@@ -85,7 +100,11 @@ def test_panels_drop_the_engine_on_unregister():
 
     def panels() -> list[str]:
         every = bpy.types.Panel.__subclasses__()
-        return [panel.__name__ for panel in every if engine.ENGINE in getattr(panel, "COMPAT_ENGINES", ())]
+        return [
+            panel.__name__
+            for panel in every
+            if engine.ENGINE in getattr(panel, "COMPAT_ENGINES", ())
+        ]
 
     engine.unregister()
     assert not panels()
@@ -93,7 +112,8 @@ def test_panels_drop_the_engine_on_unregister():
 
 
 def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
-    """Catches preferences, which belong to the main thread, read from a render thread, and an error that is lost."""
+    """Catches preferences, which belong to the main thread, read from a render thread, and an error
+    that is lost."""
     monkeypatch.setattr(engine_viewport, "missing_packages", lambda: ["numba"])
     answers, callers = [StgaError("no environment"), "python"], []
 

@@ -49,7 +49,8 @@ def exported(folder: Path, **options) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 def test_timeline_and_camera(demo_head, tmp_path):
-    """Catches the capture's motion where the scene plays another, frames outside its range, and another camera."""
+    """Catches the capture's motion where the scene plays another, frames outside its range, and
+    another camera."""
     scene = bpy.context.scene
     head = scene.stga.head
     jaw = rig_of(head).pose.bones["jaw"]
@@ -63,7 +64,9 @@ def test_timeline_and_camera(demo_head, tmp_path):
     assert (header["fps"], len(arrays["pose"])) == (24, 5)
     for index, frame in enumerate(range(1, 6)):
         scene.frame_set(frame)
-        found = posed_mesh(header, arrays, arrays["coefficients"][index], arrays["pose"][index], index)
+        found = posed_mesh(
+            header, arrays, arrays["coefficients"][index], arrays["pose"][index], index
+        )
         assert np.abs(found - evaluated_vertices(head)).max() < BLENDER_TOLERANCE_M
     assert np.ptp(arrays["pose"][:, JOINTS.index("jaw"), 0]) > 0.2
     camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
@@ -72,7 +75,8 @@ def test_timeline_and_camera(demo_head, tmp_path):
 
 
 def test_sliders_are_flames(demo_head, tmp_path):
-    """Catches a slider that moves another blend shape, and correctives or joints that do not follow."""
+    """Catches a slider that moves another blend shape, and correctives or joints that do not
+    follow."""
     header, arrays = exported(tmp_path)
     flame = demo_head.flame
     assert sorted(slider["name"] for slider in header["sliders"]) == [
@@ -90,15 +94,21 @@ def test_sliders_are_flames(demo_head, tmp_path):
         translation=arrays["translation"][0],
     )
     expected = flame_forward(flame.model, flame.shape, wanted, flame.static_offset)
-    assert np.abs(posed_mesh(header, arrays, expressions, pose, 0) - expected).max() < BLENDER_TOLERANCE_M
+    assert (
+        np.abs(posed_mesh(header, arrays, expressions, pose, 0) - expected).max()
+        < BLENDER_TOLERANCE_M
+    )
 
 
 def test_motion_only_leaves_flame_out(demo_head, tmp_path):
-    """Catches blend shapes of the model in a page that was asked for without them, or another motion in it."""
+    """Catches blend shapes of the model in a page that was asked for without them, or another
+    motion in it."""
     header, arrays = exported(tmp_path, motion_only=True)
     assert (header["sliders"], header["joints"]) == ([], ["root"])
     scene = bpy.context.scene
     for index, frame in enumerate(range(scene.frame_start, scene.frame_end + 1)):
         scene.frame_set(frame)
-        found = posed_mesh(header, arrays, arrays["coefficients"][index], arrays["pose"][index], index)
+        found = posed_mesh(
+            header, arrays, arrays["coefficients"][index], arrays["pose"][index], index
+        )
         assert np.abs(found - evaluated_vertices(scene.stga.head)).max() < BLENDER_TOLERANCE_M

@@ -49,7 +49,8 @@ def test_viewports_look_at_the_head(head):
 
 
 def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
-    """Catches a wall that covers the scene or lies on its side, and a second one each time the avatar is shown."""
+    """Catches a wall that covers the scene or lies on its side, and a second one each time the
+    avatar is shown."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     write_ply(tmp_path / "world.ply", avatar.splats)
@@ -58,14 +59,19 @@ def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
     (world,) = [thing for thing in bpy.data.objects if thing.get(tags.WORLD)]
     head = bpy.context.scene.stga.head
     bpy.context.view_layer.update()
-    assert (world.hide_get(), world.hide_render, bpy.context.scene.stga.splats is not world) == (True, True, True)
+    assert (world.hide_get(), world.hide_render, bpy.context.scene.stga.splats is not world) == (
+        True,
+        True,
+        True,
+    )
     np.testing.assert_allclose(np.array(world.matrix_world), np.array(head.matrix_world), atol=1e-6)
     assert len(world.data.vertices) == len(avatar.splats)
 
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved):
-    """Catches a first look from within Blender's cube of 2 m, and a cube of the artist's own that disappears."""
+    """Catches a first look from within Blender's cube of 2 m, and a cube of the artist's own that
+    disappears."""
     bpy.ops.mesh.primitive_cube_add()
     cube = bpy.context.object
     cube.location.x = float(moved)
@@ -118,13 +124,17 @@ def test_heads_without_bones_say_so(extension, tmp_path):
 
 
 def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
-    """Catches images by Blender's own engines in which an avatar shown as trained is missing, or is points."""
+    """Catches images by Blender's own engines in which an avatar shown as trained is missing, or is
+    points."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
-    scene.render.image_settings.file_format, scene.render.filepath = "PNG", str(tmp_path / "image.png")
+    scene.render.image_settings.file_format, scene.render.filepath = (
+        "PNG",
+        str(tmp_path / "image.png"),
+    )
     images = {}
     for mode in (AS_TRAINED, QUADS, POINTS):
         set_input(scene.stga.splats, DISPLAY, mode)
@@ -136,7 +146,8 @@ def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
 
 
 def test_cycles_sees_through_splats_that_are_shown(extension, tmp_path):
-    """Catches F12 in Cycles that makes holes of overlapping splats, and limits lowered or raised where none are."""
+    """Catches F12 in Cycles that makes holes of overlapping splats, and limits lowered or raised
+    where none are."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     other, cycles = bpy.data.scenes.new("other").cycles, bpy.context.scene.cycles
@@ -150,12 +161,17 @@ def test_cycles_sees_through_splats_that_are_shown(extension, tmp_path):
 
 
 def test_preview_for_other_engines(extension, tmp_path):
-    """Catches quads that face no camera, black holes in Cycles, and displays that do not state their limits."""
+    """Catches quads that face no camera, black holes in Cycles, and displays that do not state
+    their limits."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     scene = bpy.context.scene
-    shown, scene.render.engine, scene.cycles.transparent_max_bounces = scene.stga.splats, "CYCLES", 8
+    shown, scene.render.engine, scene.cycles.transparent_max_bounces = (
+        scene.stga.splats,
+        "CYCLES",
+        8,
+    )
     assert bpy.ops.stga.preview_images() == {"FINISHED"}
     assert (display_mode(shown), scene.cycles.transparent_max_bounces) == (QUADS, 64)
     with pytest.raises(RuntimeError, match="displayed as trained"):

@@ -40,7 +40,9 @@ def rig_of(head):
 
 def assert_parity(head, sequence: FlameSequence) -> None:
     for timestep in sequence.timesteps:
-        np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(sequence, timestep), atol=TOLERANCE)
+        np.testing.assert_allclose(
+            at_frame(head, timestep), sequence_mesh(sequence, timestep), atol=TOLERANCE
+        )
 
 
 def quaternion(axis_angle: np.ndarray) -> np.ndarray:
@@ -49,13 +51,15 @@ def quaternion(axis_angle: np.ndarray) -> np.ndarray:
 
 
 def test_tracked_frames_equal_the_forward_pass(source):
-    """Fails when a joint, a corrective, a weight, a rotation's sense or the translation is not FLAME's."""
+    """Fails when a joint, a corrective, a weight, a rotation's sense or the translation is not
+    FLAME's."""
     sequence = flame_sequence(flame_model())
     assert_parity(import_head(motion_capture(sequence, source)), sequence)
 
 
 def test_poses_set_by_hand_equal_the_forward_pass(source):
-    """Fails when only imported frames match: fixed joints, correctives without drivers, unnormalized quaternions."""
+    """Fails when only imported frames match: fixed joints, correctives without drivers,
+    unnormalized quaternions."""
     sequence = flame_sequence(flame_model())
     head = import_head(motion_capture(sequence, source))
     rig, keys = rig_of(head), head.data.shape_keys
@@ -72,22 +76,28 @@ def test_poses_set_by_hand_equal_the_forward_pass(source):
 
 
 def test_small_rotations_and_offsets_do_not_snap(source):
-    """Fails when new drivers keep their default keyframes, to which Blender snaps results below 1e-4."""
+    """Fails when new drivers keep their default keyframes, to which Blender snaps results below
+    1e-4."""
     model = flame_model()
     sequence = flame_sequence(model)
 
     def frame(timestep: int):
         full = sequence.frame(timestep)
-        return replace(full, expr=full.expr * 0.02, neck_pose=np.full(3, 5e-5), jaw_pose=np.full(3, -5e-5))
+        return replace(
+            full, expr=full.expr * 0.02, neck_pose=np.full(3, 5e-5), jaw_pose=np.full(3, -5e-5)
+        )
 
     small = replace(sequence, frame=frame)
     head = import_head(motion_capture(small, source))
     for timestep in small.timesteps:
-        np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(small, timestep), atol=5e-7)
+        np.testing.assert_allclose(
+            at_frame(head, timestep), sequence_mesh(small, timestep), atol=5e-7
+        )
 
 
 def test_correctives_of_moving_joints_only(source):
-    """Fails when joints without rotation get shape keys and drivers, or rotating ones lose theirs."""
+    """Fails when joints without rotation get shape keys and drivers, or rotating ones lose
+    theirs."""
     sequence = flame_sequence(flame_model())
 
     def frame(timestep: int):
@@ -114,7 +124,8 @@ def model_without_neck(model):
 
 
 def test_drivers_need_no_python_and_no_cycle(source, capfd):
-    """Fails when Blender would run the drivers as scripts (refused in files from others) or in an undefined order."""
+    """Fails when Blender would run the drivers as scripts (refused in files from others) or in an
+    undefined order."""
     head = import_head(motion_capture(flame_sequence(flame_model()), source))
     at_frame(head, 5)
     for owner in (rig_of(head), head.data.shape_keys):
@@ -126,13 +137,15 @@ def test_drivers_need_no_python_and_no_cycle(source, capfd):
 
 
 def test_between_frames_the_head_turns_and_does_not_shrink(source):
-    """Fails when a quaternion changes sign between keyframes, so that the interpolated head runs through zero."""
+    """Fails when a quaternion changes sign between keyframes, so that the interpolated head runs
+    through zero."""
     model = flame_model()
     sequence = flame_sequence(model, timesteps=range(12))
 
     def frame(timestep: int):
         still = replace(sequence.frame(0), expr=np.zeros(model.n_expression))
-        wrapped = (0.6 * timestep + np.pi) % (2 * np.pi) - np.pi  # as trackers write it: jumps from π to -π
+        # as trackers write it: jumps from π to -π
+        wrapped = (0.6 * timestep + np.pi) % (2 * np.pi) - np.pi
         return replace(still, rotation=np.array([0, wrapped, 0]))
 
     turning = replace(sequence, frame=frame)
@@ -144,7 +157,8 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
 
 
 def test_all_components_have_sliders(source):
-    """Fails when a component that another person's motion needs has no key, or a slider ends where faces do not."""
+    """Fails when a component that another person's motion needs has no key, or a slider ends where
+    faces do not."""
     model = flame_model(identity=12)
     sequence = flame_sequence(model)
 
@@ -155,8 +169,12 @@ def test_all_components_have_sliders(source):
 
     sparse = replace(sequence, frame=frame)
     head = import_head(motion_capture(sparse, source))
-    names = [key.name for key in head.data.shape_keys.key_blocks if not key.name.startswith("pose_")]
-    expected = [f"expr_{k:03d}" for k in range(model.n_expression)] + [f"identity_{k:03d}" for k in range(10)]
+    names = [
+        key.name for key in head.data.shape_keys.key_blocks if not key.name.startswith("pose_")
+    ]
+    expected = [f"expr_{k:03d}" for k in range(model.n_expression)] + [
+        f"identity_{k:03d}" for k in range(10)
+    ]
     assert names == ["Basis", *expected]
     for name in expected:
         key = head.data.shape_keys.key_blocks[name]
@@ -165,7 +183,8 @@ def test_all_components_have_sliders(source):
 
 
 def test_identity_sliders_move_the_joints(source):
-    """Fails when joints stay where the tracked person has them, or the sliders count from FLAME's mean face."""
+    """Fails when joints stay where the tracked person has them, or the sliders count from FLAME's
+    mean face."""
     sequence = flame_sequence(flame_model())
     head = import_head(motion_capture(sequence, source))
     rng = np.random.default_rng(8)
@@ -174,16 +193,23 @@ def test_identity_sliders_move_the_joints(source):
         head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = value
     grown = replace(sequence, shape=sequence.shape + other)
     for timestep in grown.timesteps:
-        np.testing.assert_allclose(at_frame(head, timestep), sequence_mesh(grown, timestep), atol=1e-5)
+        np.testing.assert_allclose(
+            at_frame(head, timestep), sequence_mesh(grown, timestep), atol=1e-5
+        )
     for component in range(len(other)):
         head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = 0
     assert_parity(head, sequence)
 
 
 def test_the_published_topology_with_teeth(source, shared_data):
-    """Fails when parity holds for a hundred random vertices and is lost at the size and scale of FLAME itself."""
+    """Fails when parity holds for a hundred random vertices and is lost at the size and scale of
+    FLAME itself."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
-        template, identity, faces = data["v_template"], data["shapedirs"], data["faces"].astype(np.int32)
+        template, identity, faces = (
+            data["v_template"],
+            data["shapedirs"],
+            data["faces"].astype(np.int32),
+        )
     small = flame_model(vertices=len(template), components=20, identity=0)
     model = with_teeth(
         replace(
@@ -218,7 +244,8 @@ def test_fixed_joints_have_no_helper_bones(source):
 
 
 def test_offsets_per_frame_become_keys(source):
-    """Fails when dynamic_offset is dropped, does not move the joints, or is added without a warning."""
+    """Fails when dynamic_offset is dropped, does not move the joints, or is added without a
+    warning."""
     sequence = flame_sequence(flame_model(), dynamic=True)
     said = []
     head = import_head(motion_capture(sequence, source), warn=said.append)
@@ -233,7 +260,9 @@ def test_coefficients_beyond_the_slider_range_are_reported(source):
 
     def frame(timestep: int):
         full = sequence.frame(timestep)
-        return replace(full, expr=full.expr + np.eye(len(full.expr))[7] * (12 if timestep == 5 else 0))
+        return replace(
+            full, expr=full.expr + np.eye(len(full.expr))[7] * (12 if timestep == 5 else 0)
+        )
 
     said = []
     import_head(motion_capture(replace(sequence, frame=frame), source), warn=said.append)
@@ -243,7 +272,8 @@ def test_coefficients_beyond_the_slider_range_are_reported(source):
 
 
 def test_a_flame_capture_imports_as_a_rig(tmp_path):
-    """Fails when a capture's FLAME parameters are flattened to one key a frame, or its regions are lost."""
+    """Fails when a capture's FLAME parameters are flattened to one key a frame, or its regions are
+    lost."""
     sequence = flame_sequence(flame_model(vertices=60))
     capture = replace(
         mesh_capture(tmp_path, timesteps=sequence.timesteps),
@@ -261,22 +291,30 @@ def test_a_flame_capture_imports_as_a_rig(tmp_path):
 
 def test_importing_again_replaces_the_rig(source):
     """Fails when a second import duplicates rig, modifier or drivers, or leaves unused actions."""
-    first = import_head(motion_capture(flame_sequence(flame_model(), dynamic=True), source), warn=lambda sentence: None)
+    first = import_head(
+        motion_capture(flame_sequence(flame_model(), dynamic=True), source),
+        warn=lambda sentence: None,
+    )
     rig = rig_of(first)
-    counts = [len(blocks) for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)]
+    counts = [
+        len(blocks)
+        for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)
+    ]
     sequence = flame_sequence(flame_model(seed=2), seed=2)
     head = import_head(motion_capture(sequence, source))
     assert head == first
     assert rig_of(head) == rig
     assert counts == [
-        len(blocks) for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)
+        len(blocks)
+        for blocks in (bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes)
     ]
     assert [modifier.type for modifier in head.modifiers] == ["ARMATURE"]
     assert_parity(head, sequence)
 
 
 def test_adding_a_rig_keeps_the_active_object(source):
-    """Fails when making bones, which needs edit mode, leaves another object active or a stray object behind."""
+    """Fails when making bones, which needs edit mode, leaves another object active or a stray
+    object behind."""
     mine = bpy.data.objects.new("mine", None)
     bpy.context.scene.collection.objects.link(mine)
     bpy.context.view_layer.objects.active = mine
@@ -296,16 +334,23 @@ def test_a_saved_rig_shows_the_same(source, tmp_path):
 
 
 def test_the_bundled_head_has_arkits_sliders(source):
-    """Fails when shape keys of the bundled head have numbers, move other vertices, lose their keyframes to another part
-    or do not come back as its coefficients."""
+    """Fails when shape keys of the bundled head have numbers, move other vertices, lose their
+    keyframes to another part or do not come back as its coefficients."""
     sequence = flame_sequence(bundled_model(None))
     head = import_head(motion_capture(sequence, source))
-    names = [key.name for key in head.data.shape_keys.key_blocks[1:] if not key.name.startswith("identity_")]
-    assert names == list(sequence.model.expression_names)  # and none for correctives, which it has not
+    names = [
+        key.name
+        for key in head.data.shape_keys.key_blocks[1:]
+        if not key.name.startswith("identity_")
+    ]
+    # and none for correctives, which it has not
+    assert names == list(sequence.model.expression_names)
     assert_parity(head, sequence)
     sampled = sample_motion(head, sequence, sequence.timesteps)
     for number, timestep in enumerate(sequence.timesteps):
-        np.testing.assert_allclose(sampled.frame(number).expr, sequence.frame(timestep).expr, atol=1e-5)
+        np.testing.assert_allclose(
+            sampled.frame(number).expr, sequence.frame(timestep).expr, atol=1e-5
+        )
     key = head.data.shape_keys.key_blocks["jawOpen"]
     assert is_of_parts(key.path_from_id("value"), ["expression"])
     assert not is_of_parts(key.path_from_id("value"), ["head", "jaw"])

@@ -1,4 +1,5 @@
-"""The GPU display as far as it needs no window: what it draws, from where, and that it leaves nothing behind."""
+"""The GPU display as far as it needs no window: what it draws, from where, and that it leaves
+nothing behind."""
 
 import numpy as np
 import pytest
@@ -17,7 +18,13 @@ from stga_addon.scene.display.splat_object import (  # noqa: E402
     show_world_splats,
     update_splats,
 )
-from stga_addon.scene.gpu.packing import StaticSplats, View, drawing_order, frame_block, posed_frames  # noqa: E402
+from stga_addon.scene.gpu.packing import (  # noqa: E402
+    StaticSplats,
+    View,
+    drawing_order,
+    frame_block,
+    posed_frames,
+)
 from stga_addon.scene.layers import DisplaySettings, SceneLayer  # noqa: E402
 from stga_addon.scene.render import viewport_display  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
@@ -36,7 +43,10 @@ class Region:
         self.is_perspective, self.use_clip_planes = is_perspective, False
         self.view_matrix = Matrix.Translation((0, 0, -1))
         if is_perspective:
-            rows = [(0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)), (0, 0, -1, 0)]
+            rows = [
+                (0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)),
+                (0, 0, -1, 0),
+            ]
         else:
             rows = [(0, 0, -2 / (far - near), -(far + near) / (far - near)), (0, 0, 0, 1)]
         self.window_matrix = Matrix(((f, 0, 0, 0), (0, f, 0, 0), *rows))
@@ -44,7 +54,8 @@ class Region:
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_depth_of_a_view(is_perspective):
-    """Catches splats that are hidden by, or hide, the wrong objects, and a clip range of another length."""
+    """Catches splats that are hidden by, or hide, the wrong objects, and a clip range of another
+    length."""
     region = Region(is_perspective)
     view, (a, b, c, d) = region_view(region, 300, 200)
     point = np.array([0.05, 0.02, -0.4, 1.0])
@@ -75,14 +86,20 @@ def test_drawing_order(distance, spread, short_keys):
     assert sorted(order) == sorted(np.flatnonzero(depth >= view.near))
     assert order[0] == depth.argmax(), "the largest sort key overflows"
     wrong = np.diff(depth[order]).max()
-    assert wrong <= max((1e-5 if short_keys else 0) * depth[order].min(), 1e-6 * np.abs(depth).max())
+    assert wrong <= max(
+        (1e-5 if short_keys else 0) * depth[order].min(), 1e-6 * np.abs(depth).max()
+    )
 
 
 def test_display_settings_reach_the_layer():
     """Catches a setting of the modifier that the GPU display does not follow."""
     shown = show_world_splats(random_splats(1, 10), "scan")
     assert display_mode(shown) == AS_TRAINED
-    for name, value in ((splat_nodes.SIZE, 0.5), (splat_nodes.OPACITY_THRESHOLD, 0.25), (splat_nodes.PERCENTAGE, 40.0)):
+    for name, value in (
+        (splat_nodes.SIZE, 0.5),
+        (splat_nodes.OPACITY_THRESHOLD, 0.25),
+        (splat_nodes.PERCENTAGE, 40.0),
+    ):
         set_input(shown, name, value)
     (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
     assert layer.settings == DisplaySettings(0.5, 0.25, 40.0)
@@ -115,7 +132,10 @@ def test_nothing_is_drawn_by_nodes():
     shown = show_world_splats(random_splats(1, 10), "scan")
 
     def kinds() -> set[str]:
-        return {instance.object.type for instance in bpy.context.evaluated_depsgraph_get().object_instances}
+        return {
+            instance.object.type
+            for instance in bpy.context.evaluated_depsgraph_get().object_instances
+        }
 
     assert "POINTCLOUD" not in kinds()
     set_input(shown, splat_nodes.DISPLAY, POINTS)

@@ -34,9 +34,9 @@ from .gpu_context import run_with_gpu
 MIN_PSNR_DB = 60.0
 MIN_COMPACT_PSNR_DB = 45.0
 MIN_RELIT_PSNR_DB = 55.0
-TURNED = np.array([[0.6, -0.8, 0, 0.02], [0.8, 0.6, 0, -0.01], [0, 0, 1, 0.03], [0, 0, 0, 1]]) @ np.diag(
-    [1.3, 0.8, 1, 1]
-)
+TURNED = np.array(
+    [[0.6, -0.8, 0, 0.02], [0.8, 0.6, 0, -0.01], [0, 0, 1, 0.03], [0, 0, 0, 1]]
+) @ np.diag([1.3, 0.8, 1, 1])
 
 
 def avatar(degree: int, strain: bool = False) -> Avatar:
@@ -52,7 +52,9 @@ def avatar(degree: int, strain: bool = False) -> Avatar:
         log_scale=rng.normal(-6, 0.6, (count, 3)).astype(np.float32),
         opacity=rng.normal(0, 2, count).astype(np.float32),
         sh=rng.normal(0, 0.3, splats.sh.shape).astype(np.float32),
-        strain_color=rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32) if strain else no_strain_color(count),
+        strain_color=rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32)
+        if strain
+        else no_strain_color(count),
     )
     return Avatar(splats, "stga", vertices.astype(np.float32), faces)
 
@@ -63,9 +65,13 @@ def with_offset(of: Avatar) -> Avatar:
     return replace(of, driven_offsets={"strain_position": values})
 
 
-def layer(of: Avatar, pose: np.ndarray | None = None, antialiased: bool = False, **more: Any) -> SceneLayer:
+def layer(
+    of: Avatar, pose: np.ndarray | None = None, antialiased: bool = False, **more: Any
+) -> SceneLayer:
     mesh = of.neutral * [1.1, 0.9, 1.05]
-    return SceneLayer(of.splats, of.frames(mesh), np.eye(4) if pose is None else pose, antialiased, **more)
+    return SceneLayer(
+        of.splats, of.frames(mesh), np.eye(4) if pose is None else pose, antialiased, **more
+    )
 
 
 def unembedded(of: Avatar) -> SceneLayer:
@@ -105,7 +111,9 @@ def render(layers: list[SceneLayer], camera: Camera, exact: bool) -> ComposedIma
     world = to_world(layers[0].splats, layers[0].frames)
     values = (torch.as_tensor(getattr(world, name), dtype=torch.float64) for name in
               ("xyz", "rotation", "log_scale", "opacity", "sh"))  # fmt: skip
-    rgb, alpha, depth = (image.numpy() for image in reference.render(*values, camera, world.sh_degree))
+    rgb, alpha, depth = (
+        image.numpy() for image in reference.render(*values, camera, world.sh_degree)
+    )
     return ComposedImage(rgb, alpha, depth / np.maximum(alpha, 1e-12))
 
 
@@ -115,7 +123,9 @@ def psnr_db(found: np.ndarray, expected: np.ndarray) -> float:
 
 def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact: bool) -> None:
     expected = render(layers, camera, exact)
-    print(f"{psnr_db(found.rgb, expected.rgb):.1f} dB, alpha {psnr_db(found.alpha, expected.alpha):.1f} dB")
+    print(
+        f"{psnr_db(found.rgb, expected.rgb):.1f} dB, alpha {psnr_db(found.alpha, expected.alpha):.1f} dB"
+    )
     assert psnr_db(found.rgb, expected.rgb) >= MIN_PSNR_DB
     assert psnr_db(found.alpha, expected.alpha) >= MIN_PSNR_DB
     assert expected.alpha.mean() > 0.05, "nothing to compare"
@@ -126,10 +136,13 @@ def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact:
     assert np.sqrt(np.mean(error**2)) < 1e-3 * np.ptp(expected.depth[opaque])
 
 
-@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+@pytest.mark.skipif(
+    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
+)
 @pytest.mark.parametrize("name", cases())
 def test_picture_equals_the_rasterizers(name: str) -> None:
-    """Catches another projection, order, color, filter, pose or setting than that of the CPU rasterizer."""
+    """Catches another projection, order, color, filter, pose or setting than that of the CPU
+    rasterizer."""
     layers, camera = cases()[name]
     found: list[ComposedImage] = []
 
@@ -142,9 +155,12 @@ def test_picture_equals_the_rasterizers(name: str) -> None:
     check(found[0], layers, camera, exact=name == "orthographic")
 
 
-@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+@pytest.mark.skipif(
+    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
+)
 def test_clip_planes() -> None:
-    """Catches splats outside a viewport's clipping region, and planes taken for those of another space."""
+    """Catches splats outside a viewport's clipping region, and planes taken for those of another
+    space."""
     camera, of = cases()["sh 0"][1], avatar(0)
     planes = np.array([[1.0, 0.2, 0.0, 0.0], [0.0, 1.0, 0.0, 0.02]])
     world = to_world(of.splats, of.frames(of.neutral))
@@ -162,9 +178,12 @@ def test_clip_planes() -> None:
     assert psnr_db(found[0].rgb, expected.rgb) >= MIN_PSNR_DB
 
 
-@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+@pytest.mark.skipif(
+    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
+)
 def test_other_splats_in_the_compact_format() -> None:
-    """Catches splats of an earlier picture in one of fewer, and wrong targets of viewports on a card."""
+    """Catches splats of an earlier picture in one of fewer, and wrong targets of viewports on a
+    card."""
     pictures = [cases()[name] for name in ("two and world", "sh 0", "two and world")]
     found: list[ComposedImage] = []
 
@@ -176,12 +195,15 @@ def test_other_splats_in_the_compact_format() -> None:
 
     run_with_gpu(draw)
     for image, (layers, camera) in zip(found, pictures, strict=True):
-        assert psnr_db(image.rgb, compose([one.posed() for one in layers], camera).rgb) >= MIN_COMPACT_PSNR_DB
+        assert (
+            psnr_db(image.rgb, compose([one.posed() for one in layers], camera).rgb)
+            >= MIN_COMPACT_PSNR_DB
+        )
 
 
 def relit_layers(mode: str) -> list[SceneLayer]:
-    """A ball and a plate under four kinds of light and a world, with an object that throws a shadow; beside it one as
-    recorded."""
+    """A ball and a plate under four kinds of light and a world, with an object that throws a
+    shadow; beside it one as recorded."""
     avatar = lit_avatar(degree=1)
     mesh = avatar.neutral.astype(np.float64) * [1.05, 0.97, 1.0]
     eye = np.ones(3)
@@ -189,9 +211,18 @@ def relit_layers(mode: str) -> list[SceneLayer]:
         Light("sun", eye * [1.5, 1.0, 0.5], direction=(-0.3, -1, 0.1), angle=0.1),
         Light("point", eye * 3, (0.3, 0.4, 0.5), radius=0.02),
         Light("spot", eye * 9, (0.4, 0.1, 0.4), direction=(-0.4, -0.1, -0.4), cone=0.5, blend=0.5),
-        Light("area", eye * 2, (-0.5, 0.3, 0.4), direction=(0.5, -0.3, -0.4), size=(0.3, 0.4), shape="ellipse"),
+        Light(
+            "area",
+            eye * 2,
+            (-0.5, 0.3, 0.4),
+            direction=(0.5, -0.3, -0.4),
+            size=(0.3, 0.4),
+            shape="ellipse",
+        ),
     )
-    wall = Caster(np.array([[0.1, 0.1, 0.2], [0.2, 0.1, 0.2], [0.15, 0.3, 0.2]]), np.array([[0, 1, 2]]))
+    wall = Caster(
+        np.array([[0.1, 0.1, 0.2], [0.2, 0.1, 0.2], [0.15, 0.3, 0.2]]), np.array([[0, 1, 2]])
+    )
     world = np.random.default_rng(3).normal(0, 0.1, (9, 3)) + uniform(np.full(3, 0.4))
     light = Lighting(world, lights, exposure=0.3, white=(1.1, 1.0, 0.9))
     if mode == "mix":
@@ -202,15 +233,19 @@ def relit_layers(mode: str) -> list[SceneLayer]:
     relit = Relit(Relighter(avatar), mesh, light, (wall,))
     assert (relit.relighter.distant_in_head(mesh, light)[1].share > 0.2) == (mode == "kept")
     shown = SceneLayer(avatar.splats, avatar.frames(mesh), TURNED, relit=relit)
-    recorded = SceneLayer(avatar.splats, avatar.frames(mesh), np.diag([0.5, 0.5, 0.5, 1]) + np.eye(4, k=3) * 0.2)
+    recorded = SceneLayer(
+        avatar.splats, avatar.frames(mesh), np.diag([0.5, 0.5, 0.5, 1]) + np.eye(4, k=3) * 0.2
+    )
     return [recorded, shown]
 
 
-@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+@pytest.mark.skipif(
+    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
+)
 @pytest.mark.parametrize("mode", ["scene", "mix", "kept"])
 def test_light_of_the_scene(mode):
-    """Catches a light, shadow, highlight, bounce or share of recorded colors that the GPU computes otherwise than
-    `Relighter`, and a layer as recorded that is lit, too."""
+    """Catches a light, shadow, highlight, bounce or share of recorded colors that the GPU computes
+    otherwise than `Relighter`, and a layer as recorded that is lit, too."""
     layers, camera = relit_layers(mode), look_at((0.3, 0.2, 0.7), (0, 0, 0), 160, 200, 300)
     found: list[ComposedImage] = []
 
@@ -239,24 +274,32 @@ def check_shadow_map(atlas: np.ndarray, index: int, expected: np.ndarray) -> Non
     assert (error > 1e-3).mean() < 1e-4  # edges of triangles at the middle of a texel
 
 
-@pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver")
+@pytest.mark.skipif(
+    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
+)
 def test_shadow_maps() -> None:
-    """Catches surfaces that hide what is nearer to a sun or a lamp, near, far, or drawn later, and depth that does not
-    run straight across a large triangle."""
+    """Catches surfaces that hide what is nearer to a sun or a lamp, near, far, or drawn later, and
+    depth that does not run straight across a large triangle."""
     shown = relit_layers("scene")[1]
     relit, far = shown.relit, Light("point", np.ones(3), (30, 50, 20))
     assert relit is not None
-    relit = replace(relit, lighting=replace(relit.lighting, lights=(*relit.lighting.lights[:3], far)))
+    relit = replace(
+        relit, lighting=replace(relit.lighting, lights=(*relit.lighting.lights[:3], far))
+    )
     atlas: list[np.ndarray] = []
 
     def draw() -> None:
         renderer = SplatRenderer()
-        renderer.draw([replace(shown, relit=relit)], View(look_at((0.3, 0.2, 0.7), (0, 0, 0), 16, 20, 30)))
+        renderer.draw(
+            [replace(shown, relit=relit)], View(look_at((0.3, 0.2, 0.7), (0, 0, 0), 16, 20, 30))
+        )
         assert renderer._relit is not None
         atlas.append(_pixels(renderer._relit[0].textures["shadows"], 1)[..., 0])
 
     run_with_gpu(draw)
     for index, light in enumerate(relit.lighting.lights):
         check_shadow_map(
-            atlas[0], index, ShadowMap(relit.mesh, shown.relit.relighter.avatar.faces, light, relit.casters).depth
+            atlas[0],
+            index,
+            ShadowMap(relit.mesh, shown.relit.relighter.avatar.faces, light, relit.casters).depth,
         )

@@ -29,13 +29,18 @@ def block_counts() -> dict[str, int]:
 
 
 def test_each_frame_evaluates_to_its_timestep(tmp_path):
-    """Fails when a key is off by a frame, neighbours leak into a frame, or gaps in the timesteps shift keys."""
+    """Fails when a key is off by a frame, neighbours leak into a frame, or gaps in the timesteps
+    shift keys."""
     capture = mesh_capture(tmp_path, timesteps=(2, 3, 7, 8))
     head = import_head(capture)
     for timestep in capture.timesteps:
         np.testing.assert_allclose(at_frame(head, timestep), capture.mesh(timestep), atol=1e-7)
-    np.testing.assert_allclose(at_frame(head, 6), capture.mesh(3) / 4 + capture.mesh(7) * 3 / 4, atol=1e-7)
-    np.testing.assert_allclose(at_frame(head, 2.5), (capture.mesh(2) + capture.mesh(3)) / 2, atol=1e-7)
+    np.testing.assert_allclose(
+        at_frame(head, 6), capture.mesh(3) / 4 + capture.mesh(7) * 3 / 4, atol=1e-7
+    )
+    np.testing.assert_allclose(
+        at_frame(head, 2.5), (capture.mesh(2) + capture.mesh(3)) / 2, atol=1e-7
+    )
     np.testing.assert_allclose(at_frame(head, -5), capture.mesh(2), atol=1e-7)
     np.testing.assert_allclose(at_frame(head, 30), capture.mesh(8), atol=1e-7)
 
@@ -58,7 +63,8 @@ def test_studio_head_evaluates_to_its_tracked_meshes(shared_data):
 
 
 def test_up_axis_is_z(tmp_path):
-    """Fails when the capture's up (y) is not Blender's (z), or when the head is mirrored on the way."""
+    """Fails when the capture's up (y) is not Blender's (z), or when the head is mirrored on the
+    way."""
     head = import_head(mesh_capture(tmp_path / "anna", timesteps=(1,)))
     bpy.context.view_layer.update()
     turned = np.array(head.matrix_world)[:3, :3]
@@ -70,7 +76,8 @@ def test_up_axis_is_z(tmp_path):
 
 
 def test_faces_and_regions_keep_their_order(tmp_path):
-    """Fails when faces are re-ordered or turned (splats hang on face number and first corner), or regions are lost."""
+    """Fails when faces are re-ordered or turned (splats hang on face number and first corner), or
+    regions are lost."""
     capture = mesh_capture(tmp_path)
     mesh = import_head(capture).data
     assert [list(polygon.vertices) for polygon in mesh.polygons] == capture.faces.tolist()
@@ -79,7 +86,8 @@ def test_faces_and_regions_keep_their_order(tmp_path):
 
 
 def test_second_import_replaces_the_first(tmp_path):
-    """Fails when a second import duplicates the head, leaves unused data-blocks, or breaks references to the head."""
+    """Fails when a second import duplicates the head, leaves unused data-blocks, or breaks
+    references to the head."""
     first = import_head(mesh_capture(tmp_path))
     first.modifiers.new("artist's own", "SMOOTH").iterations = 0
     follower = bpy.data.objects.new("follower", None)
@@ -95,7 +103,8 @@ def test_second_import_replaces_the_first(tmp_path):
 
 
 def test_second_import_in_edit_mode(tmp_path):
-    """Fails when the mesh is exchanged under edit mode, which writes the old mesh back on leaving it."""
+    """Fails when the mesh is exchanged under edit mode, which writes the old mesh back on leaving
+    it."""
     head = import_head(mesh_capture(tmp_path))
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
@@ -107,13 +116,17 @@ def test_second_import_in_edit_mode(tmp_path):
 
 def test_two_captures_are_imported_separately(tmp_path):
     """Fails when importing a second capture replaces the first."""
-    one, other = import_head(mesh_capture(tmp_path / "one")), import_head(mesh_capture(tmp_path / "other"))
+    one, other = (
+        import_head(mesh_capture(tmp_path / "one")),
+        import_head(mesh_capture(tmp_path / "other")),
+    )
     assert one != other
     assert one.parent != other.parent
 
 
 def test_rig_is_removed_with_the_capture_s_flame_parameters(tmp_path):
-    """Fails when a folder that changed from FLAME to meshes keeps an armature that deforms the new mesh."""
+    """Fails when a folder that changed from FLAME to meshes keeps an armature that deforms the new
+    mesh."""
     source = tmp_path / "capture"
     import_head(motion_capture(flame_sequence(flame_model()), source))
     capture = mesh_capture(source)

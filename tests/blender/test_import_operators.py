@@ -34,7 +34,11 @@ def model(tmp_path) -> Path:
 def write_motion(path: Path, timesteps: int = 4) -> Path:
     """All timesteps in one file, as VHAP's tracker leaves it."""
     frames = [flame_parameters(timestep) for timestep in range(timesteps)]
-    moving = {name: np.concatenate([f[name] for f in frames]) for name, value in frames[0].items() if value.ndim == 2}
+    moving = {
+        name: np.concatenate([f[name] for f in frames])
+        for name, value in frames[0].items()
+        if value.ndim == 2
+    }
     np.savez(path, **moving, shape=frames[0]["shape"], static_offset=frames[0]["static_offset"])
     return path
 
@@ -62,14 +66,17 @@ def state_of_file() -> dict[str, list[str]]:
 
 
 def test_a_motion_file_is_a_rig(tmp_path, model):
-    """Catches a motion that can be imported and then not worked with, because there is no folder around it."""
+    """Catches a motion that can be imported and then not worked with, because there is no folder
+    around it."""
     path = write_motion(tmp_path / "tracked_flame_params_30.npz")
     assert bpy.ops.stga.import_motion(filepath=str(path), flame=str(model)) == {"FINISHED"}
     scene, capture = bpy.context.scene, open_capture(path, model)
     assert (scene.frame_start, scene.frame_end) == (0, 3)
     for timestep in capture.timesteps:
         scene.frame_set(timestep)
-        np.testing.assert_allclose(evaluated_vertices(scene.stga.head), capture.mesh(timestep), atol=2e-6)
+        np.testing.assert_allclose(
+            evaluated_vertices(scene.stga.head), capture.mesh(timestep), atol=2e-6
+        )
     assert bpy.ops.stga.select(threshold=0.001) == {"FINISHED"}
 
 
@@ -125,7 +132,8 @@ def test_importing_again_keeps_what_an_artist_painted(tmp_path):
 
 
 def test_what_came_in_is_selected(tmp_path):
-    """Catches an import that leaves an artist's other objects selected, or in edit mode, and its head hard to find."""
+    """Catches an import that leaves an artist's other objects selected, or in edit mode, and its
+    head hard to find."""
     mesh = bpy.data.meshes.new("other")
     other = bpy.data.objects.new("other", mesh)
     bpy.context.scene.collection.objects.link(other)
@@ -138,7 +146,10 @@ def test_what_came_in_is_selected(tmp_path):
     assert bpy.context.selected_objects == [head]
     assert bpy.context.view_layer.objects.active == head
     cameras = [thing for thing in bpy.data.objects if thing.type == "CAMERA"]
-    assert all(camera.data.display_size < 0.3 * camera.matrix_world.translation.length for camera in cameras)
+    assert all(
+        camera.data.display_size < 0.3 * camera.matrix_world.translation.length
+        for camera in cameras
+    )
 
 
 def test_wrong_files_change_nothing(tmp_path, model):
@@ -147,13 +158,19 @@ def test_wrong_files_change_nothing(tmp_path, model):
     np.savez(tmp_path / "other.npz", xyz=np.zeros(3))
     (tmp_path / "empty").mkdir()
     before = state_of_file()
-    for name, message in (("noise.npz", "noise"), ("other.npz", "has none of expr"), ("gone.npz", "gone")):
+    for name, message in (
+        ("noise.npz", "noise"),
+        ("other.npz", "has none of expr"),
+        ("gone.npz", "gone"),
+    ):
         with pytest.raises(RuntimeError, match=message):
             bpy.ops.stga.import_motion(filepath=str(tmp_path / name), flame=str(model))
     with pytest.raises(RuntimeError, match="choose your FLAME model in the add-on's preferences"):
         bpy.ops.stga.import_motion(filepath=str(tmp_path / "other.npz"))
     with pytest.raises(RuntimeError, match="no model"):
-        bpy.ops.stga.import_motion(filepath=str(write_motion(tmp_path / "a.npz")), flame=str(tmp_path / "no model.npz"))
+        bpy.ops.stga.import_motion(
+            filepath=str(write_motion(tmp_path / "a.npz")), flame=str(tmp_path / "no model.npz")
+        )
     with pytest.raises(RuntimeError, match="is not a capture"):
         bpy.ops.stga.import_meshes(filepath=str(tmp_path / "empty/a.obj"))
     assert state_of_file() == before

@@ -1,4 +1,5 @@
-"""The built zip, installed as a user installs it: into a new Blender profile, in its own process."""
+"""The built zip, installed as a user installs it: into a new Blender profile, in its own
+process."""
 
 import json
 import os
@@ -55,13 +56,23 @@ def test_blender_validates_the_zip(zip_file, tmp_path):
 
 def test_same_files_as_blenders_own_build(zip_file, tmp_path):
     """Catches exclude patterns that this build and Blender interpret differently."""
-    blender_ext("build", "--source-dir", ROOT, "--output-filepath", tmp_path / "reference.zip", home=tmp_path)
-    names, reference = (set(zipfile.ZipFile(path).namelist()) for path in (zip_file, tmp_path / "reference.zip"))
+    blender_ext(
+        "build",
+        "--source-dir",
+        ROOT,
+        "--output-filepath",
+        tmp_path / "reference.zip",
+        home=tmp_path,
+    )
+    names, reference = (
+        set(zipfile.ZipFile(path).namelist()) for path in (zip_file, tmp_path / "reference.zip")
+    )
     assert names == reference
 
 
 def test_zip_holds_what_the_extension_runs(zip_file):
-    """Catches tests, docs, the benchmark, the demo or the photo studio in the zip, and a module left out."""
+    """Catches tests, docs, the benchmark, the demo or the photo studio in the zip, and a module
+    left out."""
     names = set(zipfile.ZipFile(zip_file).namelist())
     left_out = ("tests/", "docs/", "benchmarks/", "stga_addon/development/", ".")
     assert not [name for name in names if name.startswith(left_out) or name.endswith(".pyc")]
@@ -78,7 +89,9 @@ def test_zip_holds_what_the_extension_runs(zip_file):
         "ui/panel.py",
         "stga_addon/worker/launch.py",
     } <= names
-    assert {name for name in names if name.startswith("wheels/")} == {f"wheels/{name}" for name in WHEELS}
+    assert {name for name in names if name.startswith("wheels/")} == {
+        f"wheels/{name}" for name in WHEELS
+    }
 
 
 def test_equal_sources_give_an_equal_zip(zip_file, tmp_path):
@@ -94,7 +107,8 @@ def test_other_folders_are_refused(tmp_path):
         build_zip(tmp_path / "dist", root=tmp_path)
 
 
-# A Blender that nobody has installed anything into: training's packages are out of reach, others come from the zip.
+# A Blender that nobody has installed anything into: training's packages are out of reach, others
+# come from the zip.
 INSTALL = """
 import importlib.machinery, json, os, sys
 from pathlib import Path
@@ -150,19 +164,31 @@ print("RESULT " + json.dumps(result))
 
 
 def test_install_use_and_uninstall(zip_file, shared_data, tmp_path):
-    """Catches absolute imports, files left out of the zip, and packages that enabling, importing or showing needs."""
+    """Catches absolute imports, files left out of the zip, and packages that enabling, importing or
+    showing needs."""
     folder = shared_data / "studio_head"
     capture = open_capture(folder)
     splats = lattice_splats(capture.neutral, capture.faces, order=0, sh_degree=0)
-    write_avatar(tmp_path / "a.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces))
+    write_avatar(
+        tmp_path / "a.npz",
+        Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces),
+    )
     output = run(INSTALL, zip_file, folder, tmp_path / "a.npz", home=tmp_path)
-    result = json.loads(next(line for line in output.splitlines() if line.startswith("RESULT")).removeprefix("RESULT "))
+    result = json.loads(
+        next(line for line in output.splitlines() if line.startswith("RESULT")).removeprefix(
+            "RESULT "
+        )
+    )
     assert result["enabled"]
     assert result["commands"] == ["stga"]
     assert result["heavy"] == []
     assert result["missing"] == []
-    assert {f"STGA_PT_{step}" for step in ("capture", "select", "train", "show", "motion")} <= set(result["tabs"])
-    assert all(str(tmp_path) in path for path in result["wheels"]), "a bundled wheel was not installed"
+    assert {f"STGA_PT_{step}" for step in ("capture", "select", "train", "show", "motion")} <= set(
+        result["tabs"]
+    )
+    assert all(str(tmp_path) in path for path in result["wheels"]), (
+        "a bundled wheel was not installed"
+    )
     assert result["groups"] > 0
     centres = capture.mesh(result["frame"])[capture.faces].mean(1)
     np.testing.assert_allclose(np.reshape(result["xyz"], (-1, 3)), centres, atol=1e-5)

@@ -1,4 +1,5 @@
-"""Blender's lights, worlds and objects as an avatar sees them, against Cycles; and its colors in the engine."""
+"""Blender's lights, worlds and objects as an avatar sees them, against Cycles; and its colors in
+the engine."""
 
 import sys
 from pathlib import Path
@@ -35,12 +36,14 @@ TURN = Matrix.Rotation(0.7, 3, Vector((1, 2, 0.5)).normalized())
 PLACE = Matrix.LocRotScale(Vector((0.4, -0.2, 0.3)), TURN, (1.3,) * 3)
 """Of the head in the world."""
 BALL = 642
-"""Vertices of the ball; after them come those of the plate, at whose edges normals are not the surface's."""
+"""Vertices of the ball; after them come those of the plate, at whose edges normals are not the
+surface's."""
 
 
 @pytest.fixture(autouse=True)
 def _settings(empty_scene):
-    registered = settings.lighting_settings(bpy.context.scene) is not None  # by the extension, in other tests
+    # by the extension, in other tests
+    registered = settings.lighting_settings(bpy.context.scene) is not None
     if not registered:
         settings.register()
     yield
@@ -75,7 +78,9 @@ def lamp(kind: str, location: tuple[float, ...], energy: float, **properties: ob
         setattr(light, name, value)
     placed = bpy.data.objects.new(kind, light)
     placed.location = location
-    placed.rotation_euler = (Vector(location) - PLACE.translation).to_track_quat("Z", "Y").to_euler()
+    placed.rotation_euler = (
+        (Vector(location) - PLACE.translation).to_track_quat("Z", "Y").to_euler()
+    )
     bpy.context.scene.collection.objects.link(placed)
     return placed
 
@@ -91,7 +96,9 @@ def light_irradiance(found: Relit) -> np.ndarray:
     normals = vertex_normals(found.mesh, found.relighter.avatar.faces)
     lamps = Lamps(found.lighting, found.mesh, found.relighter.avatar.faces, found.casters)
     world = np.maximum(
-        found.relighter.light.transfer @ found.relighter.world_in_head(found.mesh, found.lighting.world), 0
+        found.relighter.light.transfer
+        @ found.relighter.world_in_head(found.mesh, found.lighting.world),
+        0,
     )
     return (lamps.irradiance(found.mesh + LIFT_M * normals, normals) + world)[:BALL]
 
@@ -115,7 +122,9 @@ def baked_irradiance(shown, head) -> np.ndarray:
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 32, False
     whiten(head)
-    head.data.attributes.active_color = head.data.color_attributes.new("baked", "FLOAT_COLOR", "POINT")
+    head.data.attributes.active_color = head.data.color_attributes.new(
+        "baked", "FLOAT_COLOR", "POINT"
+    )
     for each in bpy.context.selected_objects:
         each.select_set(False)
     head.select_set(True)
@@ -139,13 +148,15 @@ LAMPS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAMPS)
 def test_irradiance_is_that_of_cycles(name):
-    """Catches a light in another place, unit, color or size than Blender's, and shadows of head or objects that are
-    missing, beyond 5 % of the mean."""
+    """Catches a light in another place, unit, color or size than Blender's, and shadows of head or
+    objects that are missing, beyond 5 % of the mean."""
     shown, head = shown_head()
     kind, location, energy, properties = LAMPS[name]
     lamp(kind, location, energy, **properties)
     if kind != "AREA":  # whose shadows are harder than they should be
-        bpy.ops.mesh.primitive_cube_add(size=0.05, location=PLACE.translation.lerp(Vector(location), 0.4))
+        bpy.ops.mesh.primitive_cube_add(
+            size=0.05, location=PLACE.translation.lerp(Vector(location), 0.4)
+        )
     found = relit()
     expected = baked_irradiance(shown, head)
     arriving = light_irradiance(found)
@@ -157,12 +168,13 @@ def test_irradiance_is_that_of_cycles(name):
 
 SIDE_PX, WIDTH_M = 512, 0.34
 MIN_FACING = 0.5
-"""Cosine towards the light of surface whose shadows count: where it is less, lifted points see past what blocks."""
+"""Cosine towards the light of surface whose shadows count: where it is less, lifted points see past
+what blocks."""
 
 
 def seen_points(head) -> tuple[np.ndarray, np.ndarray]:
-    """What the scene's orthographic camera sees of the head in each pixel: points (H, W, 3) and normals in the world;
-    NaN where there is none."""
+    """What the scene's orthographic camera sees of the head in each pixel: points (H, W, 3) and
+    normals in the world; NaN where there is none."""
     mesh = head.data
     corners = [PLACE @ vertex.co for vertex in mesh.vertices]
     tree = BVHTree.FromPolygons(corners, [tuple(polygon.vertices) for polygon in mesh.polygons])
@@ -182,14 +194,16 @@ def edges(shadow: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """(N, 2) pixels beside which lies one that is shadowed otherwise, where both count."""
     across = (shadow[:, 1:] != shadow[:, :-1]) & counts[:, 1:] & counts[:, :-1]
     down = (shadow[1:] != shadow[:-1]) & counts[1:] & counts[:-1]
-    return np.concatenate([np.argwhere(across) + np.array([0, 0.5]), np.argwhere(down) + np.array([0.5, 0])])
+    return np.concatenate(
+        [np.argwhere(across) + np.array([0, 0.5]), np.argwhere(down) + np.array([0.5, 0])]
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "energy"), [("SUN", 3.0), ("POINT", 30.0)])
 def test_edges_of_shadows_are_those_of_cycles(kind, energy, tmp_path):
-    """Catches shadows that are shifted or torn off by lift and bias: edges beyond 2 pixels of 512 from the path
-    tracer's."""
+    """Catches shadows that are shifted or torn off by lift and bias: edges beyond 2 pixels of 512
+    from the path tracer's."""
     shown, head = shown_head()
     head.data.shade_flat()
     location = tuple(PLACE @ Vector((0.6, 1.0, 0.2)))  # the plate throws its shadow onto the ball
@@ -200,7 +214,9 @@ def test_edges_of_shadows_are_those_of_cycles(kind, energy, tmp_path):
     scene.camera = bpy.data.objects.new("camera", camera)
     scene.collection.objects.link(scene.camera)
     scene.camera.location = PLACE @ Vector((-0.6, 0.9, 0.9))
-    scene.camera.rotation_euler = (scene.camera.location - PLACE.translation).to_track_quat("Z", "Y").to_euler()
+    scene.camera.rotation_euler = (
+        (scene.camera.location - PLACE.translation).to_track_quat("Z", "Y").to_euler()
+    )
     found = relit()
     points, normals = seen_points(head)
     toward = np.array(location) - (points if kind == "POINT" else np.array(PLACE.translation))
@@ -214,12 +230,17 @@ def test_edges_of_shadows_are_those_of_cycles(kind, energy, tmp_path):
     depths = ShadowMap(found.mesh, found.relighter.avatar.faces, found.lighting.lights[0])
     lit[counts] = depths.lit(inside + LIFT_M * turned, normals=turned)
     expected = path_traced(shown, head, tmp_path / "image.exr") / np.maximum(facing, MIN_FACING)
-    ours, theirs = edges(lit < 0.5, counts), edges(expected < np.nanmax(expected[counts]) / 4, counts)
+    ours, theirs = (
+        edges(lit < 0.5, counts),
+        edges(expected < np.nanmax(expected[counts]) / 4, counts),
+    )
     assert len(theirs) > 100
     apart = np.linalg.norm(ours[:, None] - theirs[None], axis=2)
     one, other = apart.min(0), apart.min(1)
     most = [float(np.quantile(distance, 0.95)) for distance in (one, other)]
-    print(f"{kind}: {len(theirs)} pixels of edges; mean {one.mean():.2f}, {other.mean():.2f}, 95 % {most} px")
+    print(
+        f"{kind}: {len(theirs)} pixels of edges; mean {one.mean():.2f}, {other.mean():.2f}, 95 % {most} px"
+    )
     assert max(most) < 2
 
 
@@ -232,7 +253,10 @@ def path_traced(shown, head, path: Path) -> np.ndarray:
     scene.cycles.max_bounces, scene.cycles.pixel_filter_type = 0, "BOX"
     scene.cycles.filter_width = 0.01
     scene.render.resolution_x = scene.render.resolution_y = SIDE_PX
-    scene.render.image_settings.file_format, scene.render.image_settings.exr_codec = "OPEN_EXR", "NONE"
+    scene.render.image_settings.file_format, scene.render.image_settings.exr_codec = (
+        "OPEN_EXR",
+        "NONE",
+    )
     scene.render.image_settings.color_depth, scene.view_settings.view_transform = "32", "Raw"
     scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True)
@@ -243,7 +267,9 @@ def path_traced(shown, head, path: Path) -> np.ndarray:
 def sky(size: tuple[int, int] = (64, 32)):
     """A float image: blue above, and a warm glow to one side."""
     image = bpy.data.images.new("sky", *size, float_buffer=True)
-    v, u = np.meshgrid((np.arange(size[1]) + 0.5) / size[1], (np.arange(size[0]) + 0.5) / size[0], indexing="ij")
+    v, u = np.meshgrid(
+        (np.arange(size[1]) + 0.5) / size[1], (np.arange(size[0]) + 0.5) / size[0], indexing="ij"
+    )
     glow = np.exp(-4 * ((u - 0.3) ** 2 + (v - 0.6) ** 2))
     pixels = np.stack([glow, 0.5 * glow + 0.1 * v, 0.3 * v, np.ones_like(u)], -1).astype(np.float32)
     image.pixels.foreach_set(pixels.ravel())
@@ -257,7 +283,10 @@ def use_texture(world, image, **mapping: object) -> None:
     links.new(texture.outputs["Color"], nodes["Background"].inputs["Color"])
     if mapping:
         turn, source = nodes.new("ShaderNodeMapping"), nodes.new("ShaderNodeTexCoord")
-        turn.vector_type, turn.inputs["Rotation"].default_value = mapping["kind"], mapping["rotation"]
+        turn.vector_type, turn.inputs["Rotation"].default_value = (
+            mapping["kind"],
+            mapping["rotation"],
+        )
         links.new(source.outputs["Generated"], turn.inputs["Vector"])
         links.new(turn.outputs["Vector"], texture.inputs["Vector"])
 
@@ -265,7 +294,8 @@ def use_texture(world, image, **mapping: object) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["color", "texture", "turned point", "turned texture"])
 def test_world_is_that_of_cycles(case):
-    """Catches a mirrored or turned environment, its strength, and occlusion by the head, beyond 5 % of the mean."""
+    """Catches a mirrored or turned environment, its strength, and occlusion by the head, beyond 5 %
+    of the mean."""
     shown, head = shown_head()
     world = bpy.context.scene.world
     background(world)["Strength"].default_value = 1.7
@@ -283,7 +313,8 @@ def test_world_is_that_of_cycles(case):
 
 
 def test_lights_that_do_not_count():
-    """Catches light linking, hidden lights, a chosen collection, or a switched-off world that is ignored."""
+    """Catches light linking, hidden lights, a chosen collection, or a switched-off world that is
+    ignored."""
     shown, _ = shown_head()
     lighting = bpy.context.scene.stga_lighting
     kinds = [lamp(kind, (1.0, -0.5, 2.0), 3.0) for kind in ("SUN", "POINT", "SPOT")]
@@ -295,7 +326,11 @@ def test_lights_that_do_not_count():
     assert found() == ["sun", "point", "spot"]
     kinds[0].hide_render = True
     assert found() == ["point", "spot"]
-    cases = (shown, "EXCLUDE", ["spot"]), (kinds[0], "INCLUDE", ["spot"]), (shown, "INCLUDE", ["point", "spot"])
+    cases = (
+        (shown, "EXCLUDE", ["spot"]),
+        (kinds[0], "INCLUDE", ["spot"]),
+        (shown, "INCLUDE", ["point", "spot"]),
+    )
     for receivers, state, expected in cases:
         collection = bpy.data.collections.new("receivers")
         collection.objects.link(receivers)
@@ -314,7 +349,8 @@ def test_lights_that_do_not_count():
 
 
 def test_nothing_is_made_anew_while_nothing_moves():
-    """Catches a redraw that relights what it has, and one that keeps an earlier light, pose or caster."""
+    """Catches a redraw that relights what it has, and one that keeps an earlier light, pose or
+    caster."""
     _, head = shown_head()
     light = lamp("POINT", (1.0, -0.5, 1.0), 30.0)
     bpy.ops.mesh.primitive_cube_add(size=0.1, location=(1, 1, 1))
@@ -346,12 +382,17 @@ def test_light_is_kept_in_the_file():
     expected, found = lit_avatar().light, stored_avatar(shown).light
     for name in ("radiance", "transfer", "occlusion", "irradiance", "roughness"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-6)
-    assert (found.residual, found.damping, found.source) == (expected.residual, expected.damping, expected.source)
+    assert (found.residual, found.damping, found.source) == (
+        expected.residual,
+        expected.damping,
+        expected.source,
+    )
 
 
 @pytest.mark.parametrize("engine", ["CYCLES", pytest.param(EEVEE, marks=EEVEE_MARKS)])
 def test_shadow_onto_the_scene(engine, tmp_path):
-    """Catches a head that is seen where it should only throw its shadow, and a shadow that is missing."""
+    """Catches a head that is seen where it should only throw its shadow, and a shadow that is
+    missing."""
     shown, head = shown_head()
     lamp("SUN", (0.4, -0.2, 2.0), 3.0)
     bpy.ops.mesh.primitive_plane_add(size=2, location=(0.4, -0.2, 0.0))

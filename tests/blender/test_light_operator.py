@@ -18,8 +18,8 @@ from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # n
 
 @pytest.mark.slow
 def test_estimate_light(extension, tmp_path):
-    """Catches a button whose worker is not given the run, whose light is another than training finds, does not reach
-    the splats that are shown, or reaches those of another avatar."""
+    """Catches a button whose worker is not given the run, whose light is another than training
+    finds, does not reach the splats that are shown, or reaches those of another avatar."""
     run, scene = tmp_path / "run", bpy.context.scene
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     assert bpy.ops.stga.train(directory=str(run), iterations=6) == {"FINISHED"}
@@ -35,7 +35,9 @@ def test_estimate_light(extension, tmp_path):
     assert bpy.ops.stga.estimate_light() == {"FINISHED"}
     found = stored_avatar(shown).light
     for name in ("radiance", "transfer", "occlusion", "irradiance", "roughness"):
-        np.testing.assert_allclose(getattr(found, name), getattr(trained.light, name), atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(trained.light, name), atol=1e-6, err_msg=name
+        )
     assert read_avatar(run / "avatar.npz").light.source == "estimated"
     bpy.context.view_layer.update()
     (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())

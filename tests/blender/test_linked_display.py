@@ -1,4 +1,5 @@
-"""What the GPU display and the engine draw of heads in other files: linked, instanced, and library overrides."""
+"""What the GPU display and the engine draw of heads in other files: linked, instanced, and library
+overrides."""
 
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def shown_at(frame: int, cache: SplatCache) -> np.ndarray:
 
 @pytest.fixture
 def library(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
-    """A .blend file with a moving head and its splats in the collection "anna", and where they are at FRAMES."""
+    """A .blend file with a moving head and its splats in the collection "anna", and where they are
+    at FRAMES."""
     avatar = avatar_of("stga", 300)
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
@@ -53,7 +55,8 @@ def linked_collection(path: Path):
 
 
 def test_linked_heads_are_followed(library):
-    """Catches linked splats that are not drawn, stand still, or need what only their own file has."""
+    """Catches linked splats that are not drawn, stand still, or need what only their own file
+    has."""
     path, expected = library
     bpy.context.scene.collection.children.link(linked_collection(path))
     cache = SplatCache()
@@ -70,11 +73,14 @@ def test_instances_of_linked_heads_are_followed(library):
     bpy.context.scene.collection.objects.link(instance)
     cache = SplatCache()
     for frame, positions_there in zip(FRAMES, expected, strict=True):
-        np.testing.assert_allclose(shown_at(frame, cache), 2 * positions_there + [1, 2, 3], atol=1e-5)
+        np.testing.assert_allclose(
+            shown_at(frame, cache), 2 * positions_there + [1, 2, 3], atol=1e-5
+        )
 
 
 def test_overridden_heads_are_followed(library):
-    """Catches splats of a library override that follow the library's head instead of the one that is posed here."""
+    """Catches splats of a library override that follow the library's head instead of the one that
+    is posed here."""
     path, expected = library
     scene = bpy.context.scene
     linked = linked_collection(path)
@@ -82,7 +88,11 @@ def test_overridden_heads_are_followed(library):
     linked.override_hierarchy_create(scene, bpy.context.view_layer)
     if linked.name in scene.collection.children:
         scene.collection.children.unlink(linked)
-    own = {thing.name: thing for thing in bpy.context.view_layer.objects if thing.override_library is not None}
+    own = {
+        thing.name: thing
+        for thing in bpy.context.view_layer.objects
+        if thing.override_library is not None
+    }
     assert set(own) == {"root", "head", "head splats"}
     cache = SplatCache()
     for frame, positions_there in zip(FRAMES, expected, strict=True):

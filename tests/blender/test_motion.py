@@ -62,7 +62,8 @@ def curves_of(owner, action) -> dict:
 
 
 def test_applied_motion_equals_the_forward_pass(head, own, other):
-    """Fails when the other's identity is applied too, a frame is shifted, or an old coefficient keeps its value."""
+    """Fails when the other's identity is applied too, a frame is shifted, or an old coefficient
+    keeps its value."""
     apply_motion(head, retimed(other), 11, "other")
     for index in range(4):
         expected = mesh(own, other.frame(index))
@@ -77,14 +78,18 @@ def test_applying_one_part_keeps_the_other_parts(head, own, other, part, as_stri
     apply_motion(head, retimed(other), 2, "other", (part,), as_strip)
     for index in range(4):
         theirs = other.frame(index)
-        frame = replace(own.frame(2 + index), **{name: getattr(theirs, name) for name in PARTS[part]})
+        frame = replace(
+            own.frame(2 + index), **{name: getattr(theirs, name) for name in PARTS[part]}
+        )
         np.testing.assert_allclose(at_frame(head, 2 + index), mesh(own, frame), atol=TOLERANCE)
 
 
 def test_the_old_action_is_unchanged(head, own, other, tmp_path):
-    """Fails when applying edits the action in place, or the old one is gone once the file is saved and opened."""
+    """Fails when applying edits the action in place, or the old one is gone once the file is saved
+    and opened."""
     before = [
-        (owner.animation_data.action.name, curves_of(owner, owner.animation_data.action)) for owner in owners(head)
+        (owner.animation_data.action.name, curves_of(owner, owner.animation_data.action))
+        for owner in owners(head)
     ]
     apply_motion(head, retimed(other), 2, "other")
     name = head.name
@@ -104,7 +109,12 @@ def test_strips_override_only_their_frames(head, own, other):
     """Fails when a strip changes frames outside it, or a second one removes the first."""
     apply_motion(head, retimed(other), 2, "once", as_strip=True)
     apply_motion(head, retimed(other), 4, "twice", as_strip=True)
-    for frame, expected in ((1, own.frame(1)), (2, other.frame(0)), (4, other.frame(0)), (7, other.frame(3))):
+    for frame, expected in (
+        (1, own.frame(1)),
+        (2, other.frame(0)),
+        (4, other.frame(0)),
+        (7, other.frame(3)),
+    ):
         np.testing.assert_allclose(at_frame(head, frame), mesh(own, expected), atol=TOLERANCE)
     for owner in owners(head):
         assert [len(track.strips) for track in owner.animation_data.nla_tracks] == [1, 1, 1]
@@ -137,13 +147,16 @@ def test_tracked_offsets_are_zero_under_another_motion(own, other, tmp_path):
     """Fails when the head's own per-frame vertex offsets deform another person's expressions."""
     tracked = flame_sequence(own.model, timesteps=range(1, 5), seed=1, dynamic=True)
     for as_strip in (False, True):
-        head = import_head(motion_capture(tracked, tmp_path / "own.npz"), warn=lambda sentence: None)
+        head = import_head(
+            motion_capture(tracked, tmp_path / "own.npz"), warn=lambda sentence: None
+        )
         apply_motion(head, retimed(other), 2, "other", as_strip=as_strip)
         np.testing.assert_allclose(at_frame(head, 3), mesh(tracked, other.frame(1)), atol=TOLERANCE)
 
 
 def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
-    """Fails when a motion is written in part, or a head without a rig raises another error than StgaError."""
+    """Fails when a motion is written in part, or a head without a rig raises another error than
+    StgaError."""
     rig = rig_of(head)
     rig.pose.bones["jaw"].rotation_mode = "XYZ"
     actions = len(bpy.data.actions)
@@ -169,11 +182,14 @@ def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
 def assert_same_motion(read: FlameSequence, frames: list) -> None:
     for index, frame in enumerate(frames):
         for name in FIELDS:
-            np.testing.assert_allclose(getattr(read.frame(index), name), getattr(frame, name), atol=2e-6)
+            np.testing.assert_allclose(
+                getattr(read.frame(index), name), getattr(frame, name), atol=2e-6
+            )
 
 
 def test_sampled_motion_equals_the_keyframes(head, own):
-    """Fails when a rotation is read in another space, or the root joint's displacement counts as translation."""
+    """Fails when a rotation is read in another space, or the root joint's displacement counts as
+    translation."""
     said = []
     bpy.context.scene.frame_set(3)
     read = sample_motion(head, own, range(1, 7), warn=said.append)
@@ -196,7 +212,8 @@ def test_sampled_motion_includes_edits_by_hand(head, own):
     said = []
     read = sample_motion(head, own, (1,), warn=said.append)
     assert read.shape[2] == pytest.approx(own.shape[2] + 1.5)
-    # The constraint bypasses the bone's own rotation, which the correctives are driven by; all else is FLAME's.
+    # The constraint bypasses the bone's own rotation, which the correctives are driven by; all else
+    # is FLAME's.
     flat = replace(own.model, posedirs=np.zeros_like(own.model.posedirs))
     keys_off = [key for key in keys if key.name.startswith("pose_")]
     for key in keys_off:
@@ -223,5 +240,7 @@ def test_sampled_motion_includes_tracked_offsets(own, tmp_path):
     said = []
     read = sample_motion(head, tracked, range(1, 5), warn=said.append)
     for index, timestep in enumerate(tracked.timesteps):
-        np.testing.assert_allclose(sequence_mesh(read, index), sequence_mesh(tracked, timestep), atol=1e-5)
+        np.testing.assert_allclose(
+            sequence_mesh(read, index), sequence_mesh(tracked, timestep), atol=1e-5
+        )
     assert said == []

@@ -1,4 +1,5 @@
-"""What Blender's native splats are drawn from, against the numpy embedding; also in the Blenders of STGA_BLENDER."""
+"""What Blender's native splats are drawn from, against the numpy embedding; also in the Blenders of
+STGA_BLENDER."""
 
 import os
 import shlex
@@ -21,7 +22,11 @@ from stga_addon.scene.layers import FROZEN_COLOR
 from .test_splat_object import avatar_of, same_rotation
 
 SCRIPT = Path(__file__).with_name("native_script.py")
-BLENDERS = [shlex.split(command) for command in os.environ.get("STGA_BLENDER", "").split(" ; ") if command.strip()]
+BLENDERS = [
+    shlex.split(command)
+    for command in os.environ.get("STGA_BLENDER", "").split(" ; ")
+    if command.strip()
+]
 COMMANDS = [
     [sys.executable],
     *([*command, "--background", "--python-exit-code", "1", "--python"] for command in BLENDERS),
@@ -30,9 +35,10 @@ COMMANDS = [
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: Path(command[0]).name)
 def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_path: Path) -> None:
-    """Catches an attribute that is missing, or named or activated in another way than Blender reads it: sizes as
-    logarithms or without their factor, opacities as logits or dropped, splats that do not move with the mesh, harmonics
-    in another order or turned with triangles, and colors without strain, selection or new light."""
+    """Catches an attribute that is missing, or named or activated in another way than Blender reads
+    it: sizes as logarithms or without their factor, opacities as logits or dropped, splats that do
+    not move with the mesh, harmonics in another order or turned with triangles, and colors without
+    strain, selection or new light."""
     avatar, rng = avatar_of("stga", 400), np.random.default_rng(4)
     splats = replace(
         avatar.splats,
@@ -40,11 +46,15 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
         strain_color=rng.normal(0, 0.2, (400, 3, 3)).astype(np.float32),
     )
     avatar = replace(avatar, splats=splats)
-    posed = avatar.neutral @ [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]] + rng.normal(0, 0.004, avatar.neutral.shape)
+    posed = avatar.neutral @ [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]] + rng.normal(
+        0, 0.004, avatar.neutral.shape
+    )
     write_avatar(tmp_path / "a.npz", avatar)
     np.save(tmp_path / "head.npy", posed)
     arguments = [tmp_path / "a.npz", tmp_path / "head.npy", tmp_path / "found.npz"]
-    done = subprocess.run([*command, SCRIPT, "--", *arguments], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, SCRIPT, "--", *arguments], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     found = np.load(tmp_path / "found.npz")
     assert found["recorded/type"] in ("", "GAUSSIAN_SPLAT")
@@ -57,7 +67,9 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     flat = {"gray": np.array(FROZEN_COLOR[:3]), "relit": relit}
     for case in ("recorded", "constant", *flat):
         base = (linear_to_srgb(flat[case]) - 0.5) / SH_C0 if case in flat else wanted.sh[:, 0]
-        np.testing.assert_allclose(found[f"{case}/radiance:base"][:, :3], np.broadcast_to(base, (400, 3)), atol=5e-5)
+        np.testing.assert_allclose(
+            found[f"{case}/radiance:base"][:, :3], np.broadcast_to(base, (400, 3)), atol=5e-5
+        )
         np.testing.assert_allclose(found[f"{case}/radiance:base"][:, 3], opacity, atol=1e-6)
         names = [name for name in found if name.startswith(f"{case}/radiance:sh_")]
         assert sorted(names) == sorted(f"{case}/radiance:sh_{index}" for index in range(15))

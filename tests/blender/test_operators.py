@@ -52,7 +52,8 @@ def mesh_capture(tmp_path) -> Path:
 
 @pytest.fixture
 def shown(mesh_capture, tmp_path) -> tuple[Capture, Avatar]:
-    """A mesh capture whose head is in the scene, and the avatar of avatar.npz, which is shown on it."""
+    """A mesh capture whose head is in the scene, and the avatar of avatar.npz, which is shown on
+    it."""
     bpy.ops.stga.import_capture(directory=str(mesh_capture))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz")) == {"FINISHED"}
@@ -64,7 +65,9 @@ def assert_follow(capture: Capture, avatar: Avatar, timesteps: Iterable[int]) ->
     for timestep in timesteps:
         bpy.context.scene.frame_set(timestep)
         xyz, _, _ = evaluated_splats(bpy.context.scene.stga.splats)
-        np.testing.assert_allclose(xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5)
+        np.testing.assert_allclose(
+            xyz, expected_world(avatar, capture.mesh(timestep)).xyz, atol=1e-5
+        )
 
 
 def registered(name: str) -> bool:
@@ -77,18 +80,23 @@ def write_ball_avatar(path: Path, convention: str = "stga") -> Avatar:
     faces = faces.astype(np.int32)
     splats = lattice_splats(vertices, faces, sh_degree=1, convention=convention)
     rng = np.random.default_rng(0)
-    splats = replace(splats, xyz=splats.xyz + rng.normal(0, 0.002, splats.xyz.shape).astype(np.float32))
+    splats = replace(
+        splats, xyz=splats.xyz + rng.normal(0, 0.002, splats.xyz.shape).astype(np.float32)
+    )
     avatar = Avatar(splats, convention, vertices.astype(np.float32), faces)
     write_avatar(path, avatar)
     return avatar
 
 
 def expected_world(avatar: Avatar, vertices: np.ndarray) -> Splats:
-    return to_world(avatar.splats, face_frames(vertices, avatar.faces, avatar.neutral, avatar.convention))
+    return to_world(
+        avatar.splats, face_frames(vertices, avatar.faces, avatar.neutral, avatar.convention)
+    )
 
 
 def test_register_and_unregister_leave_nothing(extension):
-    """Catches classes, menus and properties that stay behind, which the next enabling would trip over."""
+    """Catches classes, menus and properties that stay behind, which the next enabling would trip
+    over."""
     menu = len(bpy.types.TOPBAR_MT_file_import.draw._draw_funcs)
     assert all(registered(name) for name in OPERATORS)
     extension.unregister()
@@ -113,17 +121,21 @@ def test_a_failing_registration_is_rolled_back(extension, monkeypatch):
 
 
 def test_every_operator_explains_itself(extension):
-    """Catches operators and properties without the tooltip that is their only manual inside Blender."""
+    """Catches operators and properties without the tooltip that is their only manual inside
+    Blender."""
     for name in OPERATORS:
         kind = getattr(bpy.ops.stga, name).get_rna_type()
         assert kind.description not in ("", "(undocumented operator)"), name
         for prop in kind.properties:
-            assert prop.identifier == "rna_type" or prop.is_hidden or prop.description, (name, prop.identifier)
+            assert prop.identifier == "rna_type" or prop.is_hidden or prop.description, (
+                name,
+                prop.identifier,
+            )
 
 
 def test_options_are_those_of_the_request(extension):
-    """Catches a limit, default or choice that differs from the command line's, and 0 that is not taken for "not given",
-    or is called a value."""
+    """Catches a limit, default or choice that differs from the command line's, and 0 that is not
+    taken for "not given", or is called a value."""
     shown = bpy.ops.stga.track_footage.get_rna_type().properties
     for name in ("focal", "start", "stop", "step"):
         field = Track.__dataclass_fields__[name]
@@ -134,7 +146,9 @@ def test_options_are_those_of_the_request(extension):
     assert {item.identifier for item in bpy.ops.stga.train.get_rna_type().properties["strategy"].enum_items} == {
         "global", "selective", "gaussian-avatars",
     }  # fmt: skip
-    given = SimpleNamespace(focal=0.0, start=0, stop=0, step=2, model="", cameras="/a.json", mattes="none")
+    given = SimpleNamespace(
+        focal=0.0, start=0, stop=0, step=2, model="", cameras="/a.json", mattes="none"
+    )
     names = ("focal", "start", "stop", "step", "model", "cameras")
     assert extension.operators.options.given_values(given, Track, *names) == {
         "start": 0, "step": 2, "cameras": Path("/a.json"),
@@ -155,7 +169,16 @@ SET_BY_PANEL = {
         "matte_folder",
     },
     "view_footage": set(),
-    "train": {"directory", "minutes", "resume", "strategy", "preset", "device", "adapter", "effects"},
+    "train": {
+        "directory",
+        "minutes",
+        "resume",
+        "strategy",
+        "preset",
+        "device",
+        "adapter",
+        "effects",
+    },
     "refine": {"directory", "group", "seconds", "growth", "device", "adapter"},
     "extend": {"directory", "take", "seconds", "device", "adapter"},
     "apply_motion": {"filter_glob"},
@@ -165,12 +188,14 @@ SET_BY_PANEL = {
     "heat_map": set(),
     "copy_report": set(),
 }
-"""Operator -> properties that its button in the panel sets, or that a user chooses in its file dialog."""
+"""Operator -> properties that its button in the panel sets, or that a user chooses in its file
+dialog."""
 
 
 @pytest.mark.parametrize("name", SET_BY_PANEL)
 def test_no_hidden_state_between_calls(extension, name):
-    """Catches a script's `resume` or `own_offsets` that Blender remembers for the next click on a button.
+    """Catches a script's `resume` or `own_offsets` that Blender remembers for the next click on a
+    button.
 
     Without a window Blender remembers nothing, so what tells it not to is checked.
     """
@@ -188,7 +213,8 @@ def test_steps_wait_for_a_capture(extension):
 
 
 def test_mesh_capture_from_import_to_show(extension, mesh_capture, tmp_path):
-    """Catches a chain that breaks between two operators: each works on what the one before left in the scene."""
+    """Catches a chain that breaks between two operators: each works on what the one before left in
+    the scene."""
     capture = open_capture(mesh_capture)
     assert bpy.ops.stga.import_capture(directory=str(mesh_capture)) == {"FINISHED"}
     scene = bpy.context.scene
@@ -204,7 +230,9 @@ def test_mesh_capture_from_import_to_show(extension, mesh_capture, tmp_path):
     assert rule[3].any()
     written = read_selection(head)
     for timestep, selected in rule.items():
-        np.testing.assert_array_equal(written[timestep], closure(selected, capture.faces) & selected.any())
+        np.testing.assert_array_equal(
+            written[timestep], closure(selected, capture.faces) & selected.any()
+        )
 
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     assert bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz")) == {"FINISHED"}
@@ -212,7 +240,8 @@ def test_mesh_capture_from_import_to_show(extension, mesh_capture, tmp_path):
 
 
 def test_flame_capture_from_import_to_show(extension, tmp_path):
-    """Catches the same for a rigged head, whose mesh bones and correctives move, not one key a frame."""
+    """Catches the same for a rigged head, whose mesh bones and correctives move, not one key a
+    frame."""
     folder, model = write_flame_capture(tmp_path / "capture")
     capture = open_capture(folder, model)
     assert bpy.ops.stga.import_capture(directory=str(folder), flame=str(model)) == {"FINISHED"}
@@ -227,14 +256,21 @@ def test_flame_capture_from_import_to_show(extension, tmp_path):
 
 
 def test_exports_read_back(shown, tmp_path):
-    """Catches exports of the neutral pose, of the wrong frame, or in the head's turned world axes."""
+    """Catches exports of the neutral pose, of the wrong frame, or in the head's turned world
+    axes."""
     capture, avatar = shown
     bpy.context.scene.frame_set(3)
-    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "one.ply"), format="ply") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "one.ply"), format="ply") == {
+        "FINISHED"
+    }
     at_3 = expected_world(avatar, capture.mesh(3)).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "one.ply").xyz, at_3, atol=1e-5)
-    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "many"), format="ply-sequence") == {"FINISHED"}
-    assert sorted(path.name for path in (tmp_path / "many").glob("*.ply")) == [f"{frame:05d}.ply" for frame in range(4)]
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "many"), format="ply-sequence") == {
+        "FINISHED"
+    }
+    assert sorted(path.name for path in (tmp_path / "many").glob("*.ply")) == [
+        f"{frame:05d}.ply" for frame in range(4)
+    ]
     np.testing.assert_allclose(read_ply(tmp_path / "many/00003.ply").xyz, at_3, atol=1e-5)
     assert np.abs(read_ply(tmp_path / "many/00000.ply").xyz - at_3).max() > 1e-3
     assert bpy.context.scene.frame_current == 3
@@ -243,12 +279,15 @@ def test_exports_read_back(shown, tmp_path):
 
 
 def test_exports_for_other_tools(shown, tmp_path):
-    """Catches formats that Blender cannot write, frames left out, and a rate that is not the scene's."""
+    """Catches formats that Blender cannot write, frames left out, and a rate that is not the
+    scene's."""
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     capture, avatar = shown
     bpy.context.scene.render.fps = 30
     for name, format in {"a.usdz": "usd", "a.glb": "gltf", "a.spz": "spz"}.items():
-        assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / name), format=format) == {"FINISHED"}
+        assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / name), format=format) == {
+            "FINISHED"
+        }
         assert (tmp_path / name).stat().st_size > 0
     stage = usd.Stage.Open(str(tmp_path / "a.usdz"))
     assert stage.GetTimeCodesPerSecond() == 30
@@ -260,10 +299,13 @@ def test_exports_for_other_tools(shown, tmp_path):
 
 
 def test_export_of_a_web_page(shown, tmp_path):
-    """Catches a page of other frames than the scene's, at another rate, or seen from elsewhere than its camera."""
+    """Catches a page of other frames than the scene's, at another rate, or seen from elsewhere than
+    its camera."""
     scene = bpy.context.scene
     scene.render.fps, scene.frame_start = 30, 1
-    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web") == {"FINISHED"}
+    assert bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web") == {
+        "FINISHED"
+    }
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert header["fps"] == 30
     assert len(arrays["translation"]) == 3
@@ -276,8 +318,11 @@ def test_export_of_a_web_page(shown, tmp_path):
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-5)
 
 
-def range_export(extension, folder: Path, frames: range, stop_after: int | None = None) -> list[Path]:
-    """The files of a range exported step by step, as the dialog does; cancelled after some steps."""
+def range_export(
+    extension, folder: Path, frames: range, stop_after: int | None = None
+) -> list[Path]:
+    """The files of a range exported step by step, as the dialog does; cancelled after some
+    steps."""
     module = sys.modules[f"{extension.__name__}.operators.export_range"]
 
     def write(meshes):
@@ -290,7 +335,9 @@ def range_export(extension, folder: Path, frames: range, stop_after: int | None 
         window_manager=SimpleNamespace(event_timer_remove=said.append),
         workspace=SimpleNamespace(status_text_set=said.append),
     )
-    dialog = SimpleNamespace(_range=job, _timer="timer", filepath="", report=lambda kind, text: said.append(text))
+    dialog = SimpleNamespace(
+        _range=job, _timer="timer", filepath="", report=lambda kind, text: said.append(text)
+    )
     dialog._end = lambda context: operator._end(dialog, context)
     result = {"RUNNING_MODAL"}
     while result == {"RUNNING_MODAL"}:
@@ -303,7 +350,8 @@ def range_export(extension, folder: Path, frames: range, stop_after: int | None 
 
 
 def test_a_range_is_exported_step_by_step(extension, mesh_capture, tmp_path):
-    """Catches a dialog's export that differs from a script's, and one that leaves traces where it was cancelled."""
+    """Catches a dialog's export that differs from a script's, and one that leaves traces where it
+    was cancelled."""
     bpy.ops.stga.import_capture(directory=str(mesh_capture))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     bpy.context.scene.frame_set(1)
@@ -352,7 +400,10 @@ def test_gaussian_avatars_export(extension, tmp_path):
 def test_import_ply(extension, tmp_path, up):
     """Catches a scan that lies on its back: the file's up axis must point along Blender's z."""
     vertices, faces = ball()
-    splats = replace(lattice_splats(vertices, faces.astype(np.int32), order=0), face=np.zeros(len(faces), np.int32))
+    splats = replace(
+        lattice_splats(vertices, faces.astype(np.int32), order=0),
+        face=np.zeros(len(faces), np.int32),
+    )
     write_ply(tmp_path / "scan.ply", splats)
     assert bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"), up=up) == {"FINISHED"}
     shown = bpy.context.scene.stga.splats
@@ -365,7 +416,11 @@ def test_import_ply(extension, tmp_path, up):
 @pytest.mark.parametrize(
     ("operator", "arguments", "sentence"),
     [
-        ("import_capture", {"directory": "{folder}/nowhere"}, r"^Error: .*nowhere: is not a folder"),
+        (
+            "import_capture",
+            {"directory": "{folder}/nowhere"},
+            r"^Error: .*nowhere: is not a folder",
+        ),
         ("import_capture", {}, "no path given"),
         ("import_capture", {"directory": "//capture"}, "has not been saved yet"),
         ("import_capture", {"directory": "{folder}/capture"}, r"00003\.obj"),
@@ -377,7 +432,9 @@ def test_mistakes_are_sentences(extension, mesh_capture, tmp_path, operator, arg
     (mesh_capture / "meshes/00003.obj").write_text("v 0 0 nan\n")
     (tmp_path / "broken.ply").write_bytes(b"ply\n")
     with pytest.raises(RuntimeError, match=sentence):
-        getattr(bpy.ops.stga, operator)(**{name: text.format(folder=tmp_path) for name, text in arguments.items()})
+        getattr(bpy.ops.stga, operator)(
+            **{name: text.format(folder=tmp_path) for name, text in arguments.items()}
+        )
     assert not bpy.data.objects
 
 
@@ -405,7 +462,8 @@ def test_a_hidden_head_still_moves_its_splats(shown):
 
 
 def test_show_selection_after_select(shown):
-    """Catches the two sides of the vertex groups' name and weight drifting apart: Python writes, nodes read."""
+    """Catches the two sides of the vertex groups' name and weight drifting apart: Python writes,
+    nodes read."""
     bpy.ops.stga.select(threshold=0.0015)
     scene, (_, avatar) = bpy.context.scene, shown
     set_input(scene.stga.splats, splat_nodes.DISPLAY, POINTS)

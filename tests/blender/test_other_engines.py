@@ -35,7 +35,9 @@ MIN_PSNR_DB = 33.0
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
 EEVEE_MARKS = (
     pytest.mark.slow,  # compiling its shaders takes most of a minute
-    pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"),
+    pytest.mark.skipif(
+        not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
+    ),
 )
 
 
@@ -58,18 +60,24 @@ def overlapping_splats() -> Splats:
 
 
 def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
-    """(3, H, W) sRGB over black as both engines blend: the rasterizer's image of splats with linear colors."""
+    """(3, H, W) sRGB over black as both engines blend: the rasterizer's image of splats with linear
+    colors."""
     linear = srgb_to_linear(np.clip(0.5 + SH_C0 * splats.sh.astype(np.float64), 0, 1))
     image = compose(
-        [PosedSplats(replace(splats, sh=((linear - 0.5) / SH_C0).astype(np.float32)), WORLD, np.eye(4))], view
+        [
+            PosedSplats(
+                replace(splats, sh=((linear - 0.5) / SH_C0).astype(np.float32)), WORLD, np.eye(4)
+            )
+        ],
+        view,
     )
     return np.asarray(linear_to_srgb(np.clip(image.rgb, 0, 1)))
 
 
 @pytest.mark.parametrize("engine", [pytest.param(EEVEE, marks=EEVEE_MARKS), "CYCLES"])
 def test_images_without_noise(engine: str, tmp_path: Path) -> None:
-    """Catches splats that are blended out of order, black holes behind the eighth splat of a pixel, and transparency by
-    chance, which a few samples show as noise."""
+    """Catches splats that are blended out of order, black holes behind the eighth splat of a pixel,
+    and transparency by chance, which a few samples show as noise."""
     scene = bpy.context.scene
     splats = overlapping_splats()
     set_input(show_world_splats(splats, "ball"), DISPLAY, QUADS)
@@ -90,7 +98,9 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
     bpy.ops.render.render(write_still=True)
     found = np.asarray(Image.open(tmp_path / "image.png"), np.float32).transpose(2, 0, 1) / 255
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    view = render_camera(camera.evaluated_get(depsgraph), depsgraph, SIZE_PX, SIZE_PX, (0, 0, SIZE_PX, SIZE_PX))
+    view = render_camera(
+        camera.evaluated_get(depsgraph), depsgraph, SIZE_PX, SIZE_PX, (0, 0, SIZE_PX, SIZE_PX)
+    )
     expected = blended_in_linear_light(splats, view)
     psnr_db = -10 * np.log10(np.mean((found - expected) ** 2))
     print(f"{engine}: {psnr_db:.1f} dB")
@@ -98,8 +108,11 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
     assert psnr_db >= MIN_PSNR_DB
 
 
-def test_images_of_recorded_light_say_so(extension, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches F12 and animations whose light is not the panel's, and which do not say so, or do for each image."""
+def test_images_of_recorded_light_say_so(
+    extension, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches F12 and animations whose light is not the panel's, and which do not say so, or do for
+    each image."""
     scene, cast = bpy.context.scene, "the light of this frame"
     shown, _ = show(with_light(textured(avatar_of("stga"))))
     camera_at()
@@ -133,7 +146,8 @@ def test_images_of_recorded_light_say_so(extension, tmp_path: Path, capsys: pyte
 
 
 def test_relit_color_of_a_frame(tmp_path: Path) -> None:
-    """Catches relit colors that do not reach the nodes, in another color space, or stay when they are taken back."""
+    """Catches relit colors that do not reach the nodes, in another color space, or stay when they
+    are taken back."""
     from stga_addon.light.relight import Relighter
     from stga_addon.scene.display.display_modes import DISPLAY_COLOR
     from stga_addon.scene.light import settings
@@ -141,7 +155,9 @@ def test_relit_color_of_a_frame(tmp_path: Path) -> None:
 
     def node_colors() -> np.ndarray:
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        (cloud,) = [each.object for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"]
+        (cloud,) = [
+            each.object for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"
+        ]
         colors = np.empty(4 * len(avatar.splats), np.float32)
         cloud.data.attributes[DISPLAY_COLOR].data.foreach_get("color", colors)
         return colors.reshape(-1, 4)[:, :3]

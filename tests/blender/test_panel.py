@@ -89,9 +89,12 @@ def draw(extension, name: str = "") -> list[str]:
     context = SimpleNamespace(
         scene=bpy.context.scene,
         region=SimpleNamespace(width=10_000),
-        preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0), addons=bpy.context.preferences.addons),
+        preferences=SimpleNamespace(
+            system=SimpleNamespace(ui_scale=1.0), addons=bpy.context.preferences.addons
+        ),
         space_data=SimpleNamespace(
-            shading=SimpleNamespace(type="SOLID"), region_3d=SimpleNamespace(view_perspective="PERSP")
+            shading=SimpleNamespace(type="SOLID"),
+            region_3d=SimpleNamespace(view_perspective="PERSP"),
         ),
         view_layer=bpy.context.view_layer,
         screen=SimpleNamespace(is_animation_playing=False),
@@ -99,7 +102,12 @@ def draw(extension, name: str = "") -> list[str]:
     layout = Layout()
     for cls in [cls for cls in panels(extension) if name in cls.bl_idname]:
         own = [base for base in reversed(cls.__mro__) if base.__module__.startswith("stga")]
-        members = {key: value for base in own for key, value in vars(base).items() if not key.startswith("__")}
+        members = {
+            key: value
+            for base in own
+            for key, value in vars(base).items()
+            if not key.startswith("__")
+        }
         panel = type(cls.__name__, (), members)()  # Blender makes panels itself, in a window only
         panel.layout = layout
         panel.draw(context)
@@ -107,7 +115,8 @@ def draw(extension, name: str = "") -> list[str]:
 
 
 def test_drawing_reads_no_file(extension, trained, monkeypatch):
-    """Catches panels that open, stat or list files: on a network drive, each redraw would block Blender."""
+    """Catches panels that open, stat or list files: on a network drive, each redraw would block
+    Blender."""
     extension.operators.training_python.has_training_python(bpy.context)
 
     def refuse(*arguments, **_):
@@ -128,11 +137,14 @@ def test_drawing_reads_no_file(extension, trained, monkeypatch):
 
 
 def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch, capsys):
-    """Catches a timer that ends at an unexpected error without a trace, and one that repeats it at every call."""
+    """Catches a timer that ends at an unexpected error without a trace, and one that repeats it at
+    every call."""
     monitor = extension.operators.monitor
     monkeypatch.setattr(monitor, "_read_status", lambda scene, state: 1 / 0)
     assert monitor.tick() is None
     assert capsys.readouterr().err.count("ZeroDivisionError") == 1
     assert monitor.tick() is None
     assert "ZeroDivisionError" not in capsys.readouterr().err
-    assert "Monitoring stopped after an unexpected error (ZeroDivisionError" in " ".join(draw(extension))
+    assert "Monitoring stopped after an unexpected error (ZeroDivisionError" in " ".join(
+        draw(extension)
+    )

@@ -1,7 +1,7 @@
 """The complete edition in real Blenders without a network, from installing to uninstalling.
 
-STGA_BLENDER is the command that starts a Blender; several, separated by " ; ", are tried one after another. The wheels
-of the Python of each are downloaded into build/wheels, where they are missing.
+STGA_BLENDER is the command that starts a Blender; several, separated by " ; ", are tried one after
+another. The wheels of the Python of each are downloaded into build/wheels, where they are missing.
 """
 
 import json
@@ -31,7 +31,11 @@ from stga_addon.worker.status import WorkerState, inspect_worker
 
 from .zips import with_version
 
-BLENDERS = [shlex.split(command) for command in os.environ.get("STGA_BLENDER", "").split(" ; ") if command.strip()]
+BLENDERS = [
+    shlex.split(command)
+    for command in os.environ.get("STGA_BLENDER", "").split(" ; ")
+    if command.strip()
+]
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender"),
@@ -51,11 +55,16 @@ def name_of(command: list[str]) -> str:
 def offline() -> list[str]:
     """A prefix of commands that leaves them no network, where this system has one."""
     prefixes = (["unshare", "-n"], ["unshare", "-rn"], [])
-    return next(prefix for prefix in prefixes if not prefix or not subprocess.run([*prefix, "true"]).returncode)
+    return next(
+        prefix
+        for prefix in prefixes
+        if not prefix or not subprocess.run([*prefix, "true"]).returncode
+    )
 
 
 def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
-    """The complete edition for a Blender, in the folder `out`; skips the test where wheels cannot be had."""
+    """The complete edition for a Blender, in the folder `out`; skips the test where wheels cannot
+    be had."""
     target = replace(target_of(command), cuda=True)
     try:
         collect_wheels(wheel_folder(target), target)
@@ -67,27 +76,53 @@ def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
 
 def blender(command: list[str], home: Path, *arguments: object, background: bool = True) -> None:
     """Run a Blender in a home folder of its own, without a network."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "BLENDER", "STGA"))}
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "BLENDER", "STGA"))
+    }
     full = [*offline(), *command, *(["--background"] if background else []), *map(str, arguments)]
     done = subprocess.run(
-        full, cwd=ROOT, env={**kept, "HOME": str(home)}, capture_output=True, text=True, timeout=TIMEOUT_S
+        full,
+        cwd=ROOT,
+        env={**kept, "HOME": str(home)},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
 def files_of(home: Path) -> set[str]:
-    """All files in a home folder but those that Blender itself writes: its settings, caches and lists."""
-    own = (".cache/blender", ".cache/mesa_shader_cache", ".cache/openbox", ".config/blender", ".local")
-    extension = ("extensions/user_default/stga/", "extensions/.local/lib", "extensions/.user/user_default/stga")
+    """All files in a home folder but those that Blender itself writes: its settings, caches and
+    lists."""
+    own = (
+        ".cache/blender",
+        ".cache/mesa_shader_cache",
+        ".cache/openbox",
+        ".config/blender",
+        ".local",
+    )
+    extension = (
+        "extensions/user_default/stga/",
+        "extensions/.local/lib",
+        "extensions/.user/user_default/stga",
+    )
     names = {path.relative_to(home).as_posix() for path in home.rglob("*") if not path.is_dir()}
-    # Of modules of a single file, such as typing_extensions.py, Blender leaves what its own Python has compiled.
+    # Of modules of a single file, such as typing_extensions.py, Blender leaves what its own Python
+    # has compiled.
     names = {name for name in names if "/site-packages/__pycache__/" not in name}
-    return {name for name in names if not name.startswith(own) or any(part in name for part in extension)}
+    return {
+        name
+        for name in names
+        if not name.startswith(own) or any(part in name for part in extension)
+    }
 
 
 @pytest.fixture(scope="module")
 def home(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A home folder in which every Blender has the complete edition, of a version before the one beside it."""
+    """A home folder in which every Blender has the complete edition, of a version before the one
+    beside it."""
     folder = tmp_path_factory.mktemp("real")
     home = folder / "home"
     home.mkdir()
@@ -95,7 +130,17 @@ def home(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         new = complete_zip(command, folder / name_of(command), demo)
         blender(command, home, "--command", "extension", "validate", new)
         old = with_version(new, OLD_VERSION, folder / "old.zip")
-        blender(command, home, "--command", "extension", "install-file", "--repo", "user_default", "--enable", old)
+        blender(
+            command,
+            home,
+            "--command",
+            "extension",
+            "install-file",
+            "--repo",
+            "user_default",
+            "--enable",
+            old,
+        )
         old.unlink()  # gigabytes
     return home
 
@@ -112,26 +157,42 @@ def script(command: list[str], home: Path, wait: bool, iterations: int) -> dict[
 
 @pytest.mark.parametrize("command", BLENDERS, ids=name_of)
 def test_train(command: list[str], home: Path, demo: Path, tmp_path: Path) -> None:
-    """Catches a missing wheel, a worker that needs another Python or a network, and worse avatars."""
+    """Catches a missing wheel, a worker that needs another Python or a network, and worse
+    avatars."""
     seen = script(command, home, True, ITERATIONS)
     settings = make_settings("global", iterations=ITERATIONS)
     perform(Train(tmp_path / "here", demo, settings), ignore, print)
-    found, expected = (read_metrics(run)[-1]["psnr"] for run in (Path(seen["run"]), tmp_path / "here"))
+    found, expected = (
+        read_metrics(run)[-1]["psnr"] for run in (Path(seen["run"]), tmp_path / "here")
+    )
     assert abs(found - expected) < MAX_DIFFERENCE_DB
     assert seen["splats"] > 0
 
 
 @pytest.mark.parametrize("command", BLENDERS, ids=name_of)
 def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
-    """Catches an update that fails or ends a training, and one that disturbs another Blender's extension."""
+    """Catches an update that fails or ends a training, and one that disturbs another Blender's
+    extension."""
     seen = script(command, home, False, UPDATE_ITERATIONS)
     run, others = Path(seen["run"]), other_profiles(home, seen["version"])
     while not (run / "job/preview.npz").exists() and inspect_worker(run / "job").state.is_alive:
         time.sleep(0.2)
     new = next((home.parent / name_of(command)).glob("*.zip"))
-    blender(command, home, "--command", "extension", "install-file", "--repo", "user_default", "--enable", new)
+    blender(
+        command,
+        home,
+        "--command",
+        "extension",
+        "install-file",
+        "--repo",
+        "user_default",
+        "--enable",
+        new,
+    )
     assert inspect_worker(run / "job").state.is_alive, "the training ended before the update"
-    manifest = next(home.glob(f".config/blender/{short(seen['version'])}/extensions/user_default/stga/*.toml"))
+    manifest = next(
+        home.glob(f".config/blender/{short(seen['version'])}/extensions/user_default/stga/*.toml")
+    )
     assert tomllib.loads(manifest.read_text())["version"] == __version__
     while (last := inspect_worker(run / "job")).state.is_alive:
         time.sleep(0.5)
@@ -143,7 +204,9 @@ def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
 def test_uninstall(home: Path) -> None:
     """Catches files that uninstalling leaves, and one that disturbs another Blender's extension."""
     for command in BLENDERS:
-        version = subprocess.run([*command, "--version"], cwd=ROOT, capture_output=True, text=True).stdout.split()[1]
+        version = subprocess.run(
+            [*command, "--version"], cwd=ROOT, capture_output=True, text=True
+        ).stdout.split()[1]
         others = other_profiles(home, version)
         blender(command, home, "--command", "extension", "remove", "user_default.stga")
         assert other_profiles(home, version) == others
@@ -155,7 +218,13 @@ def short(version: str) -> str:
 
 
 def other_profiles(home: Path, version: str) -> dict[str, int]:
-    """Files of the extensions of other Blender versions in the home folder, and when they were changed."""
+    """Files of the extensions of other Blender versions in the home folder, and when they were
+    changed."""
     profiles = [path for path in home.glob(".config/blender/*") if path.name != short(version)]
-    files = [path for profile in profiles for path in (profile / "extensions").rglob("*") if path.is_file()]
+    files = [
+        path
+        for profile in profiles
+        for path in (profile / "extensions").rglob("*")
+        if path.is_file()
+    ]
     return {str(path): path.stat().st_mtime_ns for path in files}

@@ -28,7 +28,9 @@ from .test_operators import write_ball_avatar  # noqa: E402
 @pytest.fixture
 def shown(extension, tmp_path):
     """A scene of three frames that shows an avatar on the moving ball."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture", range(3), range(3))))
+    bpy.ops.stga.import_capture(
+        directory=str(write_mesh_capture(tmp_path / "capture", range(3), range(3)))
+    )
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     colors = np.random.default_rng(1).normal(0, 1.5, avatar.splats.sh.shape).astype(np.float32)
     write_avatar(tmp_path / "avatar.npz", replace(avatar, splats=replace(avatar.splats, sh=colors)))
@@ -60,14 +62,20 @@ def engine_image(frame: int, path: Path) -> np.ndarray:
 
 
 def test_image_sequence_of_the_scene(shown):
-    """Catches a sequence of another camera, size, frame or transparency than the render engine's."""
+    """Catches a sequence of another camera, size, frame or transparency than the render
+    engine's."""
     scene = bpy.context.scene
-    assert bpy.ops.stga.render_video(filepath=str(shown / "images"), path="scene", format="png") == {"FINISHED"}
+    assert bpy.ops.stga.render_video(
+        filepath=str(shown / "images"), path="scene", format="png"
+    ) == {"FINISHED"}
     assert scene.frame_current == 1
     written = sorted((shown / "images").glob("*.png"))
     assert [path.name for path in written] == ["0001.png", "0002.png", "0003.png"]
     for frame, path in enumerate(written):
-        image, expected = np.asarray(Image.open(path)).astype(int), engine_image(frame, shown / "engine.png")
+        image, expected = (
+            np.asarray(Image.open(path)).astype(int),
+            engine_image(frame, shown / "engine.png"),
+        )
         opaque = (expected[..., 3] > 250) & (image[..., 3] > 250)
         assert opaque.mean() > 0.1
         assert np.abs(image - expected)[opaque].max() <= 2
@@ -75,11 +83,14 @@ def test_image_sequence_of_the_scene(shown):
 
 
 def test_turntable_video(shown):
-    """Catches a turntable that stands still, lasts another time, or ends without the file it names."""
+    """Catches a turntable that stands still, lasts another time, or ends without the file it
+    names."""
     assert bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=1.5) == {"FINISHED"}
     with av.open(str(shown / "turn.mp4")) as container:
         assert container.streams.video[0].average_rate == 10
-        images = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+        images = [
+            frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)
+        ]
     assert len(images) == 15
     assert np.abs(images[0] - images[4]).max() > 40
     (video,) = [video for video in shown.iterdir() if video.suffix == ".mp4"]
@@ -92,17 +103,31 @@ def test_turntable_of_a_ply(extension, tmp_path):
     xyz = rng.normal((3, 1, 0), 0.1, (200, 3))
     xyz[0] = 1e4
     upright = np.tile(np.float32([1, 0, 0, 0]), (200, 1))
-    shape = {"log_scale": np.full((200, 3), -4.0), "opacity": np.full(200, 3.0), "sh": np.full((200, 1, 3), 1.5)}
+    shape = {
+        "log_scale": np.full((200, 3), -4.0),
+        "opacity": np.full(200, 3.0),
+        "sh": np.full((200, 1, 3), 1.5),
+    }
     floats = {name: values.astype(np.float32) for name, values in ({"xyz": xyz} | shape).items()}
-    splats = Splats(rotation=upright, face=np.zeros(200, np.int32), unbound=np.zeros(200, bool), **floats)
+    splats = Splats(
+        rotation=upright, face=np.zeros(200, np.int32), unbound=np.zeros(200, bool), **floats
+    )
     write_ply(tmp_path / "scan.ply", splats)
     bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"))
-    scene, camera = bpy.context.scene, bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene, camera = (
+        bpy.context.scene,
+        bpy.data.objects.new("camera", bpy.data.cameras.new("camera")),
+    )
     scene.collection.objects.link(camera)
     camera.location, camera.rotation_euler = (3, -1, 1), (np.pi / 2, 0, 0)
     scene.camera, scene.render.resolution_percentage, scene.frame_end = camera, 5, 3
-    assert bpy.ops.stga.render_video(filepath=str(tmp_path / "turn"), format="png", seconds=0.5) == {"FINISHED"}
-    images = [np.asarray(Image.open(path)).astype(int) for path in sorted((tmp_path / "turn").glob("*.png"))]
+    assert bpy.ops.stga.render_video(
+        filepath=str(tmp_path / "turn"), format="png", seconds=0.5
+    ) == {"FINISHED"}
+    images = [
+        np.asarray(Image.open(path)).astype(int)
+        for path in sorted((tmp_path / "turn").glob("*.png"))
+    ]
     assert len(images) == 12
     shown = [(image[..., :3].max(2) > image[0, 0, :3].max() + 20).mean() for image in images]
     assert min(shown) > 0.5 * max(shown) > 0
@@ -174,7 +199,8 @@ def around_each_image(monkeypatch, before, after) -> None:
 
 
 def test_a_recording_follows_its_own_scene(shown, monkeypatch):
-    """Catches images of another scene, which the window shows meanwhile, and another scene's frame that is moved."""
+    """Catches images of another scene, which the window shows meanwhile, and another scene's frame
+    that is moved."""
     render = {"path": "scene", "format": "png"}
     assert bpy.ops.stga.render_video(filepath=str(shown / "alone"), **render) == {"FINISHED"}
     own, other = bpy.context.scene, bpy.data.scenes.new("other")
@@ -188,7 +214,9 @@ def test_a_recording_follows_its_own_scene(shown, monkeypatch):
     finally:
         window.scene = own
     for frame in ("0001.png", "0002.png", "0003.png"):
-        alone, beside = (np.asarray(Image.open(shown / name / frame)) for name in ("alone", "images"))
+        alone, beside = (
+            np.asarray(Image.open(shown / name / frame)) for name in ("alone", "images")
+        )
         assert alone[..., 3].any()
         assert np.array_equal(alone, beside)
 
@@ -204,6 +232,8 @@ def test_a_recording_keeps_the_last_frame_only(shown, monkeypatch):
 
     around_each_image(monkeypatch, lambda: None, count)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
-    assert bpy.ops.stga.render_video(filepath=str(shown / "images"), path="scene", format="png") == {"FINISHED"}
+    assert bpy.ops.stga.render_video(
+        filepath=str(shown / "images"), path="scene", format="png"
+    ) == {"FINISHED"}
     assert len(counts) == 5
     assert 0 < max(counts) <= 2

@@ -1,6 +1,8 @@
-"""The repository on loopback, in a real Blender: install, update from a lower version while a worker trains.
+"""The repository on loopback, in a real Blender: install, update from a lower version while a
+worker trains.
 
-STGA_BLENDER is the command that starts the Blender; several, separated by " ; ", are tried one after another.
+STGA_BLENDER is the command that starts the Blender; several, separated by " ; ", are tried one
+after another.
 """
 
 import functools
@@ -27,8 +29,14 @@ from stga_addon.errors import StgaError
 
 from .zips import with_version
 
-BLENDERS = [shlex.split(command) for command in os.environ.get("STGA_BLENDER", "").split(" ; ") if command.strip()]
-pytestmark = pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender")
+BLENDERS = [
+    shlex.split(command)
+    for command in os.environ.get("STGA_BLENDER", "").split(" ; ")
+    if command.strip()
+]
+pytestmark = pytest.mark.skipif(
+    not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender"
+)
 OLD_VERSION = "0.1.9"
 ITERATIONS = 150
 """Of a training that is still at work when the update has ended."""
@@ -37,7 +45,9 @@ ITERATIONS = 150
 @pytest.fixture(scope="module")
 def zips(zip_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The built zip, after one that says that it is older."""
-    return with_version(zip_file, OLD_VERSION, tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip"), zip_file
+    return with_version(
+        zip_file, OLD_VERSION, tmp_path_factory.mktemp("old") / f"stga-{OLD_VERSION}.zip"
+    ), zip_file
 
 
 @pytest.fixture
@@ -55,15 +65,20 @@ def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
 def extension(blender: list[str], profile: Path, *arguments: str) -> str:
     command = [*blender, "--background", "--online-mode", "--command", "extension", *arguments]
     variables = {**os.environ, "BLENDER_USER_RESOURCES": str(profile)}
-    done = subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        command, cwd=ROOT, env=variables, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return done.stdout
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("blender", BLENDERS, ids=lambda command: "-".join(command[-2:]))
-def test_install_and_update(blender: list[str], zips: tuple[Path, Path], served: tuple[Path, str], tmp_path) -> None:
-    """Catches an index that Blender cannot read, an update that fails, and one that ends a training."""
+def test_install_and_update(
+    blender: list[str], zips: tuple[Path, Path], served: tuple[Path, str], tmp_path
+) -> None:
+    """Catches an index that Blender cannot read, an update that fails, and one that ends a
+    training."""
     (folder, address), profile, (old, new) = served, tmp_path / "profile", zips
     index = write_repository([old], folder / "stga", blender)
     assert index == folder / "stga" / INDEX
@@ -77,7 +92,9 @@ def test_install_and_update(blender: list[str], zips: tuple[Path, Path], served:
     command = [sys.executable, "-S", "-m", "stga_addon", "train", str(capture), "--out", str(run)]
     path = os.pathsep.join([str(installed.parent), sysconfig.get_path("platlib")])
     variables = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
-    training = subprocess.Popen([*command, "--iterations", str(ITERATIONS)], cwd=tmp_path, env=variables)
+    training = subprocess.Popen(
+        [*command, "--iterations", str(ITERATIONS)], cwd=tmp_path, env=variables
+    )
     try:
         while not (run / "run.json").exists() and training.poll() is None:
             time.sleep(0.2)

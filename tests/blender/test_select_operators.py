@@ -33,7 +33,9 @@ def the_head():
 
 
 def rows() -> list[tuple[int, int, int]]:
-    return [(row.frame, row.triangles, row.splats) for row in bpy.context.scene.stga.selected_frames]
+    return [
+        (row.frame, row.triangles, row.splats) for row in bpy.context.scene.stga.selected_frames
+    ]
 
 
 def show_ball_avatar(path: Path, order: int) -> np.ndarray:
@@ -51,7 +53,9 @@ def paint_chin(capture) -> np.ndarray:
     low = np.unique(capture.faces[centres[:, 1] < -0.02])
     the_head().vertex_groups.new(name="chin").add(low.tolist(), 1.0, "REPLACE")
     region = np.isin(capture.faces, low).all(1)
-    offset = np.linalg.norm((capture.mesh(3) - capture.neutral)[capture.faces].mean(1), axis=1)[region]
+    offset = np.linalg.norm((capture.mesh(3) - capture.neutral)[capture.faces].mean(1), axis=1)[
+        region
+    ]
     assert offset.min() < 0.0005 < offset.mean()
     return region
 
@@ -74,7 +78,9 @@ def test_ticking_regions(folder):
     for expected in (alone | region, alone):
         bpy.ops.stga.toggle_region(name="chin")
         bpy.ops.stga.select(threshold=0.0005)
-        np.testing.assert_array_equal(read_selection(the_head())[3], closure(expected, capture.faces))
+        np.testing.assert_array_equal(
+            read_selection(the_head())[3], closure(expected, capture.faces)
+        )
     with pytest.raises(RuntimeError, match="no region and no vertex group 'nostril'"):
         bpy.ops.stga.toggle_region(name="nostril")
 
@@ -86,13 +92,18 @@ def test_regions_that_are_not_there(folder):
     with pytest.raises(RuntimeError, match="no region and no vertex group 'lips'"):
         bpy.ops.stga.select(regions="mouth, lips")
     the_head().vertex_groups.new(name="empty")
-    with pytest.raises(RuntimeError, match="no triangle has all its corners in the vertex group 'empty'"):
+    with pytest.raises(
+        RuntimeError, match="no triangle has all its corners in the vertex group 'empty'"
+    ):
         bpy.ops.stga.select(regions="empty")
-    assert {timestep: faces.tolist() for timestep, faces in read_selection(the_head()).items()} == before
+    assert {
+        timestep: faces.tolist() for timestep, faces in read_selection(the_head()).items()
+    } == before
 
 
 def test_the_table_counts_what_each_frame_trains(folder, tmp_path):
-    """Catches counts of the rule instead of the groups, of six splats a triangle always, or of another head."""
+    """Catches counts of the rule instead of the groups, of six splats a triangle always, or of
+    another head."""
     bpy.ops.stga.select(threshold=0.0005)
     chosen = read_selection(the_head())
     assert rows() == [(t, int(faces.sum()), 6 * int(faces.sum())) for t, faces in chosen.items()]
@@ -101,7 +112,9 @@ def test_the_table_counts_what_each_frame_trains(folder, tmp_path):
     bpy.ops.stga.count_selected()
     painted = read_selection(the_head())
     assert painted[3].sum() < chosen[3].sum()
-    assert rows() == [(t, int(faces.sum()), int(per_face[faces].sum())) for t, faces in painted.items()]
+    assert rows() == [
+        (t, int(faces.sum()), int(per_face[faces].sum())) for t, faces in painted.items()
+    ]
     bpy.context.scene.stga.head = None
     assert rows() == []
 
@@ -113,7 +126,8 @@ def materials_of(head) -> set[str]:
 
 
 def test_heat_map(folder):
-    """Catches colors on the wrong triangles, and a head that does not look as before once they are gone."""
+    """Catches colors on the wrong triangles, and a head that does not look as before once they are
+    gone."""
     with pytest.raises(RuntimeError, match="no frame selects a triangle yet"):
         bpy.ops.stga.heat_map()
     bpy.ops.stga.select(threshold=0.0015)
@@ -145,7 +159,9 @@ def test_heat_map_follows_a_new_selection(folder):
     bpy.ops.stga.select(threshold=0.0005)
     share = np.empty(len(the_head().data.polygons), np.float32)
     the_head().data.attributes[SHARE].data.foreach_get("value", share)
-    np.testing.assert_allclose(share, np.mean(list(read_selection(the_head()).values()), axis=0), atol=1e-6)
+    np.testing.assert_allclose(
+        share, np.mean(list(read_selection(the_head()).values()), axis=0), atol=1e-6
+    )
 
 
 def test_heat_map_and_splats_take_turns(folder, tmp_path):

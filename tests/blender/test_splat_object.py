@@ -34,13 +34,20 @@ FRAMES = (1, 5, 9)
 
 
 def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Head-sized triangles (V, 3), (F, 3), a meter from the origin, each starting at a random one of its corners."""
+    """Head-sized triangles (V, 3), (F, 3), a meter from the origin, each starting at a random one
+    of its corners."""
     rng = np.random.default_rng(0)
-    theta, phi = np.meshgrid(np.linspace(0.2, np.pi - 0.2, rings), np.linspace(0, 2 * np.pi, segments, endpoint=False))
-    ball = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1).reshape(-1, 3)
+    theta, phi = np.meshgrid(
+        np.linspace(0.2, np.pi - 0.2, rings), np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    )
+    ball = np.stack(
+        [np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1
+    ).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(segments), np.arange(rings - 1), indexing="ij")
     a, b = i * rings + j, (i + 1) % segments * rings + j
-    faces = np.concatenate([np.stack([a, b, b + 1], -1).reshape(-1, 3), np.stack([a, b + 1, a + 1], -1).reshape(-1, 3)])
+    faces = np.concatenate(
+        [np.stack([a, b, b + 1], -1).reshape(-1, 3), np.stack([a, b + 1, a + 1], -1).reshape(-1, 3)]
+    )
     turn = rng.integers(0, 3, len(faces))
     faces = np.take_along_axis(faces, (np.arange(3) + turn[:, None]) % 3, axis=1)
     return 0.1 * ball + [0.3, 1.0, 0.2], faces.astype(np.int32)
@@ -73,7 +80,9 @@ def animated_head(neutral: np.ndarray, faces: np.ndarray):
     head.shape_key_add(name="Basis")
     for name, first in (("a", 0.0), ("b", 1.0)):
         key = head.shape_key_add(name=name)
-        key.data.foreach_set("co", (neutral + rng.normal(0, 0.004, neutral.shape)).astype(np.float32).ravel())
+        key.data.foreach_set(
+            "co", (neutral + rng.normal(0, 0.004, neutral.shape)).astype(np.float32).ravel()
+        )
         for frame, value in zip(FRAMES, (first, 0.6, 1 - first), strict=True):
             key.value = value
             key.keyframe_insert("value", frame=frame)
@@ -95,7 +104,8 @@ def same_rotation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
-    """The evaluated splats against `to_world` on the evaluated head's vertices; returns the positions."""
+    """The evaluated splats against `to_world` on the evaluated head's vertices; returns the
+    positions."""
     expected = to_world(avatar.splats, avatar.frames(evaluated_vertices(head)))
     xyz, rotation, scale = evaluated_splats(shown)
     assert np.abs(xyz - expected.xyz).max() < 1e-5
@@ -106,7 +116,8 @@ def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_splats_follow_the_animated_head(convention, tmp_path):
-    """Catches wrong axes, a wrong first corner, a wrong unit, and trees that stop working once saved and reopened."""
+    """Catches wrong axes, a wrong first corner, a wrong unit, and trees that stop working once
+    saved and reopened."""
     avatar = avatar_of(convention)
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
@@ -124,7 +135,8 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
 
 
 def test_splat_object_has_the_head_s_transform():
-    """Catches a splat object that ignores the head's parent, and separates from it when the root rotates."""
+    """Catches a splat object that ignores the head's parent, and separates from it when the root
+    rotates."""
     avatar = avatar_of("stga", 100)
     head = animated_head(avatar.neutral, avatar.faces)
     head.location = (0.1, 0.2, 0.3)
@@ -150,12 +162,19 @@ def test_degenerate_triangles_stay_finite(convention):
 
 
 def test_attributes_hold_activated_values():
-    """Catches logits shown as opacities, log sigmas as sizes, and sRGB stored where Blender expects scene-linear."""
+    """Catches logits shown as opacities, log sigmas as sizes, and sRGB stored where Blender expects
+    scene-linear."""
     avatar = avatar_of("stga", 50)
-    splats = replace(avatar.splats, sh=np.zeros((50, 4, 3), np.float32), opacity=np.zeros(50, np.float32))
-    mesh = show_avatar(replace(avatar, splats=splats), animated_head(avatar.neutral, avatar.faces)).data
+    splats = replace(
+        avatar.splats, sh=np.zeros((50, 4, 3), np.float32), opacity=np.zeros(50, np.float32)
+    )
+    mesh = show_avatar(
+        replace(avatar, splats=splats), animated_head(avatar.neutral, avatar.faces)
+    ).data
     assert [item.value for item in mesh.attributes[OPACITY].data] == pytest.approx([0.5] * 50)
-    assert list(mesh.attributes[SCALE].data[3].vector) == pytest.approx(np.exp(splats.log_scale[3]), rel=1e-5)
+    assert list(mesh.attributes[SCALE].data[3].vector) == pytest.approx(
+        np.exp(splats.log_scale[3]), rel=1e-5
+    )
     assert [SH.format(i) in mesh.attributes for i in range(5)] == [True, True, True, True, False]
 
 
@@ -163,7 +182,9 @@ def displayed_colors(shown) -> np.ndarray:
     """(N, 3) scene-linear colors of the splats as points."""
     set_input(shown, splat_nodes.DISPLAY, POINTS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    points = next(i.object.data for i in depsgraph.object_instances if i.object.type == "POINTCLOUD")
+    points = next(
+        i.object.data for i in depsgraph.object_instances if i.object.type == "POINTCLOUD"
+    )
     color = np.empty(4 * len(points.points), np.float32)
     points.attributes[DISPLAY_COLOR].data.foreach_get("color", color)
     return color.reshape(-1, 4)[:, :3]
@@ -184,16 +205,22 @@ def active_camera(location=(0.0, 0.0, 0.0)):
 
 def test_constant_colors_are_scene_linear():
     """Catches sRGB shown where Blender expects scene-linear, and colors outside 0…1."""
-    splats = replace(random_splats(1, 300, degree=0), sh=np.linspace(-3, 3, 900, dtype=np.float32).reshape(300, 1, 3))
+    splats = replace(
+        random_splats(1, 300, degree=0),
+        sh=np.linspace(-3, 3, 900, dtype=np.float32).reshape(300, 1, 3),
+    )
     expected = linear(0.5 + SH_C0 * splats.sh[:, 0])
     assert expected.min() == 0
     assert expected.max() == 1
-    np.testing.assert_allclose(displayed_colors(show_world_splats(splats, "scan")), expected, atol=2e-6)
+    np.testing.assert_allclose(
+        displayed_colors(show_world_splats(splats, "scan")), expected, atol=2e-6
+    )
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_colors_follow_the_active_camera(degree):
-    """Catches harmonics of another order or sign, and directions in the world's instead of the splats' own space."""
+    """Catches harmonics of another order or sign, and directions in the world's instead of the
+    splats' own space."""
     harmonics = pytest.importorskip("stga_addon.raster.cpu.harmonics")
     avatar = avatar_of("stga", 400)
     sh = np.random.default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
@@ -215,7 +242,8 @@ def test_colors_follow_the_active_camera(degree):
 
 
 def test_colors_follow_a_moving_camera():
-    """Catches colors that stay those of the first frame while the camera moves, in playback and in renders."""
+    """Catches colors that stay those of the first frame while the camera moves, in playback and in
+    renders."""
     avatar = avatar_of("stga", 100)
     sh = np.random.default_rng(3).normal(0, 0.3, (100, 4, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
@@ -236,7 +264,8 @@ def test_colors_follow_a_moving_camera():
 
 
 def test_colors_follow_strain():
-    """Catches strain of another triangle, in other axes or not averaged, against numpy on the deformed mesh."""
+    """Catches strain of another triangle, in other axes or not averaged, against numpy on the
+    deformed mesh."""
     avatar = avatar_of("stga", 1500)
     colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3, 3)).astype(np.float32)
     splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors)
@@ -262,7 +291,8 @@ def test_colors_follow_strain():
 
 
 def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Avatar:
-    """Splats that move with strain, on a mesh with boundaries, an edge of three triangles and a line for a triangle.
+    """Splats that move with strain, on a mesh with boundaries, an edge of three triangles and a
+    line for a triangle.
 
     Within their ranges of strain, some triangles at rest have another strain than 0.
     """
@@ -272,7 +302,9 @@ def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Av
     fin = np.append(faces[100, :2], len(neutral))
     neutral = np.append(neutral, [1.2 * neutral[faces[100, 0]] - 0.2 * neutral.mean(0)], axis=0)
     faces = np.append(faces, [fin], axis=0).astype(np.int32)
-    ends = np.stack([rng.uniform(-2, -0.3, (len(faces), 3)), rng.uniform(-0.3, 2, (len(faces), 3))], 1)
+    ends = np.stack(
+        [rng.uniform(-2, -0.3, (len(faces), 3)), rng.uniform(-0.3, 2, (len(faces), 3))], 1
+    )
     unit = 0.004 if convention == "stga" else 0.3
     splats = replace(avatar.splats, face=rng.integers(0, len(faces), count).astype(np.int32))
     offsets = {"strain_position": rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32)}
@@ -283,25 +315,37 @@ def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Av
 @pytest.mark.parametrize("strain_color", [False, True])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_positions_follow_strain(convention, strain_color, tmp_path):
-    """Catches strain averaged over other triangles or too few times, not relative to rest, and coefficients of another
-    triangle, in other axes or another unit, or that a saved file loses: against numpy on the deformed mesh."""
+    """Catches strain averaged over other triangles or too few times, not relative to rest, and
+    coefficients of another triangle, in other axes or another unit, or that a saved file loses:
+    against numpy on the deformed mesh."""
     avatar = following_positions(convention)
-    colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3 if strain_color else 0, 3)).astype(np.float32)
-    avatar = replace(avatar, splats=replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors))
-    assert {2, 3, 4} <= set(edge_neighbors(avatar.faces).counts.tolist())  # at a boundary, inside, an edge of three
+    colors = (
+        np.random.default_rng(4)
+        .normal(0, 0.2, (1500, 3 if strain_color else 0, 3))
+        .astype(np.float32)
+    )
+    avatar = replace(
+        avatar, splats=replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors)
+    )
+    # at a boundary, inside, an edge of three
+    assert {2, 3, 4} <= set(edge_neighbors(avatar.faces).counts.tolist())
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     shown, head = bpy.data.objects["head splats"], bpy.data.objects["head"]
     stored = stored_avatar(shown)
-    np.testing.assert_array_equal(stored.driven_offsets["strain_position"], avatar.driven_offsets["strain_position"])
+    np.testing.assert_array_equal(
+        stored.driven_offsets["strain_position"], avatar.driven_offsets["strain_position"]
+    )
     np.testing.assert_array_equal(stored.strain_range, avatar.strain_range)
     set_input(shown, splat_nodes.DISPLAY, POINTS)
     unmoved = replace(avatar, driven_offsets={})
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
-        frames, plain, again = (each.frames(evaluated_vertices(head)) for each in (avatar, unmoved, stored))
+        frames, plain, again = (
+            each.frames(evaluated_vertices(head)) for each in (avatar, unmoved, stored)
+        )
         np.testing.assert_array_equal(again.origin, frames.origin)
         assert np.median(np.linalg.norm(frames.origin - plain.origin, axis=1)) > 3e-4
         assert_follows(shown, head, avatar)
@@ -315,7 +359,8 @@ def test_positions_follow_strain(convention, strain_color, tmp_path):
 
 
 def test_updated_splats_follow_strain_anew():
-    """Catches a live preview that shows new splats with the strain coefficients of the first ones."""
+    """Catches a live preview that shows new splats with the strain coefficients of the first
+    ones."""
     first, second = (following_positions("stga", seed) for seed in (6, 7))
     second = replace(second, neutral=first.neutral, faces=first.faces)
     head = animated_head(first.neutral, first.faces)
@@ -329,13 +374,16 @@ def test_updated_splats_follow_strain_anew():
     np.testing.assert_array_equal(stored, second.driven_offsets["strain_position"])
     assert not can_update(shown, replace(second, driven_offsets={}))
     colors = np.zeros((len(second.splats), 3, 3), np.float32)
-    assert not can_update(shown, replace(second, splats=replace(second.splats, strain_color=colors)))
+    assert not can_update(
+        shown, replace(second, splats=replace(second.splats, strain_color=colors))
+    )
     set_input(shown, splat_nodes.NEUTRAL, None)
     assert not can_update(shown, second)
 
 
 def test_names_of_trees_are_told_apart():
-    """Catches names that Blender shortens, and a tree or group that is found for another whose name begins likewise."""
+    """Catches names that Blender shortens, and a tree or group that is found for another whose name
+    begins likewise."""
     kinds = [
         splat_nodes.TreeOptions(convention, degree, *strain)
         for convention in (*CONVENTIONS, None)
@@ -363,7 +411,8 @@ def test_no_strain_nodes_without_strain():
 
 
 def test_display_inputs():
-    """Catches inputs that are not wired: threshold, percentage and quads must each change what is shown."""
+    """Catches inputs that are not wired: threshold, percentage and quads must each change what is
+    shown."""
     avatar = avatar_of("stga", 2000)
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     opacity = 1 / (1 + np.exp(-avatar.splats.opacity))
@@ -382,7 +431,8 @@ def test_display_inputs():
 
 
 def test_quads_face_the_camera_and_cover_the_splat():
-    """Catches quads seen edge-on, of another size or shape than their splats: both cut Gaussians off."""
+    """Catches quads seen edge-on, of another size or shape than their splats: both cut Gaussians
+    off."""
     avatar = avatar_of("stga", 200)
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     camera = active_camera((0.4, -1.0, 1.3))
@@ -391,11 +441,18 @@ def test_quads_face_the_camera_and_cover_the_splat():
     set_input(shown, splat_nodes.SIZE, 2.0)
     set_input(shown, splat_nodes.DISPLAY, QUADS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    quads = np.array([np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64)
+    quads = np.array(
+        [np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance], np.float64
+    )
     to_world = np.array(shown.matrix_world, np.float64)
-    np.testing.assert_allclose(quads[:, :3, 3], centre @ to_world[:3, :3].T + to_world[:3, 3], atol=1e-5)
-    # Seen from the camera each splat is a sphere in the quad's own space, right above the quad's centre.
-    eye = np.linalg.solve(quads, np.broadcast_to([*camera.location, 1.0], (len(quads), 4))[..., None])[:, :3, 0]
+    np.testing.assert_allclose(
+        quads[:, :3, 3], centre @ to_world[:3, :3].T + to_world[:3, 3], atol=1e-5
+    )
+    # Seen from the camera each splat is a sphere in the quad's own space, right above the quad's
+    # centre.
+    eye = np.linalg.solve(
+        quads, np.broadcast_to([*camera.location, 1.0], (len(quads), 4))[..., None]
+    )[:, :3, 0]
     assert (eye[:, 2] / np.linalg.norm(eye, axis=-1)).min() > 1 - 1e-4
     turned = np.array([mathutils.Quaternion(each).to_matrix() for each in rotation], np.float64)
     axes = to_world[:3, :3] @ turned * 2 * scale[:, None]
@@ -405,7 +462,8 @@ def test_quads_face_the_camera_and_cover_the_splat():
 
 
 def test_selection_grays_out_frozen_splats():
-    """Catches the selection of another frame, and triangles that count as selected next to selected ones."""
+    """Catches the selection of another frame, and triangles that count as selected next to selected
+    ones."""
     avatar = avatar_of("stga", 1000)
     head = animated_head(avatar.neutral, avatar.faces)
     chosen = avatar.faces[:40]
@@ -467,8 +525,8 @@ TREES = [
 
 @pytest.mark.parametrize("kind", TREES)
 def test_trees_are_built_one_node_group_at_a_time(kind):
-    """Catches what blocks the UI when a live preview first appears: several groups built in one call, a large tree
-    (build time is quadratic), and groups that are built again."""
+    """Catches what blocks the UI when a live preview first appears: several groups built in one
+    call, a large tree (build time is quadratic), and groups that are built again."""
     built, options = [], splat_nodes.TreeOptions(*kind)
     while splat_nodes.build_next_node_group(options):
         built.append(len(bpy.data.node_groups))

@@ -1,4 +1,5 @@
-"""The Track panel's way: footage, worker, import, the cameras' images, a head posed by hand, and solved again."""
+"""The Track panel's way: footage, worker, import, the cameras' images, a head posed by hand, and
+solved again."""
 
 import sys
 from math import radians
@@ -22,7 +23,12 @@ HEAD = HeadModel(small_head(0), "flame")
 
 
 def track(take, out, **more):
-    paths = {"footage": take / "footage", "landmarks": take / "points", "model": take / "head.npz", "directory": out}
+    paths = {
+        "footage": take / "footage",
+        "landmarks": take / "points",
+        "model": take / "head.npz",
+        "directory": out,
+    }
     return bpy.ops.stga.track_footage(
         **{name: str(path) for name, path in (paths | more).items()}, python=sys.executable
     )
@@ -65,7 +71,8 @@ def look_through(cameras):
 
 
 def test_the_whole_way_of_the_panel(tracked, extension):
-    """Catches a capture that is not imported, a pose that is lost, or a key that the solution does not pass through."""
+    """Catches a capture that is not imported, a pose that is lost, or a key that the solution does
+    not pass through."""
     scene, settings = bpy.context.scene, bpy.context.scene.stga
     head = settings.head
     assert list(head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
@@ -109,7 +116,9 @@ def test_the_whole_way_of_the_panel(tracked, extension):
 def test_exported_shape_keys_as_head_model(extension, take, tmp_path):
     """Catches shape keys that are tracked in Blender's axes."""
     model = HEAD.model
-    blender_head(model.v_template, model.faces, ["identity 0", "smile"], model.shapedirs[:, :, [0, -1]])
+    blender_head(
+        model.v_template, model.faces, ["identity 0", "smile"], model.shapedirs[:, :, [0, -1]]
+    )
     assert bpy.ops.stga.export_head_model.poll()
     bpy.ops.stga.export_head_model(filepath=str(tmp_path / "exported.npz"))
     found = read_head_model(tmp_path / "exported.npz").model
@@ -145,7 +154,8 @@ def test_a_capture_of_another_tracker_is_not_solved_again(extension, tmp_path):
 
 
 def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monkeypatch):
-    """Catches a result that never arrives where Blender was closed, or its file saved, while the worker ran."""
+    """Catches a result that never arrives where Blender was closed, or its file saved, while the
+    worker ran."""
     out, settings = tmp_path / "capture", bpy.context.scene.stga
     asked(extension, take, out)
     settings.tracking_capture = str(out)

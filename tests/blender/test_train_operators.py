@@ -1,5 +1,5 @@
-"""Training from Blender: in its own process, in a worker, and the training monitor. Timers need a window: tests call
-their function."""
+"""Training from Blender: in its own process, in a worker, and the training monitor. Timers need a
+window: tests call their function."""
 
 import sys
 import time
@@ -51,7 +51,9 @@ def ask_only(monkeypatch, extension) -> list:
     """Let the operators that train do nothing but ask; what they ask."""
     asked = []
     monkeypatch.setattr(extension.operators.request, "missing_packages", list)
-    monkeypatch.setattr(extension.operators.train, "start", lambda scene, wanted, *_, **__: asked.append(wanted))
+    monkeypatch.setattr(
+        extension.operators.train, "start", lambda scene, wanted, *_, **__: asked.append(wanted)
+    )
     return asked
 
 
@@ -67,7 +69,8 @@ def tick_until(monitor, done: Callable[[], bool]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["mesh", "flame"])
 def test_training_in_process(extension, tmp_path, layout):
-    """Catches a train step that does not reach the trainer with this capture, or whose result show cannot read."""
+    """Catches a train step that does not reach the trainer with this capture, or whose result show
+    cannot read."""
     for package in ("torch", "numba", "PIL"):
         pytest.importorskip(package)
     if layout == "mesh":
@@ -82,14 +85,20 @@ def test_training_in_process(extension, tmp_path, layout):
     assert bpy.ops.stga.train(directory=str(tmp_path / "run"), resume=True) == {"FINISHED"}
     path = bpy.context.scene.stga.avatar
     assert bpy.ops.stga.show_avatar(filepath=path) == {"FINISHED"}
-    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(read_avatar(Path(path)).splats)
+    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(
+        read_avatar(Path(path)).splats
+    )
 
 
 @pytest.mark.slow
 def test_resume_of_another_capture_is_refused(extension, tmp_path):
-    """Catches a run that is continued on another capture, or with another principal point, and so ruined."""
+    """Catches a run that is continued on another capture, or with another principal point, and so
+    ruined."""
     pytest.importorskip("torch")
-    one, other = write_mesh_capture(tmp_path / "one"), write_mesh_capture(tmp_path / "other", timesteps=(0, 5))
+    one, other = (
+        write_mesh_capture(tmp_path / "one"),
+        write_mesh_capture(tmp_path / "other", timesteps=(0, 5)),
+    )
     run, folder = tmp_path / "run", str(tmp_path / "run")
     bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
     assert bpy.ops.stga.train(directory=folder, iterations=3, device="cpu") == {"FINISHED"}
@@ -118,8 +127,11 @@ def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
     ("device", "adapter", "wanted"),
     [("gpu", "", "gpu"), ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"), ("cpu", "Card", "cpu")],
 )
-def test_named_gpu_reaches_the_request(device, adapter, wanted, head, tmp_path, monkeypatch, extension):
-    """Catches a GPU chosen by name that another one trains instead of, and a name that moves the CPU's training."""
+def test_named_gpu_reaches_the_request(
+    device, adapter, wanted, head, tmp_path, monkeypatch, extension
+):
+    """Catches a GPU chosen by name that another one trains instead of, and a name that moves the
+    CPU's training."""
     asked = ask_only(monkeypatch, extension)
     folder = str(tmp_path / "run")
     assert bpy.ops.stga.train(directory=folder, device=device, adapter=adapter) == {"FINISHED"}
@@ -127,7 +139,8 @@ def test_named_gpu_reaches_the_request(device, adapter, wanted, head, tmp_path, 
 
 
 def test_gpus_are_those_of_the_last_test(monkeypatch, extension):
-    """Catches a list of another Python's GPUs, and a traceback in the panel before the first test."""
+    """Catches a list of another Python's GPUs, and a traceback in the panel before the first
+    test."""
     train, own = extension.operators.train, extension.operators.training_python
     monkeypatch.setattr(own.test, "found", None)
     assert train.list_adapters(None, None, "") == []
@@ -136,7 +149,8 @@ def test_gpus_are_those_of_the_last_test(monkeypatch, extension):
 
 
 def test_missing_training_python(extension, head, tmp_path, monkeypatch):
-    """Catches a traceback about imports where a sentence should say which Python lacks which packages."""
+    """Catches a traceback about imports where a sentence should say which Python lacks which
+    packages."""
     monkeypatch.setattr(extension.stga_addon.worker.training_python, "find_spec", lambda name: None)
     monkeypatch.setattr(extension.operators.request, "missing_packages", lambda: ["torch"])
     expected = r"^Error: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
@@ -146,7 +160,8 @@ def test_missing_training_python(extension, head, tmp_path, monkeypatch):
 
 
 def test_mistakes_of_training_are_sentences(head, tmp_path):
-    """Catches tracebacks and silence for an unsaved .blend, an impossible folder, and an interpreter that is none."""
+    """Catches tracebacks and silence for an unsaved .blend, an impossible folder, and an
+    interpreter that is none."""
     (tmp_path / "file").write_text("")
     python = str(tmp_path / "no_python")
     for arguments, sentence in (
@@ -154,7 +169,10 @@ def test_mistakes_of_training_are_sentences(head, tmp_path):
         ({"directory": "//run"}, "relative to the .blend file, which has not been saved yet"),
         ({"directory": str(tmp_path / "file")}, "cannot be written"),
         ({"directory": str(tmp_path / "run"), "resume": True}, "holds no run"),
-        ({"directory": str(tmp_path / "run"), "python": python}, "no_python: cannot be started as a Python"),
+        (
+            {"directory": str(tmp_path / "run"), "python": python},
+            "no_python: cannot be started as a Python",
+        ),
     ):
         with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
             bpy.ops.stga.train(**{"iterations": 2, **arguments})
@@ -173,17 +191,21 @@ def test_failed_worker_is_a_sentence(head, tmp_path):
 
 
 def test_a_cancelled_training_that_is_waited_for(head, tmp_path):
-    """Catches a cancel from elsewhere that a script is told as a failure, and an avatar so far that is not stored."""
+    """Catches a cancel from elsewhere that a script is told as a failure, and an avatar so far that
+    is not stored."""
     from .test_analyze_operator import write_interpreter
 
     body = "(FOLDER.parent / 'avatar.npz').touch(); end('cancelled')"
     python = write_interpreter(tmp_path / "python", body)
-    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=python) == {"FINISHED"}
+    assert bpy.ops.stga.train(directory=str(tmp_path / "run"), iterations=2, python=python) == {
+        "FINISHED"
+    }
     assert bpy.context.scene.stga.avatar == str(tmp_path / "run/avatar.npz")
 
 
 def test_running_worker_cannot_be_replaced_or_dismissed(worker):
-    """Catches a second worker in the same folder, and a dismissed training whose worker continues."""
+    """Catches a second worker in the same folder, and a dismissed training whose worker
+    continues."""
     assert not bpy.ops.stga.train.poll()
     assert not bpy.ops.stga.dismiss.poll()
     assert bpy.ops.stga.cancel(request="training") == {"FINISHED"}
@@ -206,7 +228,8 @@ def test_dismiss_removes_a_requests_files_only(worker):
 
 
 def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
-    """Catches a .blend file from elsewhere whose stored path makes Dismiss delete files that no training wrote."""
+    """Catches a .blend file from elsewhere whose stored path makes Dismiss delete files that no
+    training wrote."""
     folder = tmp_path / "documents/job"
     folder.mkdir(parents=True)
     names = ["preview.npz", "result.json", "selection.npz", "status.json", "worker.log"]
@@ -220,7 +243,8 @@ def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
 
 
 def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
-    """Catches a new object for each preview, display settings that are lost, and splats whose number may not change."""
+    """Catches a new object for each preview, display settings that are lost, and splats whose
+    number may not change."""
     monitor, scene = extension.operators.monitor, bpy.context.scene
     preview = worker.folder / "preview.npz"
     write_ball_avatar(preview)
@@ -232,9 +256,13 @@ def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
 
     avatar = read_avatar(preview)
     keep = np.arange(count) % 3 > 0
-    fewer = type(avatar.splats)(**{name: array[keep] for name, array in vars(avatar.splats).items()})
+    fewer = type(avatar.splats)(
+        **{name: array[keep] for name, array in vars(avatar.splats).items()}
+    )
     fewer.xyz[:] += 0.01
-    extension.stga_addon.avatar.file.write_avatar(preview, type(avatar)(**{**vars(avatar), "splats": fewer}))
+    extension.stga_addon.avatar.file.write_avatar(
+        preview, type(avatar)(**{**vars(avatar), "splats": fewer})
+    )
     tick_until(monitor, lambda: len(shown.data.vertices) == keep.sum())
     bpy.context.view_layer.update()
     assert len(evaluated_splats(shown)[0]) == keep.sum()
@@ -251,7 +279,8 @@ def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
 
 @pytest.mark.parametrize("wanted", [True, False])
 def test_result_reaches_the_scene_once(extension, worker, wanted):
-    """Catches a result that is not shown, shown although it is not wanted, or shown again at every reopening."""
+    """Catches a result that is not shown, shown although it is not wanted, or shown again at every
+    reopening."""
     monitor, scene = extension.operators.monitor, bpy.context.scene
     scene.stga.show_result = wanted
     write_ball_avatar(worker.run / "avatar.npz")
@@ -267,7 +296,8 @@ def test_result_reaches_the_scene_once(extension, worker, wanted):
 
 
 def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
-    """Catches a training that a saved file forgets: its worker continues, and may end, while Blender is closed."""
+    """Catches a training that a saved file forgets: its worker continues, and may end, while
+    Blender is closed."""
     monitor = extension.operators.monitor
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -284,7 +314,8 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
 
 
 def test_cancel_right_after_reopening(extension, worker, tmp_path):
-    """Catches a script that cannot cancel a training of the file it opened: without a window no timer has read it."""
+    """Catches a script that cannot cancel a training of the file it opened: without a window no
+    timer has read it."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
     assert bpy.ops.stga.cancel(request="training") == {"FINISHED"}
@@ -292,7 +323,8 @@ def test_cancel_right_after_reopening(extension, worker, tmp_path):
 
 
 def test_moved_blend_file(extension, worker, tmp_path):
-    """Catches a training that is lost when file and run move together, and silence when the run is gone."""
+    """Catches a training that is lost when file and run move together, and silence when the run is
+    gone."""
     monitor, scene = extension.operators.monitor, bpy.context.scene
     worker.leave()
     scene.stga.run_folder, scene.stga.show_result = "//run", False
@@ -310,7 +342,8 @@ def test_moved_blend_file(extension, worker, tmp_path):
 
 
 def test_undo_does_not_lose_the_worker(extension, worker):
-    """Catches a training that nobody can cancel because an undo step took the scene back to before it began."""
+    """Catches a training that nobody can cancel because an undo step took the scene back to before
+    it began."""
     monitor, scene = extension.operators.monitor, bpy.context.scene
     monitor.tick()
     scene.stga.training_run = ""
@@ -322,7 +355,10 @@ def test_failed_worker_ends_the_timer(extension, worker):
     """Catches a progress bar that never ends, and a failure without the end of the log."""
     monitor = extension.operators.monitor
     (worker.folder / "worker.log").write_text("Killed\n")
-    write_json(worker.folder / "status.json", {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"})
+    write_json(
+        worker.folder / "status.json",
+        {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"},
+    )
     last = monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot
     assert last.state.failed
     assert last.log_tail == ("Killed",)
@@ -330,7 +366,8 @@ def test_failed_worker_ends_the_timer(extension, worker):
 
 
 def test_file_made_without_the_panel(extension, tmp_path):
-    """Catches a demo.blend that opens with an empty panel, and a chosen head that is replaced at loading."""
+    """Catches a demo.blend that opens with an empty panel, and a chosen head that is replaced at
+    loading."""
     folder = write_mesh_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder))
     name = bpy.context.scene.stga.head.name
@@ -346,10 +383,15 @@ def test_file_made_without_the_panel(extension, tmp_path):
 
 @pytest.mark.slow
 def test_python_is_tested_without_a_window(extension, tmp_path):
-    """Catches a test of a Python that a script cannot make, or that finds nothing wrong with another program."""
-    with pytest.raises(RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"):
+    """Catches a test of a Python that a script cannot make, or that finds nothing wrong with
+    another program."""
+    with pytest.raises(
+        RuntimeError, match=r"^Error: .*python: cannot be started as a Python interpreter"
+    ):
         bpy.ops.stga.test_python(python=str(tmp_path / "python"))
     with pytest.raises(RuntimeError, match="is not a Python that runs this add-on"):
         bpy.ops.stga.test_python(python="false")
     assert bpy.ops.stga.test_python(python=sys.executable) == {"FINISHED"}
-    assert extension.operators.training_python.test.found.line.startswith(f"Python {sys.version.split()[0]}, torch ")
+    assert extension.operators.training_python.test.found.line.startswith(
+        f"Python {sys.version.split()[0]}, torch "
+    )

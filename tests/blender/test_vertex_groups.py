@@ -30,7 +30,8 @@ def random_selection(capture, share: float = 0.2, seed: int = 0) -> dict[int, np
 
 
 def test_reading_back_gives_the_closure(capture, head):
-    """Fails when a group is written to the wrong frame or vertices, or one timestep's group leaks into another's."""
+    """Fails when a group is written to the wrong frame or vertices, or one timestep's group leaks
+    into another's."""
     chosen = random_selection(capture)
     write_selection(head, chosen)
     read = read_selection(head)
@@ -51,14 +52,17 @@ def test_round_trip_is_idempotent(capture, head):
 
 
 def test_new_selection_replaces_only_selection_groups(tmp_path):
-    """Fails when old timesteps keep their groups, or the rig's vertex groups are removed with them."""
+    """Fails when old timesteps keep their groups, or the rig's vertex groups are removed with
+    them."""
     sequence = flame_sequence(flame_model(), timesteps=(1, 2))
     head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
     bones = {group.name: [head.vertex_groups[group.name].weight(3)] for group in head.vertex_groups}
     faces = len(sequence.model.faces)
     write_selection(head, {1: np.ones(faces, bool), 2: np.ones(faces, bool)})
     write_selection(head, {2: np.arange(faces) < 4, 1: np.zeros(faces, bool)})
-    ours = [group.name for group in head.vertex_groups if tags.group_timestep(group.name) is not None]
+    ours = [
+        group.name for group in head.vertex_groups if tags.group_timestep(group.name) is not None
+    ]
     assert ours == ["stga_2"]
     assert {name: [head.vertex_groups[name].weight(3)] for name in bones} == bones
     read = read_selection(head)
@@ -67,7 +71,8 @@ def test_new_selection_replaces_only_selection_groups(tmp_path):
 
 
 def test_the_rest_of_the_head_stays(tmp_path):
-    """Fails when writing weights moves vertices or shape keys, turns triangles, or drops what is stored on them."""
+    """Fails when writing weights moves vertices or shape keys, turns triangles, or drops what is
+    stored on them."""
     sequence = flame_sequence(flame_model(), timesteps=(1, 2))
     head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
     mesh = head.data
@@ -82,7 +87,10 @@ def test_the_rest_of_the_head_stays(tmp_path):
         found = {key.name: read_values(key.data, "co", 3) for key in keys}
         found |= {"": read_values(mesh.vertices, "co", 3), "shown": evaluated_vertices(head)}
         found["edges"] = read_values(mesh.edges, "vertices", 2, np.int32)
-        return found | {"own": read_values(mesh.attributes["own"].data, "value", 1), "faces": mesh_triangles(mesh)}
+        return found | {
+            "own": read_values(mesh.attributes["own"].data, "value", 1),
+            "faces": mesh_triangles(mesh),
+        }
 
     before = state()
     write_selection(head, {2: np.arange(len(mesh.polygons)) < 4})
@@ -106,7 +114,16 @@ def test_weights_of_one_half_and_more_select(capture, head):
 def test_group_names_of_timesteps():
     """Fails when an artist's own group counts as a selection, and is deleted with it."""
     assert tags.group_timestep("stga_12") == 12
-    for name in ("stga_012", "stga_", "stga_-1", "stga_1_0", "stga_region_nose", "12", "jaw", "stga_٣"):
+    for name in (
+        "stga_012",
+        "stga_",
+        "stga_-1",
+        "stga_1_0",
+        "stga_region_nose",
+        "12",
+        "jaw",
+        "stga_٣",
+    ):
         assert tags.group_timestep(name) is None
 
 
@@ -121,4 +138,6 @@ def test_edit_mode_and_wrong_sizes_are_refused(capture, head):
     with pytest.raises(StgaError, match="edit mode"):
         write_selection(head, {})
     bpy.ops.object.mode_set(mode="OBJECT")
-    assert all((before[timestep] == after).all() for timestep, after in read_selection(head).items())
+    assert all(
+        (before[timestep] == after).all() for timestep, after in read_selection(head).items()
+    )

@@ -1,4 +1,5 @@
-"""Colors of the engine's images through view transforms, whose inverses are kept of several scenes and settings."""
+"""Colors of the engine's images through view transforms, whose inverses are kept of several scenes
+and settings."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,8 @@ def scene_with(view: str, exposure: float = 0.0):
 
 
 def test_scenes_with_different_view_transforms():
-    """Catches a render of two scenes in which only the scene measured last shows the trained colors."""
+    """Catches a render of two scenes in which only the scene measured last shows the trained
+    colors."""
     scenes = [scene_with("AgX"), scene_with("Standard", exposure=1.0)]
     for scene in scenes:
         measure(scene)
@@ -39,7 +41,8 @@ def test_scenes_with_different_view_transforms():
 
 
 def test_dark_colors_are_shown_as_trained():
-    """Catches an inverse that has not come to the end where the view transform hardly changes: in dark skin."""
+    """Catches an inverse that has not come to the end where the view transform hardly changes: in
+    dark skin."""
     rng = np.random.default_rng(0)
     skin = rng.uniform(0.1, 1.3, (4000, 1)) * [0.75, 0.55, 0.45] + rng.normal(0, 0.04, (4000, 3))
     scene, skin = scene_with("AgX"), np.clip(skin, 0, 1)
@@ -52,8 +55,8 @@ def test_dark_colors_are_shown_as_trained():
 
 
 def test_an_animated_exposure_keeps_a_few(monkeypatch):
-    """Catches a table per frame of an animation that stays in memory, and one of a scene that is rendered with each
-    frame and displaced by them."""
+    """Catches a table per frame of an animation that stays in memory, and one of a scene that is
+    rendered with each frame and displaced by them."""
     monkeypatch.setattr(view_transform, "_measured", {})
     monkeypatch.setattr(view_transform, "_shown", lambda scene, axis: scene.view_settings.exposure)
     monkeypatch.setattr(view_transform, "InverseView", lambda axis, exposure: exposure)
@@ -76,7 +79,9 @@ def sheet(color: np.ndarray | None = None) -> None:
     colors = skin if color is None else np.tile(color, (count, 1))
     splats = replace(
         random_splats(1, count, degree=0),
-        xyz=np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)]).astype(np.float32),
+        xyz=np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)]).astype(
+            np.float32
+        ),
         log_scale=np.full((count, 3), -3.2, np.float32),
         opacity=np.full(count, 3, np.float32),
         sh=((colors - 0.5) / SH_C0).astype(np.float32).reshape(count, 1, 3),
@@ -86,7 +91,8 @@ def sheet(color: np.ndarray | None = None) -> None:
 
 
 def saved_picture(folder: Path, **view: object) -> np.ndarray:
-    """(H, W, 4) values 0 to 255 of the image that Blender saves of a render through these view settings."""
+    """(H, W, 4) values 0 to 255 of the image that Blender saves of a render through these view
+    settings."""
     scene = bpy.context.scene
     scene.view_settings.look = "None"
     scene.view_settings.view_transform = view["view_transform"]  # which says what looks there are
@@ -119,12 +125,18 @@ def test_standard_view_transform_shows_trained_colors(tmp_path):
     [
         {"view_transform": "AgX"},
         {"view_transform": "Filmic"},
-        {"view_transform": "AgX", "look": "AgX - Medium High Contrast", "exposure": 0.5, "gamma": 1.1},
+        {
+            "view_transform": "AgX",
+            "look": "AgX - Medium High Contrast",
+            "exposure": 0.5,
+            "gamma": 1.1,
+        },
         {"view_transform": "Standard", "exposure": -0.5},
     ],
 )
 def test_view_transforms_show_trained_colors(view, transparent, tmp_path):
-    """Catches colors that a scene in AgX or Filmic changes, at soft edges too, and data that a measurement leaves."""
+    """Catches colors that a scene in AgX or Filmic changes, at soft edges too, and data that a
+    measurement leaves."""
     sheet()
     bpy.context.scene.render.film_transparent = transparent
     trained = saved_picture(tmp_path, view_transform="Standard")
@@ -139,7 +151,8 @@ def test_view_transforms_show_trained_colors(view, transparent, tmp_path):
 
 
 def test_standard_needs_no_table():
-    """Catches a table between the trained colors and the image where the view transform needs none."""
+    """Catches a table between the trained colors and the image where the view transform needs
+    none."""
     scene = bpy.context.scene
     for name in ("Standard", "Raw"):
         scene.view_settings.view_transform = name

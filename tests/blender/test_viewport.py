@@ -27,7 +27,8 @@ def request(x: float = 0.0, layers=(), background=None) -> RenderRequest:
 
 
 class Recorder:
-    """A renderer whose images are empty; records the requests, and lets the thread go on one image per `go`."""
+    """A renderer whose images are empty; records the requests, and lets the thread go on one image
+    per `go`."""
 
     def __init__(self, error: Exception | None = None, waits: bool = False) -> None:
         self.rendered: list[tuple[RenderRequest, float]] = []
@@ -132,7 +133,8 @@ def poll_until_idle() -> None:
 
 
 def test_viewports_are_redrawn_from_the_main_thread():
-    """Catches bpy called from the render thread, a last image that is never shown, and a timer that runs when idle."""
+    """Catches bpy called from the render thread, a last image that is never shown, and a timer that
+    runs when idle."""
     recorder, engine = Recorder(waits=True), Engine()
     recorder.renderer.request(request())
     engine_viewport.redraw_when_rendered(recorder.renderer, engine)
@@ -153,7 +155,8 @@ def test_viewports_are_redrawn_from_the_main_thread():
 
 @pytest.mark.parametrize("freed", [False, True])
 def test_a_closed_viewport_ends_its_thread(freed):
-    """Catches a thread that refines a view nobody sees, an engine kept alive by the timer, and a timer that fails."""
+    """Catches a thread that refines a view nobody sees, an engine kept alive by the timer, and a
+    timer that fails."""
     recorder, engine = Recorder(waits=True), Engine(freed)
     recorder.renderer.request(request())
     recorder.started.wait()

@@ -1,9 +1,10 @@
-"""An artist's way through the installed extension; run by `test_versions.py` in a Python of its own with some bpy.
+"""An artist's way through the installed extension; run by `test_versions.py` in a Python of its own
+with some bpy.
 
     python workflow.py ZIP FOLDER PYTHON
 
-FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. PYTHON is the one that trains,
-with the kernels in the zip; "" if there is none. Prints RESULT and JSON.
+FOLDER holds capture/, model.npz, other.npz and a.npz, and receives what is exported. PYTHON is the
+one that trains, with the kernels in the zip; "" if there is none. Prints RESULT and JSON.
 """
 
 import importlib
@@ -19,7 +20,9 @@ MODULE = "bl_ext.user_default.stga"
 
 
 def main(archive: str, folder: Path, python: str) -> dict[str, object]:
-    bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
+    bpy.ops.extensions.package_install_files(
+        filepath=archive, repo="user_default", enable_on_install=True
+    )
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.preferences.addon_enable(module=MODULE)
     ops = bpy.ops.stga
@@ -35,7 +38,10 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
     if can_train() or python:
         # Without torch, whose bytecode a new extension would write first
         ops.train(
-            directory=str(folder / "run"), iterations=3, effects="tracking=off", python=python if can_train() else ""
+            directory=str(folder / "run"),
+            iterations=3,
+            effects="tracking=off",
+            python=python if can_train() else "",
         )
         ops.show_avatar(filepath=bpy.context.scene.stga.avatar)
         trained = len(positions()) // 3
@@ -69,7 +75,10 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
 
 
 def can_train() -> bool:
-    return all(importlib.util.find_spec(name) for name in ("torch", "numba", "scipy", "PIL", "platformdirs"))
+    return all(
+        importlib.util.find_spec(name)
+        for name in ("torch", "numba", "scipy", "PIL", "platformdirs")
+    )
 
 
 def positions() -> list[float]:
@@ -82,4 +91,5 @@ def positions() -> list[float]:
 
 if __name__ == "__main__":
     print("RESULT " + json.dumps(main(sys.argv[1], Path(sys.argv[2]), sys.argv[3])), flush=True)
-    os._exit(0)  # the module bpy 4.2 crashes when its Python ends where a property has an update function
+    # the module bpy 4.2 crashes when its Python ends where a property has an update function
+    os._exit(0)

@@ -12,6 +12,8 @@ def with_version(archive: Path, version: str, out: Path) -> Path:
         for entry in source.infolist():
             data = source.read(entry)
             if entry.filename == "blender_manifest.toml":
-                data = data.replace(f'version = "{__version__}"'.encode(), f'version = "{version}"'.encode(), 1)
+                data = data.replace(
+                    f'version = "{__version__}"'.encode(), f'version = "{version}"'.encode(), 1
+                )
             made.writestr(entry, data)
     return out

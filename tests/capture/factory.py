@@ -25,7 +25,11 @@ def pose(camera: int) -> np.ndarray:
     """Camera-to-world, OpenGL axes, one meter from the ball and looking at it."""
     angle = 0.4 * camera - 0.5
     matrix = np.eye(4)
-    matrix[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    matrix[:3, :3] = [
+        [np.cos(angle), 0, np.sin(angle)],
+        [0, 1, 0],
+        [-np.sin(angle), 0, np.cos(angle)],
+    ]
     matrix[:3, 3] = matrix[:3, 2]
     return matrix
 
@@ -33,13 +37,17 @@ def pose(camera: int) -> np.ndarray:
 def silhouette() -> np.ndarray:
     """(HEIGHT, WIDTH) bool: which pixels' rays meet the ball; the same from every camera."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    sine = np.hypot(columns - CX, rows - CY) / np.sqrt((columns - CX) ** 2 + (rows - CY) ** 2 + FOCAL**2)
+    sine = np.hypot(columns - CX, rows - CY) / np.sqrt(
+        (columns - CX) ** 2 + (rows - CY) ** 2 + FOCAL**2
+    )
     return sine < RADIUS
 
 
 def picture(timestep: int, camera: int) -> np.ndarray:
     """(HEIGHT, WIDTH, 3) uint8 on white, of a color that only this view has."""
-    return np.where(silhouette()[..., None], [10 * timestep, 10 * camera, 128], 255).astype(np.uint8)
+    return np.where(silhouette()[..., None], [10 * timestep, 10 * camera, 128], 255).astype(
+        np.uint8
+    )
 
 
 def moved(timestep: int, vertices: np.ndarray) -> np.ndarray:
@@ -78,17 +86,25 @@ def write_images(root: Path, timesteps: Sequence[int], cameras: Sequence[int]) -
 
 def write_splits(root: Path, frames: list[dict[str, Any]], **shared: Any) -> None:
     """The last camera is `val`, the last timestep `test`, all else `train`."""
-    last_camera, last_timestep = max(f["camera_index"] for f in frames), max(f["timestep_index"] for f in frames)
+    last_camera, last_timestep = (
+        max(f["camera_index"] for f in frames),
+        max(f["timestep_index"] for f in frames),
+    )
     splits: dict[str, list[dict[str, Any]]] = {name: [] for name in SPLITS}
     for entry in frames:
         late = entry["timestep_index"] == last_timestep
-        splits["test" if late else "val" if entry["camera_index"] == last_camera else "train"].append(entry)
+        splits[
+            "test" if late else "val" if entry["camera_index"] == last_camera else "train"
+        ].append(entry)
     for name, entries in splits.items():
         (root / f"transforms_{name}.json").write_text(json.dumps({**shared, "frames": entries}))
 
 
 def write_mesh_capture(
-    root: Path, timesteps: Sequence[int] = (0, 1, 3), cameras: Sequence[int] = (0, 1, 2), suffix: str = ".obj"
+    root: Path,
+    timesteps: Sequence[int] = (0, 1, 3),
+    cameras: Sequence[int] = (0, 1, 2),
+    suffix: str = ".obj",
 ) -> Path:
     """Layout "mesh" with a canonical mesh and one region, `mouth`."""
     write_images(root, timesteps, cameras)
@@ -97,9 +113,13 @@ def write_mesh_capture(
     write_mesh(root / f"meshes/neutral{suffix}", vertices, faces)
     for timestep in timesteps:
         write_mesh(root / f"meshes/{timestep:05d}{suffix}", moved(timestep, vertices), faces)
-    (root / "regions.json").write_text(json.dumps({"mouth": np.flatnonzero(vertices[:, 1] < -0.06).tolist()}))
+    (root / "regions.json").write_text(
+        json.dumps({"mouth": np.flatnonzero(vertices[:, 1] < -0.06).tolist()})
+    )
     frames = [frame(t, c, mesh_path=f"meshes/{t:05d}{suffix}") for t in timesteps for c in cameras]
-    write_splits(root, frames, canonical_mesh_path=f"meshes/neutral{suffix}", regions_path="regions.json")
+    write_splits(
+        root, frames, canonical_mesh_path=f"meshes/neutral{suffix}", regions_path="regions.json"
+    )
     return root
 
 
@@ -112,7 +132,8 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def write_flame_model(path: Path, seed: int = 0) -> Path:
-    """A model file in FLAME's format with the ball as template, four identity and two expression components."""
+    """A model file in FLAME's format with the ball as template, four identity and two expression
+    components."""
     random = np.random.default_rng(seed)
     vertices, faces = ball()
     weights = random.random((len(vertices), 5))
@@ -127,7 +148,10 @@ def write_flame_model(path: Path, seed: int = 0) -> Path:
         kintree_table=np.array([[-1, 0, 1, 1, 1], [0, 1, 2, 3, 4]]),
         weights=weights / weights.sum(1, keepdims=True),
         f=faces,
-        **{"masks/nose": np.flatnonzero(vertices[:, 2] > 0.07), "masks/lips": np.flatnonzero(vertices[:, 1] < -0.06)},
+        **{
+            "masks/nose": np.flatnonzero(vertices[:, 2] > 0.07),
+            "masks/lips": np.flatnonzero(vertices[:, 1] < -0.06),
+        },
     )
     return path
 
@@ -157,12 +181,22 @@ def write_flame_capture(
     for timestep in timesteps:
         np.savez(root / f"flame_param/{timestep:05d}.npz", **flame_parameters(timestep))
     np.savez(root / "canonical_flame_param.npz", **flame_parameters(timesteps[0]))
-    write_splits(root, [frame(t, c, flame_param_path=f"flame_param/{t:05d}.npz") for t in timesteps for c in cameras])
+    write_splits(
+        root,
+        [
+            frame(t, c, flame_param_path=f"flame_param/{t:05d}.npz")
+            for t in timesteps
+            for c in cameras
+        ],
+    )
     return root, write_flame_model(root / "model.npz")
 
 
-def write_release(root: Path, timesteps: Sequence[int] = (0, 1), cameras: Sequence[int] = (0, 1)) -> Path:
-    """The layout of the STGA authors' release; the first timestep trains triangles 0, 2 and 5, others name none."""
+def write_release(
+    root: Path, timesteps: Sequence[int] = (0, 1), cameras: Sequence[int] = (0, 1)
+) -> Path:
+    """The layout of the STGA authors' release; the first timestep trains triangles 0, 2 and 5,
+    others name none."""
     write_images(root, timesteps, cameras)
     (root / "meshes").mkdir()
     (root / "training_faces").mkdir()

@@ -1,4 +1,5 @@
-"""Captures with absurd values: refused in one sentence that names file and field, without warnings of NumPy."""
+"""Captures with absurd values: refused in one sentence that names file and field, without warnings
+of NumPy."""
 
 import json
 import subprocess
@@ -22,7 +23,8 @@ def change_frames(root: Path, change) -> None:
     """Change every frame of every split in place."""
     for split in factory.SPLITS:
         factory.edit(
-            root / f"transforms_{split}.json", lambda document: [change(frame) for frame in document["frames"]]
+            root / f"transforms_{split}.json",
+            lambda document: [change(frame) for frame in document["frames"]],
         )
 
 
@@ -66,7 +68,8 @@ def test_flame_mesh_out_of_reach(tmp_path, field, value, expected):
 )
 @pytest.mark.parametrize("field", ["file_path", "fg_mask_path", "mesh_path"])
 def test_impossible_paths(tmp_path, field, path, expected):
-    """Catches a path that ends in a ValueError, OSError or UnicodeEncodeError, and one that is quoted whole."""
+    """Catches a path that ends in a ValueError, OSError or UnicodeEncodeError, and one that is
+    quoted whole."""
     root = factory.write_mesh_capture(tmp_path / "capture")
 
     def change(frame):
@@ -88,7 +91,8 @@ def test_impossible_capture_folder(folder):
 
 
 def test_region_name_that_cannot_be_printed(tmp_path):
-    """Catches a lone surrogate in a region's name, which fails when the capture's summary is printed."""
+    """Catches a lone surrogate in a region's name, which fails when the capture's summary is
+    printed."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     (root / "regions.json").write_text(json.dumps({"mouth\udc80": [0, 1, 2]}))
     with pytest.raises(StgaError, match=r"regions\.json: is not valid JSON") as error:
@@ -98,7 +102,14 @@ def test_region_name_that_cannot_be_printed(tmp_path):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("fl_x", 1e30), ("fl_x", 1e-30), ("fl_y", 1e300), ("camera_angle_x", 5e-324), ("cx", 1e30), ("cy", -1e30)],
+    [
+        ("fl_x", 1e30),
+        ("fl_x", 1e-30),
+        ("fl_y", 1e300),
+        ("camera_angle_x", 5e-324),
+        ("cx", 1e30),
+        ("cy", -1e30),
+    ],
 )
 def test_absurd_intrinsics(tmp_path, field, value):
     """Catches focal lengths and principal points with which pixel positions overflow."""
@@ -117,7 +128,8 @@ def test_absurd_intrinsics(tmp_path, field, value):
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 0.02, 0.1, -1.0])
 @pytest.mark.filterwarnings("error")
 def test_camera_inside_the_head(tmp_path, distance):
-    """Catches divisions by a depth or distance of zero for a camera in the head, or with the head behind it."""
+    """Catches divisions by a depth or distance of zero for a camera in the head, or with the head
+    behind it."""
     root = factory.write_mesh_capture(tmp_path / "capture")
 
     def change(frame):
@@ -142,7 +154,8 @@ def test_size_of_images_is_limited(tmp_path):
 def test_memory_of_shrinking_a_large_image(tmp_path):
     """Catches wide intermediate numbers of all pixels at once: 29 million pixels took 3 GB.
 
-    Measured in a process of its own, whose peak no other test has raised; that of getrusage is inherited.
+    Measured in a process of its own, whose peak no other test has raised; that of getrusage is
+    inherited.
     """
     if not Path("/proc/self/status").exists():
         pytest.skip("peak memory of a process is read from Linux's /proc")
@@ -174,5 +187,7 @@ def test_impossible_frame_rate(tmp_path, value):
     """Catches a rate at which nothing plays, which fails as late as in an export."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     factory.edit(root / "transforms_val.json", lambda document: document.update(fps=value))
-    with pytest.raises(StgaError, match=r"transforms_val\.json: (fps: expected a finite number|is not valid JSON)"):
+    with pytest.raises(
+        StgaError, match=r"transforms_val\.json: (fps: expected a finite number|is not valid JSON)"
+    ):
         open_capture(root)

@@ -37,8 +37,13 @@ def test_orbit() -> None:
 
 def test_azimuths_undo_the_orbit() -> None:
     """Catches angles that do not lead from one camera to the other."""
-    start, others = camera(20), [camera(angle, height) for angle, height in ((20, 0.5), (-60, -0.2), (150, 0.1))]
-    np.testing.assert_allclose(np.degrees(azimuths(others, start, CENTER, (0, 2, 0))), (0, -80, 130), atol=1e-9)
+    start, others = (
+        camera(20),
+        [camera(angle, height) for angle, height in ((20, 0.5), (-60, -0.2), (150, 0.1))],
+    )
+    np.testing.assert_allclose(
+        np.degrees(azimuths(others, start, CENTER, (0, 2, 0))), (0, -80, 130), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -51,14 +56,18 @@ def test_azimuths_undo_the_orbit() -> None:
         ((30,), 30, (0, 0)),
     ],
 )
-def test_covered_angles(angles: tuple[float, ...], start: float, expected: tuple[float, float]) -> None:
-    """Catches a turntable that shows a side which no camera saw, or leaves out one that they did."""
+def test_covered_angles(
+    angles: tuple[float, ...], start: float, expected: tuple[float, float]
+) -> None:
+    """Catches a turntable that shows a side which no camera saw, or leaves out one that they
+    did."""
     covered = covered_angles([camera(angle) for angle in angles], camera(start), CENTER)
     np.testing.assert_allclose(np.degrees(covered), expected, atol=1e-9)
 
 
 def test_turntable() -> None:
-    """Catches a full turn that ends in its first view, and a partial one that leaves its limits or jumps."""
+    """Catches a full turn that ends in its first view, and a partial one that leaves its limits or
+    jumps."""
     full = turntable(camera(10), CENTER, 8, (-np.pi, np.pi))
     for index, each in enumerate(full):
         assert_same_pose(each, camera(10 + 45 * index))
@@ -74,6 +83,7 @@ def test_central_camera() -> None:
 
 
 def test_to_and_fro() -> None:
-    """Catches a jump from the last timestep to the first, and a timestep shown twice at the turning points."""
+    """Catches a jump from the last timestep to the first, and a timestep shown twice at the turning
+    points."""
     assert to_and_fro((3, 5, 8), 9) == [3, 5, 8, 5, 3, 5, 8, 5, 3]
     assert to_and_fro((4,), 3) == [4, 4, 4]

@@ -38,8 +38,11 @@ def test_plain_color(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (10, 200, 90)])
-def test_transparency_is_laid_over_the_background(tmp_path: Path, background: tuple[int, int, int]) -> None:
-    """Catches premultiplied mixing and integer overflow, against the same in floating point; alpha is the mask."""
+def test_transparency_is_laid_over_the_background(
+    tmp_path: Path, background: tuple[int, int, int]
+) -> None:
+    """Catches premultiplied mixing and integer overflow, against the same in floating point; alpha
+    is the mask."""
     view = view_of(saved(tmp_path / "x.png", np.dstack([COLOUR, ALPHA])))
     share = ALPHA[..., None] / 255
     expected = np.round(COLOUR * share + np.array(background) * (1 - share))
@@ -48,10 +51,15 @@ def test_transparency_is_laid_over_the_background(tmp_path: Path, background: tu
 
 
 def test_gray_and_palette(tmp_path: Path) -> None:
-    """Catches gray, black-and-white, gray with alpha and palette images read with a missing channel axis."""
-    np.testing.assert_array_equal(read_image(view_of(saved(tmp_path / "l.png", GREY))), np.dstack([GREY] * 3))
+    """Catches gray, black-and-white, gray with alpha and palette images read with a missing channel
+    axis."""
+    np.testing.assert_array_equal(
+        read_image(view_of(saved(tmp_path / "l.png", GREY))), np.dstack([GREY] * 3)
+    )
     bits = GREY > 127
-    np.testing.assert_array_equal(read_image(view_of(saved(tmp_path / "1.png", bits)))[..., 0], bits * 255)
+    np.testing.assert_array_equal(
+        read_image(view_of(saved(tmp_path / "1.png", bits)))[..., 0], bits * 255
+    )
     la = saved(tmp_path / "la.png", np.dstack([GREY, np.where(bits, 255, 0).astype(np.uint8)]))
     np.testing.assert_array_equal(read_image(view_of(la))[..., 1], np.where(bits, GREY, 255))
     few = (COLOUR // 128) * 255
@@ -83,11 +91,15 @@ def test_size_mismatch_names_both(tmp_path: Path) -> None:
     """Catches an image that is resized in silence, or broadcast later on."""
     wrong = saved(tmp_path / "wrong.png", COLOUR[:-1])
     with pytest.raises(
-        StgaError, match=r"wrong\.png: the image has 7 x 4 pixels, but the camera of wrong\.png has 7 x"
+        StgaError,
+        match=r"wrong\.png: the image has 7 x 4 pixels, but the camera of wrong\.png has 7 x",
     ):
         read_image(view_of(wrong))
     right = saved(tmp_path / "right.png", COLOUR)
-    with pytest.raises(StgaError, match=r"wrong\.png: the mask has 7 x 4 pixels, but the image .*right\.png .* 7 x 5"):
+    with pytest.raises(
+        StgaError,
+        match=r"wrong\.png: the mask has 7 x 4 pixels, but the image .*right\.png .* 7 x 5",
+    ):
         read_mask(view_of(right, wrong))
 
 
@@ -107,7 +119,8 @@ def test_truncated_images(tmp_path: Path, suffix: str, kept: float) -> None:
 
 
 def test_missing_and_foreign_images(tmp_path: Path) -> None:
-    """Catches a missing image, a text file, and a format besides those allowed: for some Pillow runs other programs."""
+    """Catches a missing image, a text file, and a format besides those allowed: for some Pillow
+    runs other programs."""
     with pytest.raises(StgaError, match=r"none\.png: does not exist"):
         read_image(view_of(tmp_path / "none.png"))
     for text in (b"hello", b"P6 7 5 255 " + bytes(WIDTH * HEIGHT * 3)):
@@ -122,7 +135,9 @@ def test_decompression_bomb(tmp_path: Path) -> None:
     """Catches a tiny file that claims gigapixels and would fill the memory."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+        return (
+            len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+        )
 
     header = (60000).to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
     body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
@@ -140,10 +155,15 @@ def test_area_mean_against_overlaps(height: int, width: int) -> None:
     def overlaps(old: int, new: int) -> np.ndarray:
         step = old / new
         return np.array(
-            [[max(0, min((j + 1) * step, i + 1) - max(j * step, i)) / step for i in range(old)] for j in range(new)]
+            [
+                [max(0, min((j + 1) * step, i + 1) - max(j * step, i)) / step for i in range(old)]
+                for j in range(new)
+            ]
         )
 
-    expected = np.einsum("yh,xw,hwc->yxc", overlaps(HEIGHT, height), overlaps(WIDTH, width), COLOUR.astype(float))
+    expected = np.einsum(
+        "yh,xw,hwc->yxc", overlaps(HEIGHT, height), overlaps(WIDTH, width), COLOUR.astype(float)
+    )
     np.testing.assert_allclose(area_mean(COLOUR, height, width), expected, atol=0.5 + 1e-9)
     np.testing.assert_allclose(area_mean(GREY, height, width).mean(), GREY.mean(), atol=0.51)
 

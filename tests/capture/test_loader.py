@@ -105,7 +105,9 @@ def test_one_view_larger_than_the_queue(views: list[View]) -> None:
 
 def test_memory_does_not_grow(views: list[View]) -> None:
     """Catches arrays held after use: 600 views of 10 kB pass through 10 views' worth of memory."""
-    with ViewLoader(itertools.cycle(views), queue_bytes=4 * VIEW_BYTES, cache_bytes=4 * VIEW_BYTES) as loader:
+    with ViewLoader(
+        itertools.cycle(views), queue_bytes=4 * VIEW_BYTES, cache_bytes=4 * VIEW_BYTES
+    ) as loader:
         for _ in range(20):
             next(loader)
         tracemalloc.start()
@@ -117,7 +119,8 @@ def test_memory_does_not_grow(views: list[View]) -> None:
 
 
 def test_errors_come_where_their_view_would(views: list[View]) -> None:
-    """Catches an error lost in the thread, or raised before the good views ahead of it; and a hang afterwards."""
+    """Catches an error lost in the thread, or raised before the good views ahead of it; and a hang
+    afterwards."""
     views[2].image.write_bytes(b"broken")
     with ViewLoader(views) as loader:
         assert next(loader)[0] is views[0]
@@ -156,7 +159,8 @@ def test_closes_from_any_state(views: list[View]) -> None:
 
 
 def test_scales_by_position(views: list[View]) -> None:
-    """Catches a full-size image from the cache where a small one is due, or a camera that does not match it."""
+    """Catches a full-size image from the cache where a small one is due, or a camera that does not
+    match it."""
     sizes = [0.5, 1.0, 0.5, 0.25]
     with ViewLoader([views[0]] * 4, scale=lambda position: sizes[position]) as loader:
         loaded = list(loader)
@@ -176,7 +180,8 @@ def test_shared_arrays_are_read_only(views: list[View]) -> None:
 
 
 def test_waiting_is_counted(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a wait that is not measured: slow decoding shows, and views that are ready cost nothing."""
+    """Catches a wait that is not measured: slow decoding shows, and views that are ready cost
+    nothing."""
 
     def slow(view: View, *rest: object) -> object:
         time.sleep(0.05)
@@ -201,7 +206,9 @@ def test_meshes_are_read_in_the_thread_and_bounded(views: list[View]) -> None:
         return np.full((1000, 3), float(timestep))
 
     item_bytes = VIEW_BYTES + 24_000
-    with ViewLoader(itertools.cycle(views), queue_bytes=2 * item_bytes, cache_bytes=0, mesh=mesh) as loader:
+    with ViewLoader(
+        itertools.cycle(views), queue_bytes=2 * item_bytes, cache_bytes=0, mesh=mesh
+    ) as loader:
         first = next(loader)
         wait_until(lambda: len(read) == 4)
         time.sleep(0.1)

@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.mesh_geometry import rasterize, weighted_procrustes, without_head_motion
-from stga_addon.capture.meshes import CACHE_BYTES, cached_meshes, find_region, read_mesh, read_regions, tracked_meshes
+from stga_addon.capture.meshes import (
+    CACHE_BYTES,
+    cached_meshes,
+    find_region,
+    read_mesh,
+    read_regions,
+    tracked_meshes,
+)
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
@@ -21,7 +28,8 @@ from . import factory
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
 def test_order_is_kept(tmp_path: Path, suffix: str) -> None:
-    """Catches vertices merged, sorted or dropped, by a mesh with a duplicate and an unused vertex."""
+    """Catches vertices merged, sorted or dropped, by a mesh with a duplicate and an unused
+    vertex."""
     vertices, faces = factory.ball()
     vertices = np.concatenate([vertices[:1], [[1.0, 2.0, 3.0]], vertices])
     path = tmp_path / f"mesh{suffix}"
@@ -33,7 +41,8 @@ def test_order_is_kept(tmp_path: Path, suffix: str) -> None:
 
 
 def test_stl_is_a_soup_in_order(tmp_path: Path) -> None:
-    """Catches STL triangles welded by position, which would join lips and eyelids that merely touch."""
+    """Catches STL triangles welded by position, which would join lips and eyelids that merely
+    touch."""
     vertices, faces = factory.ball()
     factory.write_mesh(tmp_path / "mesh.stl", vertices, faces)
     read, triangles = read_mesh(tmp_path / "mesh.stl")
@@ -51,11 +60,27 @@ def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
 
 
 def test_obj_dialects(tmp_path: Path) -> None:
-    """Catches what exporters really write: colors, texture corners, several materials and objects, quads,
-    negative indices, Windows line ends, continued lines. trimesh would regroup the triangles by material.
+    """Catches what exporters really write: colors, texture corners, several materials and objects,
+    quads, negative indices, Windows line ends, continued lines. trimesh would regroup the triangles
+    by material.
     """
-    lines = ["mtllib x.mtl", "o a", *(f"v {i} {i * i} 0 1 0 0" for i in range(5)), "vt 0 0", "vn 0 0 1", "usemtl b"]
-    lines += ["f 4/1 2/1 1/1", "usemtl a", "f 1//1 2//1 3//1 4//1", "o b", "f -1 -2\\", " -3", "f 1/1/1 3/1/1 5/1/1"]
+    lines = [
+        "mtllib x.mtl",
+        "o a",
+        *(f"v {i} {i * i} 0 1 0 0" for i in range(5)),
+        "vt 0 0",
+        "vn 0 0 1",
+        "usemtl b",
+    ]
+    lines += [
+        "f 4/1 2/1 1/1",
+        "usemtl a",
+        "f 1//1 2//1 3//1 4//1",
+        "o b",
+        "f -1 -2\\",
+        " -3",
+        "f 1/1/1 3/1/1 5/1/1",
+    ]
     path = tmp_path / "x.obj"
     path.write_bytes("\r\n".join(lines).encode())
     vertices, faces = read_mesh(path)
@@ -64,7 +89,8 @@ def test_obj_dialects(tmp_path: Path) -> None:
 
 
 def test_obj_files_with_the_same_face_lines(tmp_path: Path) -> None:
-    """Catches kept triangles that ignore how many vertices stand before a line that counts backwards."""
+    """Catches kept triangles that ignore how many vertices stand before a line that counts
+    backwards."""
     path = tmp_path / "x.obj"
     for vertices, expected in (("", [0, 1, 2]), ("v 2 0 0\n", [1, 2, 3]), ("", [0, 1, 2])):
         path.write_text(vertices + OK + "f -3 -2 -1\n")
@@ -125,14 +151,19 @@ def test_missing_and_unknown_meshes(tmp_path: Path) -> None:
 
 
 def test_topology_must_not_change(tmp_path: Path) -> None:
-    """Catches splats bound to triangles that are other ones in a later frame; the error names the file."""
+    """Catches splats bound to triangles that are other ones in a later frame; the error names the
+    file."""
     vertices, faces = factory.ball()
     swapped = faces.copy()
     swapped[[7, 8]] = swapped[[8, 7]]
     files = {number: tmp_path / f"{number}.obj" for number in range(4)}
     for path, triangles in zip(files.values(), (faces, faces[:-1], swapped, faces), strict=True):
-        factory.write_mesh(path, vertices if path != files[3] else np.vstack([vertices, [0, 0, 0]]), triangles)
-    mesh = tracked_meshes(files, len(vertices), faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh)
+        factory.write_mesh(
+            path, vertices if path != files[3] else np.vstack([vertices, [0, 0, 0]]), triangles
+        )
+    mesh = tracked_meshes(
+        files, len(vertices), faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh
+    )
     np.testing.assert_allclose(mesh(0), vertices, atol=1e-9)
     with pytest.raises(StgaError, match=r"1\.obj: has 319 triangles, but .*neutral\.obj has 320"):
         mesh(1)
@@ -145,7 +176,8 @@ def test_topology_must_not_change(tmp_path: Path) -> None:
 
 
 def test_meshes_are_kept_within_bounds() -> None:
-    """Catches a mesh parsed again at each visit, a cache that grows with the sequence, or a shared array changed."""
+    """Catches a mesh parsed again at each visit, a cache that grows with the sequence, or a shared
+    array changed."""
     calls: list[int] = []
 
     def read(timestep: int) -> np.ndarray:
@@ -164,7 +196,16 @@ def test_meshes_are_kept_within_bounds() -> None:
 
 
 @pytest.mark.parametrize(
-    "document", ["[]", "{", '{"mouth": 3}', '{"mouth": ["a"]}', '{"mouth": [-1]}', '{"mouth": [4]}', '{"mouth": [1.5]}']
+    "document",
+    [
+        "[]",
+        "{",
+        '{"mouth": 3}',
+        '{"mouth": ["a"]}',
+        '{"mouth": [-1]}',
+        '{"mouth": [4]}',
+        '{"mouth": [1.5]}',
+    ],
 )
 def test_malformed_regions(tmp_path: Path, document: str) -> None:
     """Catches a regions file whose indices are no vertices of the mesh."""
@@ -184,18 +225,26 @@ def test_region_holds_triangles_with_all_corners_in_it(tmp_path: Path) -> None:
 
 
 def test_procrustes_as_scipy_has_it() -> None:
-    """Catches a reflection, a transposed rotation or ignored weights, against scipy's align_vectors."""
+    """Catches a reflection, a transposed rotation or ignored weights, against scipy's
+    align_vectors."""
     random = np.random.default_rng(1)
-    source, target, weights = random.normal(size=(30, 3)), random.normal(size=(30, 3)), random.random(30)
+    source, target, weights = (
+        random.normal(size=(30, 3)),
+        random.normal(size=(30, 3)),
+        random.random(30),
+    )
     rotation, translation = weighted_procrustes(source, target, weights)
     centers = np.average(source, 0, weights), np.average(target, 0, weights)
-    expected = Rotation.align_vectors(target - centers[1], source - centers[0], weights)[0].as_matrix()
+    expected = Rotation.align_vectors(target - centers[1], source - centers[0], weights)[
+        0
+    ].as_matrix()
     np.testing.assert_allclose(rotation, expected, atol=1e-9)
     np.testing.assert_allclose(rotation @ centers[0] + translation, centers[1], atol=1e-12)
 
 
 def test_moving_jaw_does_not_drag_the_head() -> None:
-    """Catches a plain least-squares fit: with 40 % of the vertices turned down by 2 cm it tilts the skull by mm."""
+    """Catches a plain least-squares fit: with 40 % of the vertices turned down by 2 cm it tilts the
+    skull by mm."""
     random = np.random.default_rng(2)
     neutral = random.normal(size=(2000, 3)) * 0.08
     jaw = neutral[:, 1] < np.quantile(neutral[:, 1], 0.4)
@@ -232,12 +281,17 @@ def test_names_and_files(toy: Capture, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("weights", "sentence"),
     [
-        (np.ones(3, np.float32), r"expected 'weights', one number from 0 to 1 per triangle .* found float32 \(3,\)"),
+        (
+            np.ones(3, np.float32),
+            r"expected 'weights', one number from 0 to 1 per triangle .* found float32 \(3,\)",
+        ),
         (np.ones(3, np.int64), "found int64"),
         (None, "found no such array"),
     ],
 )
-def test_files_that_do_not_fit(toy: Capture, tmp_path: Path, weights: np.ndarray | None, sentence: str) -> None:
+def test_files_that_do_not_fit(
+    toy: Capture, tmp_path: Path, weights: np.ndarray | None, sentence: str
+) -> None:
     """Catches weights of another mesh taken for this one's."""
     path = tmp_path / "painted.npz"
     np.savez(path, **({"other": np.ones(2)} if weights is None else {"weights": weights}))
@@ -252,13 +306,18 @@ def test_an_empty_region_is_refused(toy: Capture, tmp_path: Path) -> None:
         find_region(toy, str(tmp_path / "nothing.npz"))
 
 
-def by_equations(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Like `rasterize`: the barycentric coordinates of each pixel center in each triangle, solved for."""
+def by_equations(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Like `rasterize`: the barycentric coordinates of each pixel center in each triangle, solved
+    for."""
     flat, depth = camera.project(vertices)
     y, x = np.mgrid[: camera.height, : camera.width]
     centers = np.stack([x.ravel() + 0.5, y.ravel() + 0.5, np.ones(x.size)])
     systems = np.concatenate([flat[faces], np.ones((len(faces), 3, 1))], 2).transpose(0, 2, 1)
-    inside = np.linalg.solve(systems, np.broadcast_to(centers, (len(faces), *centers.shape))).transpose(2, 0, 1)
+    inside = np.linalg.solve(
+        systems, np.broadcast_to(centers, (len(faces), *centers.shape))
+    ).transpose(2, 0, 1)
     closeness = np.where((inside >= 0).all(2), (inside / depth[faces]).sum(2), 0)
     nearest = closeness.argmax(1)
     shown = closeness.max(1) > 0
@@ -268,12 +327,15 @@ def by_equations(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tup
 
 
 def test_every_pixel_shows_the_nearest_triangle():
-    """Catches a triangle that is farther, a gap between neighbors, lines cut off at the image's edge, and barycentric
-    coordinates of another corner; triangles are from a tenth of a pixel to larger than the image."""
+    """Catches a triangle that is farther, a gap between neighbors, lines cut off at the image's
+    edge, and barycentric coordinates of another corner; triangles are from a tenth of a pixel to
+    larger than the image."""
     rng = np.random.default_rng(0)
     camera = replace(look_at((0.2, 0.1, 2.0), (0, 0, 0), 37, 29, 40.0), cx=17.0, cy=15.5)
     sizes = np.repeat([0.005, 0.05, 0.3, 3.0], [150, 60, 30, 8])
-    corners = rng.uniform(-0.7, 0.7, (len(sizes), 1, 3)) + sizes[:, None, None] * rng.normal(size=(len(sizes), 3, 3))
+    corners = rng.uniform(-0.7, 0.7, (len(sizes), 1, 3)) + sizes[:, None, None] * rng.normal(
+        size=(len(sizes), 3, 3)
+    )
     vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(sizes)).reshape(-1, 3)
     in_front = (camera.project(vertices)[1][faces] > 0.05).all(1)
     triangle, weights = rasterize(vertices, faces[in_front], camera)
@@ -284,7 +346,8 @@ def test_every_pixel_shows_the_nearest_triangle():
 
 
 def test_a_closed_mesh_has_no_holes():
-    """Catches pixels between two triangles whose centers lie on the common edge to within rounding."""
+    """Catches pixels between two triangles whose centers lie on the common edge to within
+    rounding."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     for turn in np.linspace(0, 1, 7):
         camera = look_at((3 * np.sin(turn), 0, 3 * np.cos(turn)), (0, 0, 0), 64, 64, 64.0)

@@ -39,17 +39,26 @@ def each_split(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
 def test_mesh_capture(tmp_path: Path, suffix: str) -> None:
-    """Catches a timestep paired with another's mesh or image, a lost gap, split or region, in each mesh format."""
+    """Catches a timestep paired with another's mesh or image, a lost gap, split or region, in each
+    mesh format."""
     capture = open_capture(factory.write_mesh_capture(tmp_path / "capture", suffix=suffix))
     vertices, faces = factory.ball()
     assert (capture.layout, capture.timesteps, capture.flame) == ("mesh", (0, 1, 3), None)
-    assert {name: len(views) for name, views in capture.views.items()} == {"train": 4, "val": 2, "test": 3}
+    assert {name: len(views) for name, views in capture.views.items()} == {
+        "train": 4,
+        "val": 2,
+        "test": 3,
+    }
     np.testing.assert_allclose(capture.neutral[capture.faces], vertices[faces], atol=1e-7)
     for timestep in capture.timesteps:
         mesh = capture.mesh(timestep)
-        np.testing.assert_allclose(mesh[capture.faces], factory.moved(timestep, vertices)[faces], atol=1e-7)
+        np.testing.assert_allclose(
+            mesh[capture.faces], factory.moved(timestep, vertices)[faces], atol=1e-7
+        )
     for view in (view for split in capture.views.values() for view in split):
-        np.testing.assert_array_equal(read_image(view), factory.picture(view.timestep, view.camera_index))
+        np.testing.assert_array_equal(
+            read_image(view), factory.picture(view.timestep, view.camera_index)
+        )
         np.testing.assert_array_equal(read_mask(view), factory.silhouette() * 255)
     if suffix == ".stl":
         assert any("STL" in warning for warning in capture.warnings)
@@ -60,7 +69,8 @@ def test_mesh_capture(tmp_path: Path, suffix: str) -> None:
 
 
 def test_without_canonical_mesh(tmp_path: Path) -> None:
-    """Catches a capture without a neutral mesh being refused, or its first timestep taken silently."""
+    """Catches a capture without a neutral mesh being refused, or its first timestep taken
+    silently."""
     root = factory.write_mesh_capture(tmp_path / "capture", timesteps=(2, 4))
     each_split(root, lambda document: document.pop("canonical_mesh_path"))
     capture = open_capture(root)
@@ -69,7 +79,9 @@ def test_without_canonical_mesh(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("timesteps", "cameras"), [((5,), (0, 1)), ((0, 1), (3,)), ((7,), (2,))])
-def test_one_timestep_or_camera(tmp_path: Path, timesteps: tuple[int, ...], cameras: tuple[int, ...]) -> None:
+def test_one_timestep_or_camera(
+    tmp_path: Path, timesteps: tuple[int, ...], cameras: tuple[int, ...]
+) -> None:
     """Catches a capture of a single frame or camera being refused by a division or a split."""
     root = factory.write_mesh_capture(tmp_path / "mesh", timesteps, cameras)
     assert open_capture(root).timesteps == timesteps
@@ -81,20 +93,28 @@ def test_one_timestep_or_camera(tmp_path: Path, timesteps: tuple[int, ...], came
 
 
 def test_flame_capture(tmp_path: Path) -> None:
-    """Catches parameters of another timestep, a lost offset or shape, and head motion left in the expression."""
+    """Catches parameters of another timestep, a lost offset or shape, and head motion left in the
+    expression."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
     capture = open_capture(root, model_file)
     assert capture.flame is not None
     model = read_flame(model_file)
-    offset, shape = np.full((len(model.v_template), 3), np.float32(0.0005)), np.full(4, np.float32(0.3))
+    offset, shape = (
+        np.full((len(model.v_template), 3), np.float32(0.0005)),
+        np.full(4, np.float32(0.3)),
+    )
     assert (capture.layout, capture.timesteps, capture.warnings) == ("flame", (0, 1, 3), ())
     for timestep in capture.timesteps:
         frame = read_frame(root / f"flame_param/{timestep:05d}.npz", model)
-        np.testing.assert_allclose(capture.mesh(timestep), flame_forward(model, shape, frame, offset), atol=1e-12)
+        np.testing.assert_allclose(
+            capture.mesh(timestep), flame_forward(model, shape, frame, offset), atol=1e-12
+        )
         still = replace(frame, rotation=np.zeros(3), neck_pose=np.zeros(3), translation=np.zeros(3))
         expected = flame_forward(model, shape, still, offset)
         np.testing.assert_allclose(capture.expression_mesh(timestep, "head"), expected, atol=1e-12)
-    assert np.abs(capture.expression_mesh(3, "all") - capture.expression_mesh(3, "head")).max() > 1e-4
+    assert (
+        np.abs(capture.expression_mesh(3, "all") - capture.expression_mesh(3, "head")).max() > 1e-4
+    )
     shaped = model.v_template + model.shapedirs[:, :, :4] @ shape + offset
     np.testing.assert_allclose(capture.neutral, shaped, atol=1e-12)
     assert set(capture.regions) == {"nose", "mouth"}
@@ -102,7 +122,8 @@ def test_flame_capture(tmp_path: Path) -> None:
 
 
 def test_flame_capture_without_paths_or_masks(tmp_path: Path) -> None:
-    """Catches a canonical_flame_param.npz capture whose frames name no parameters, or whose model has no masks."""
+    """Catches a canonical_flame_param.npz capture whose frames name no parameters, or whose model
+    has no masks."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
     for split in factory.SPLITS:
 
@@ -121,7 +142,8 @@ def test_flame_capture_without_paths_or_masks(tmp_path: Path) -> None:
 
 
 def test_flame_motion_without_cameras(tmp_path: Path) -> None:
-    """Catches a folder of parameters without transforms being refused: it can be imported and animated."""
+    """Catches a folder of parameters without transforms being refused: it can be imported and
+    animated."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
     for split in factory.SPLITS:
         (root / f"transforms_{split}.json").unlink()
@@ -133,7 +155,8 @@ def test_flame_motion_without_cameras(tmp_path: Path) -> None:
 def test_published_topology_gets_teeth(tmp_path: Path, shared_data: Path, rows: int) -> None:
     """Catches a mesh of 9976 triangles where VHAP tracked 10144, whichever size its offsets have.
 
-    The real template and triangles; skinning and expressions are filled in, for they are not published openly.
+    The real template and triangles; skinning and expressions are filled in, for they are not
+    published openly.
     """
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, faces = data["v_template"].astype(float), data["faces"]
@@ -152,7 +175,9 @@ def test_published_topology_gets_teeth(tmp_path: Path, shared_data: Path, rows: 
         weights=weights,
         f=faces,
     )
-    parameters = factory.flame_parameters(0) | {"static_offset": np.full((1, rows, 3), 0.001, np.float32)}
+    parameters = factory.flame_parameters(0) | {
+        "static_offset": np.full((1, rows, 3), 0.001, np.float32)
+    }
     np.savez(root / "flame_param/00000.npz", **parameters)
     capture = open_capture(root, model_file)
     assert capture.neutral.shape == (5143, 3)
@@ -161,11 +186,14 @@ def test_published_topology_gets_teeth(tmp_path: Path, shared_data: Path, rows: 
 
 
 def test_release_layout(tmp_path: Path) -> None:
-    """Catches keyframes read as something else, and a selection that came with the capture being recomputed."""
+    """Catches keyframes read as something else, and a selection that came with the capture being
+    recomputed."""
     capture = open_capture(factory.write_release(tmp_path / "capture"))
     vertices, faces = factory.ball()
     assert (capture.layout, capture.timesteps) == ("release", (0, 1))
-    np.testing.assert_allclose(capture.mesh(1)[capture.faces], factory.moved(1, vertices)[faces], atol=1e-12)
+    np.testing.assert_allclose(
+        capture.mesh(1)[capture.faces], factory.moved(1, vertices)[faces], atol=1e-12
+    )
     selected = select_capture(capture, SelectionOptions(threshold=0.0005))
     assert np.flatnonzero(selected[0]).tolist() == [0, 2, 5]
     moving = np.abs((factory.moved(1, vertices) - vertices)[faces]).max(axis=(1, 2)) > 0
@@ -177,7 +205,9 @@ def test_bare_folder(tmp_path: Path) -> None:
     """Catches frame 10 sorted before frame 9, and the neutral mesh taken for a timestep."""
     vertices, faces = factory.ball()
     for timestep in (9, 10, 12):
-        factory.write_mesh(tmp_path / f"head_{timestep}.obj", factory.moved(timestep, vertices), faces)
+        factory.write_mesh(
+            tmp_path / f"head_{timestep}.obj", factory.moved(timestep, vertices), faces
+        )
     capture = open_capture(tmp_path)
     assert (capture.timesteps, dict(capture.views)) == ((9, 10, 12), {})
     assert "first timestep" in capture.warnings[0]
@@ -214,7 +244,8 @@ def test_union_set(tmp_path: Path) -> None:
 
 
 def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
-    """Catches a capture of the other convention opened silently, and a warning where all is well."""
+    """Catches a capture of the other convention opened silently, and a warning where all is
+    well."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     assert open_capture(root, principal_point="vhap").warnings == ()
     for wrong in ("opencv", "center"):
@@ -239,7 +270,8 @@ def test_a_head_that_is_not_in_meters(tmp_path: Path, factor: float, says: str |
 
 
 def test_principal_point_of_a_real_capture(tmp_path: Path, shared_data: Path) -> None:
-    """Catches a check too dull for a real head: the principal point 10 pixels off the center, of 401."""
+    """Catches a check too dull for a real head: the principal point 10 pixels off the center, of
+    401."""
     root = tmp_path / "capture"
     root.mkdir()
     for entry in (shared_data / "studio_head").iterdir():
@@ -258,9 +290,14 @@ def test_principal_point_of_a_real_capture(tmp_path: Path, shared_data: Path) ->
 
 
 def test_studio_head(shared_data: Path) -> None:
-    """Catches a mesh that misses its image: every vertex of a real tracked mesh must project into the mask."""
+    """Catches a mesh that misses its image: every vertex of a real tracked mesh must project into
+    the mask."""
     capture = open_capture(shared_data / "studio_head")
-    assert {name: len(views) for name, views in capture.views.items()} == {"train": 180, "val": 12, "test": 64}
+    assert {name: len(views) for name, views in capture.views.items()} == {
+        "train": 180,
+        "val": 12,
+        "test": 64,
+    }
     assert (capture.timesteps, capture.warnings) == (tuple(range(16)), ())
     assert set(capture.regions) == {"left_eye", "right_eye", "mouth", "nose"}
     for view in (capture.views["train"][0], capture.views["val"][-1], capture.views["test"][-1]):
@@ -271,19 +308,24 @@ def test_studio_head(shared_data: Path) -> None:
 
 
 def test_studio_head_without_head_motion(shared_data: Path) -> None:
-    """Catches head motion left in the expression: the back of the skull must lie as close to the neutral mesh as
-    a fit of it alone brings it (scipy's align_vectors).
+    """Catches head motion left in the expression: the back of the skull must lie as close to the
+    neutral mesh as a fit of it alone brings it (scipy's align_vectors).
 
-    At STGA's threshold of 1 cm three of the twelve training frames select anything (measured independently).
+    At STGA's threshold of 1 cm three of the twelve training frames select anything (measured
+    independently).
     """
     capture = open_capture(shared_data / "studio_head")
     skull = capture.neutral[:, 2] < np.quantile(capture.neutral[:, 2], 0.2)
     neutral = capture.neutral[skull]
     for timestep in capture.timesteps:
-        offset = np.linalg.norm(capture.expression_mesh(timestep, "head") - capture.neutral, axis=1)[skull]
+        offset = np.linalg.norm(
+            capture.expression_mesh(timestep, "head") - capture.neutral, axis=1
+        )[skull]
         mesh = capture.mesh(timestep)[skull]
         rotation, _ = Rotation.align_vectors(neutral - neutral.mean(0), mesh - mesh.mean(0))
-        alone = np.linalg.norm(rotation.apply(mesh - mesh.mean(0)) + neutral.mean(0) - neutral, axis=1)
+        alone = np.linalg.norm(
+            rotation.apply(mesh - mesh.mean(0)) + neutral.mean(0) - neutral, axis=1
+        )
         assert np.linalg.norm(mesh - neutral, axis=1).max() > 5e-3
         assert offset.max() < 1.3 * alone.max() + 1e-6
     selected = select_capture(capture, SelectionOptions(threshold=0.01))
@@ -291,7 +333,8 @@ def test_studio_head_without_head_motion(shared_data: Path) -> None:
 
 
 def test_summary(tmp_path: Path) -> None:
-    """Catches counts, gaps, offsets or warnings that `info` would show wrong, by one at either end of a gap, too."""
+    """Catches counts, gaps, offsets or warnings that `info` would show wrong, by one at either end
+    of a gap, too."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
     lines = dict(summarize_capture(open_capture(root, model_file, "opencv")))
     assert lines["layout"] == "flame"
@@ -313,7 +356,8 @@ def test_summary(tmp_path: Path) -> None:
 
 
 def test_numpy_alone_is_enough(tmp_path: Path) -> None:
-    """Catches an import that needs more than numpy: Blender must open a capture without Pillow, trimesh or torch.
+    """Catches an import that needs more than numpy: Blender must open a capture without Pillow,
+    trimesh or torch.
 
     What does need them says so.
     """
@@ -336,7 +380,9 @@ def test_numpy_alone_is_enough(tmp_path: Path) -> None:
         f"try: open_capture(Path({str(ply)!r}))\n"
         "except StgaError as error: print(error)\n"
     )
-    result = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    )
     assert "neutral.ply: reading PLY needs the Python package trimesh" in result.stdout
 
 
@@ -349,7 +395,9 @@ def cut(name: str) -> Callable[[Path], object]:
 
 
 def edited(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], object]:
-    return lambda root: factory.edit(root / "transforms_val.json", lambda document: change(document["frames"]))
+    return lambda root: factory.edit(
+        root / "transforms_val.json", lambda document: change(document["frames"])
+    )
 
 
 BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
@@ -357,15 +405,24 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
         remove("images/00001_01.png"),
         r"images/00001_01\.png: does not exist, but .*train\.json: frames\[3\] .*file_path",
     ),
-    (remove("fg_masks/00003_02.png"), r"fg_masks/00003_02\.png: does not exist, but .*test\.json: frames\[2\]"),
-    (remove("meshes/00003.obj"), r"meshes/00003\.obj: does not exist, but .*test\.json: frames\[0\] .*mesh_path"),
+    (
+        remove("fg_masks/00003_02.png"),
+        r"fg_masks/00003_02\.png: does not exist, but .*test\.json: frames\[2\]",
+    ),
+    (
+        remove("meshes/00003.obj"),
+        r"meshes/00003\.obj: does not exist, but .*test\.json: frames\[0\] .*mesh_path",
+    ),
     (remove("meshes/neutral.obj"), r"neutral\.obj: cannot be read"),
     (remove("regions.json"), r"regions\.json: cannot be read"),
     (cut("transforms_train.json"), r"transforms_train\.json: is not valid JSON"),
     (cut("meshes/neutral.obj"), r"neutral\.obj: "),
     (cut("regions.json"), r"regions\.json: is not valid JSON"),
     (cut("fg_masks/00000_00.png"), r"fg_masks/00000_00\.png: is not a readable image"),
-    (edited(lambda frames: frames[1].pop("mesh_path")), r"transforms_val\.json: frames\[1\]\.mesh_path: is missing"),
+    (
+        edited(lambda frames: frames[1].pop("mesh_path")),
+        r"transforms_val\.json: frames\[1\]\.mesh_path: is missing",
+    ),
     (
         edited(lambda frames: frames[0].update(mesh_path="meshes/00003.obj")),
         r"transforms_val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already",
@@ -376,13 +433,18 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
 def parameters(change: dict[str, np.ndarray | None]) -> Callable[[Path], None]:
     def damage(root: Path) -> None:
         arrays: dict[str, Any] = factory.flame_parameters(0) | change
-        np.savez(root / "flame_param/00000.npz", **{k: v for k, v in arrays.items() if v is not None})
+        np.savez(
+            root / "flame_param/00000.npz", **{k: v for k, v in arrays.items() if v is not None}
+        )
 
     return damage
 
 
 BROKEN_FLAME_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
-    (remove("flame_param/00003.npz"), r"flame_param/00003\.npz: does not exist, but .*flame_param_path"),
+    (
+        remove("flame_param/00003.npz"),
+        r"flame_param/00003\.npz: does not exist, but .*flame_param_path",
+    ),
     (cut("flame_param/00000.npz"), r"flame_param/00000\.npz: is not a readable npz"),
     (remove("model.npz"), r"model\.npz: cannot be read"),
     (parameters({"shape": None}), r"00000\.npz: .*shape"),
@@ -410,8 +472,14 @@ BROKEN_RELEASES: list[tuple[Callable[[Path], object], str]] = [
     (ids(np.array([{}], object)), r"0000\.npy: is not a readable npy"),
     (soup("[]"), r"mesh_0000\.json: triangles: "),
     (soup('{"triangles": []}'), r"mesh_0000\.json: triangles: "),
-    (soup('{"triangles": [{"Vertices": [[0, 0], [1, 0], [0, 1]]}]}'), r"mesh_0000\.json: triangles: "),
-    (soup('{"triangles": [{"Vertices": [[0, 0, NaN], [1, 0, 0], [0, 1, 0]]}]}'), r"mesh_0000\.json: vertex 0"),
+    (
+        soup('{"triangles": [{"Vertices": [[0, 0], [1, 0], [0, 1]]}]}'),
+        r"mesh_0000\.json: triangles: ",
+    ),
+    (
+        soup('{"triangles": [{"Vertices": [[0, 0, NaN], [1, 0, 0], [0, 1, 0]]}]}'),
+        r"mesh_0000\.json: vertex 0",
+    ),
     (remove("meshes/mesh_0001.json"), r"mesh_0001\.json: cannot be read"),
 ]
 
@@ -425,7 +493,11 @@ BROKEN_CAPTURES = [
 
 @pytest.mark.parametrize(("write", "timestep", "damage", "message"), BROKEN_CAPTURES)
 def test_broken_captures(
-    tmp_path: Path, write: Callable[[Path], Any], timestep: int, damage: Callable[[Path], object], message: str
+    tmp_path: Path,
+    write: Callable[[Path], Any],
+    timestep: int,
+    damage: Callable[[Path], object],
+    message: str,
 ) -> None:
     """Catches a damaged capture that opens, or fails without naming the file and the field."""
     written = write(tmp_path / "capture")
@@ -445,7 +517,9 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
     with pytest.raises(StgaError, match="is not a capture; expected transforms_"):
         open_capture(tmp_path)
     root, model_file = factory.write_flame_capture(tmp_path / "flame")
-    with pytest.raises(StgaError, match=r"give the FLAME model file .* with --flame or in the preferences"):
+    with pytest.raises(
+        StgaError, match=r"give the FLAME model file .* with --flame or in the preferences"
+    ):
         open_capture(root)
     with pytest.raises(StgaError, match="'left' is not one of vhap, opencv, center"):
         open_capture(root, model_file, "left")
@@ -465,7 +539,8 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
 
 
 def test_a_motion_file_is_a_capture_without_views(tmp_path: Path) -> None:
-    """Catches a motion that needs a folder around it, or loses its identity, offsets or regions on the way."""
+    """Catches a motion that needs a folder around it, or loses its identity, offsets or regions on
+    the way."""
     root, model_file = factory.write_flame_capture(tmp_path / "flame")
     whole = open_capture(root, model_file)
     motion = open_capture(root / "flame_param/00003.npz", model_file)
@@ -497,4 +572,7 @@ def test_frame_rate(tmp_path: Path) -> None:
         assert "frame rate" not in dict(summarize_capture(open_capture(root, model)))
         factory.edit(root / "transforms_train.json", lambda document: document.update(fps=59.94))
         assert open_capture(root, model).fps == 59.94
-        assert dict(summarize_capture(open_capture(root, model)))["frame rate"] == "59.94 frames per second"
+        assert (
+            dict(summarize_capture(open_capture(root, model)))["frame rate"]
+            == "59.94 frames per second"
+        )

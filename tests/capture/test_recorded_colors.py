@@ -23,22 +23,35 @@ ORIENTATIONS = {
 
 
 def view_of(image, width=WIDTH, height=HEIGHT, mask=None):
-    return View(0, 0, camera_from_gl(np.eye(4), width, height, 60, 60, width / 2, height / 2), image.name, image, mask)
+    return View(
+        0,
+        0,
+        camera_from_gl(np.eye(4), width, height, 60, 60, width / 2, height / 2),
+        image.name,
+        image,
+        mask,
+    )
 
 
 def corners(image):
     """Letters of the four quarters, row by row."""
     height, width = image.shape[:2]
-    gray = image.reshape(height, width, -1)[height // 4 :: height // 2, width // 4 :: width // 2, 0].astype(int)
+    gray = image.reshape(height, width, -1)[
+        height // 4 :: height // 2, width // 4 :: width // 2, 0
+    ].astype(int)
     names = np.array(list("abcd"))[np.abs(gray[..., None] - list(LEVELS.values())).argmin(-1)]
     return " ".join("".join(row) for row in names)
 
 
 def write_turned(path, orientation):
-    gray = np.kron([[LEVELS["a"], LEVELS["b"]], [LEVELS["c"], LEVELS["d"]]], np.ones((HEIGHT // 2, WIDTH // 2)))
+    gray = np.kron(
+        [[LEVELS["a"], LEVELS["b"]], [LEVELS["c"], LEVELS["d"]]], np.ones((HEIGHT // 2, WIDTH // 2))
+    )
     exif = Image.Exif()
     exif[0x0112] = orientation
-    Image.fromarray(np.repeat(gray.astype(np.uint8)[..., None], 3, axis=2)).save(path, exif=exif, quality=95)
+    Image.fromarray(np.repeat(gray.astype(np.uint8)[..., None], 3, axis=2)).save(
+        path, exif=exif, quality=95
+    )
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp", ".tif", ".png"])
@@ -53,7 +66,8 @@ def test_orientation(tmp_path, orientation, suffix):
     assert corners(read_mask(view_of(path, *size, mask=path))) == ORIENTATIONS[orientation]
     camera = open_footage(tmp_path, focal=50).cameras[0]
     assert corners(camera.image(0)) == ORIENTATIONS[orientation]
-    # A file that other programs would show turned is not copied into a capture; TIFF is turned by all.
+    # A file that other programs would show turned is not copied into a capture; TIFF is turned by
+    # all.
     assert is_plain(path) == (camera.file(0) is not None) == (orientation == 1 or suffix == ".tif")
 
 
@@ -62,12 +76,15 @@ def test_camera_of_the_stored_pixels(tmp_path):
     path = tmp_path / "x.jpg"
     write_turned(path, 6)
     assert corners(read_image(view_of(path, WIDTH, HEIGHT))) == "ab cd"
-    with pytest.raises(StgaError, match=r"x.jpg: the image has 32 x 48 pixels, but the camera of x.jpg has 40 x 40"):
+    with pytest.raises(
+        StgaError, match=r"x.jpg: the image has 32 x 48 pixels, but the camera of x.jpg has 40 x 40"
+    ):
         read_image(view_of(path, 40, 40))
 
 
 def profile(colorants, gamma, name):
-    """A minimal ICC profile (ICC.1:2010): a display with the given colorants (D50), and one exponent."""
+    """A minimal ICC profile (ICC.1:2010): a display with the given colorants (D50), and one
+    exponent."""
 
     def xyz(values):
         return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(65536 * value) for value in values))
@@ -76,8 +93,14 @@ def profile(colorants, gamma, name):
     tags = {
         b"desc": b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(78),
         b"wtpt": xyz((0.9642, 1.0, 0.8249)),
-        **{tag: xyz(values) for tag, values in zip((b"rXYZ", b"gXYZ", b"bXYZ"), colorants, strict=True)},
-        **{tag: b"curv\0\0\0\0" + struct.pack(">IH", 1, round(256 * gamma)) for tag in (b"rTRC", b"gTRC", b"bTRC")},
+        **{
+            tag: xyz(values)
+            for tag, values in zip((b"rXYZ", b"gXYZ", b"bXYZ"), colorants, strict=True)
+        },
+        **{
+            tag: b"curv\0\0\0\0" + struct.pack(">IH", 1, round(256 * gamma))
+            for tag in (b"rTRC", b"gTRC", b"bTRC")
+        },
         b"cprt": b"text\0\0\0\0none\0",
     }
     tags = {tag: data + bytes(-len(data) % 4) for tag, data in tags.items()}
@@ -86,13 +109,19 @@ def profile(colorants, gamma, name):
         table += tag + struct.pack(">2I", at + len(body), len(data))
         body += data
     size = 128 + len(table) + len(body)
-    head = struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02100000, b"mntr", b"RGB ", b"XYZ ") + bytes(12) + b"acsp"
+    head = (
+        struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+        + bytes(12)
+        + b"acsp"
+    )
     head += bytes(28) + struct.pack(">3i", 63190, 65536, 54061)
     return head.ljust(128, b"\0") + table + body
 
 
 DISPLAY_P3 = profile(
-    [(0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)], 2.2, "P3"
+    [(0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)],
+    2.2,
+    "P3",
 )
 """Colorants as published with Apple's profile."""
 
@@ -109,7 +138,8 @@ def png(path, color, *chunks, mode="RGB"):
     path.write_bytes(data[:33] + b"".join(chunks) + data[33:])
 
 
-# In Display P3 sRGB's red is (0.9175, 0.2003, 0.1386) by CSS Color 4; it is near that with an exponent of 2.2 as well.
+# In Display P3 sRGB's red is (0.9175, 0.2003, 0.1386) by CSS Color 4; it is near that with an
+# exponent of 2.2 as well.
 RED_IN_P3 = (234, 51, 35)
 STORED = {
     "profile": (RED_IN_P3, [chunk(b"iCCP", b"p\0\0" + zlib.compress(DISPLAY_P3))], (255, 0, 0)),
@@ -136,7 +166,8 @@ STORED = {
 
 @pytest.mark.parametrize("name", STORED)
 def test_colors_become_srgb(tmp_path, name):
-    """Catches skin that is pale or dark because the file's colors are not sRGB's; and sRGB that is converted."""
+    """Catches skin that is pale or dark because the file's colors are not sRGB's; and sRGB that is
+    converted."""
     color, chunks, expected = STORED[name]
     path = tmp_path / "x.png"
     png(path, color, *chunks)
@@ -147,10 +178,13 @@ def test_colors_become_srgb(tmp_path, name):
 
 
 def test_profile_beside_transparency_and_in_jpeg(tmp_path):
-    """Catches alpha lost in the conversion, a mask that is converted, and profiles of JPEG left out."""
+    """Catches alpha lost in the conversion, a mask that is converted, and profiles of JPEG left
+    out."""
     path = tmp_path / "x.png"
     png(path, (*RED_IN_P3, 128), chunk(b"iCCP", b"p\0\0" + zlib.compress(DISPLAY_P3)), mode="RGBA")
     np.testing.assert_allclose(read_image(view_of(path), (0, 0, 0))[5, 5], (128, 0, 0), atol=4)
     assert read_mask(view_of(path))[5, 5] == 128
-    Image.new("RGB", (WIDTH, HEIGHT), RED_IN_P3).save(tmp_path / "x.jpg", quality=98, icc_profile=DISPLAY_P3)
+    Image.new("RGB", (WIDTH, HEIGHT), RED_IN_P3).save(
+        tmp_path / "x.jpg", quality=98, icc_profile=DISPLAY_P3
+    )
     np.testing.assert_allclose(read_image(view_of(tmp_path / "x.jpg"))[5, 5], (255, 0, 0), atol=8)

@@ -12,7 +12,9 @@ from stga_addon.errors import StgaError
 
 def moved(capture: Capture, offset: float) -> Capture:
     """Another take: the same head, elsewhere."""
-    return replace(capture, root=Path("other"), mesh=lambda timestep: capture.mesh(timestep) + offset)
+    return replace(
+        capture, root=Path("other"), mesh=lambda timestep: capture.mesh(timestep) + offset
+    )
 
 
 def test_timesteps_follow_each_other(toy: Capture) -> None:
@@ -32,11 +34,14 @@ def test_timesteps_follow_each_other(toy: Capture) -> None:
         both = joined.views[split]
         assert both[: len(views)] == views
         assert [view.image for view in both[len(views) :]] == [view.image for view in views]
-        assert [view.timestep - start for view in both[len(views) :]] == [view.timestep for view in views]
+        assert [view.timestep - start for view in both[len(views) :]] == [
+            view.timestep for view in views
+        ]
 
 
 def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> None:
-    """Catches exposure of one camera corrected in the images of another that merely has its number."""
+    """Catches exposure of one camera corrected in the images of another that merely has its
+    number."""
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     views = tuple(
         replace(v, camera=replace(v.camera, world_to_camera=turned @ v.camera.world_to_camera))
@@ -53,12 +58,16 @@ def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> 
 
 
 def test_cameras_of_different_takes_have_different_indices(toy: Capture) -> None:
-    """Catches two cameras that count as one because their takes begin as far apart as their numbers."""
+    """Catches two cameras that count as one because their takes begin as far apart as their
+    numbers."""
     start = max(toy.timesteps) + 1
     (view,) = (view for view in toy.views["train"] if (view.timestep, view.camera_index) == (0, 0))
-    away = replace(view.camera, world_to_camera=np.diag([-1.0, -1.0, 1.0, 1.0]) @ view.camera.world_to_camera)
+    away = replace(
+        view.camera, world_to_camera=np.diag([-1.0, -1.0, 1.0, 1.0]) @ view.camera.world_to_camera
+    )
     second, third = (
-        replace(toy, views={"train": (replace(view, camera=away, camera_index=index),)}) for index in (start, 0)
+        replace(toy, views={"train": (replace(view, camera=away, camera_index=index),)})
+        for index in (start, 0)
     )
     joined = join_takes([toy, second, third])
     indices = [found.camera_index for found in joined.views["train"][-2:]]

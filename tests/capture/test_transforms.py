@@ -14,14 +14,17 @@ from stga_addon.errors import StgaError
 from . import factory
 
 
-def read_one(folder: Path, entry: dict[str, Any], principal_point: str = "vhap", **shared: Any) -> Frame:
+def read_one(
+    folder: Path, entry: dict[str, Any], principal_point: str = "vhap", **shared: Any
+) -> Frame:
     path = folder / "transforms.json"
     path.write_text(json.dumps({**shared, "frames": [entry]}))
     return read_transforms(path, principal_point)[0]
 
 
 def test_projection_is_that_of_an_opengl_camera(tmp_path: Path) -> None:
-    """Catches a wrong axis flip, an inverted pose or a swapped principal point, by the textbook OpenGL formula."""
+    """Catches a wrong axis flip, an inverted pose or a swapped principal point, by the textbook
+    OpenGL formula."""
     camera = read_one(tmp_path, factory.frame(0, 2)).view.camera
     points = np.random.default_rng(0).normal(scale=0.1, size=(50, 3))
     x, y, z, _ = np.linalg.inv(factory.pose(2)) @ np.c_[points, np.ones(50)].T
@@ -37,11 +40,19 @@ def test_own_intrinsics_win(tmp_path: Path) -> None:
     wrong = {"fl_x": 7.0, "fl_y": 7.0, "cx": 1.0, "cy": 1.0, "w": 8, "h": 8, "camera_angle_x": 1.0}
     camera = read_one(tmp_path, factory.frame(0, 0), **wrong).view.camera
     found = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
-    assert found == (factory.WIDTH, factory.HEIGHT, factory.FOCAL, factory.FOCAL, factory.CX, factory.CY)
+    assert found == (
+        factory.WIDTH,
+        factory.HEIGHT,
+        factory.FOCAL,
+        factory.FOCAL,
+        factory.CX,
+        factory.CY,
+    )
 
 
 def test_shared_intrinsics_and_field_of_view(tmp_path: Path) -> None:
-    """Catches a lost fallback: values at the top level only, and camera_angle_x in place of a focal length.
+    """Catches a lost fallback: values at the top level only, and camera_angle_x in place of a focal
+    length.
 
     A frame's own angle wins over a focal length at the top.
     """
@@ -52,7 +63,11 @@ def test_shared_intrinsics_and_field_of_view(tmp_path: Path) -> None:
     assert (camera.width, camera.height, camera.cx, camera.cy) == (40, 60, 20, 30)
     assert camera.fl_x == pytest.approx(200)
     assert camera.fl_y == pytest.approx(200)
-    own = {**entry, "camera_angle_x": 2 * math.atan(20 / 300), "camera_angle_y": 2 * math.atan(30 / 150)}
+    own = {
+        **entry,
+        "camera_angle_x": 2 * math.atan(20 / 300),
+        "camera_angle_y": 2 * math.atan(30 / 150),
+    }
     camera = read_one(tmp_path, own, **shared, fl_x=5.0).view.camera
     assert (camera.fl_x, camera.fl_y) == (pytest.approx(300), pytest.approx(150))
 
@@ -68,7 +83,8 @@ def test_principal_point(tmp_path: Path, convention: str, expected: tuple[float,
 
 
 def test_cameras_are_numbered_alike_in_all_splits(tmp_path: Path) -> None:
-    """Catches the held-out camera of `val` taking the number of a training camera when camera_index is missing."""
+    """Catches the held-out camera of `val` taking the number of a training camera when camera_index
+    is missing."""
     write = factory.write_mesh_capture(tmp_path / "capture")
     for keep_id in (True, False):
         for split in factory.SPLITS:
@@ -86,7 +102,8 @@ def test_cameras_are_numbered_alike_in_all_splits(tmp_path: Path) -> None:
 
 
 def test_camera_is_known_by_where_it_stands(tmp_path: Path) -> None:
-    """Catches one camera taken for two because of the sign of a zero or the last digits of its pose."""
+    """Catches one camera taken for two because of the sign of a zero or the last digits of its
+    pose."""
     frames = [factory.frame(0, 0), factory.frame(1, 0), factory.frame(1, 1)]
     matrix = np.array(frames[1]["transform_matrix"])
     matrix[:3] -= 1e-9
@@ -98,8 +115,15 @@ def test_camera_is_known_by_where_it_stands(tmp_path: Path) -> None:
 
 
 def test_frames_share_cameras_that_are_alike_in_everything(tmp_path: Path) -> None:
-    """Catches a camera of its own for each of 18,000 views, and one lens or pose taken for another's."""
-    entries = [factory.frame(0, 0), factory.frame(1, 0), factory.frame(2, 0), factory.frame(3, 0), factory.frame(4, 1)]
+    """Catches a camera of its own for each of 18,000 views, and one lens or pose taken for
+    another's."""
+    entries = [
+        factory.frame(0, 0),
+        factory.frame(1, 0),
+        factory.frame(2, 0),
+        factory.frame(3, 0),
+        factory.frame(4, 1),
+    ]
     entries[2]["fl_x"] += 1.0
     entries[3]["cy"] += 1.0
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": entries}))
@@ -115,11 +139,16 @@ def test_single_file_is_all_training(tmp_path: Path) -> None:
     frames = [factory.frame(0, camera) for camera in range(3)]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     splits = read_splits(tmp_path).splits
-    assert {name: len(frames) for name, frames in splits.items()} == {"train": 3, "val": 0, "test": 0}
+    assert {name: len(frames) for name, frames in splits.items()} == {
+        "train": 3,
+        "val": 0,
+        "test": 0,
+    }
 
 
 def test_static_capture_without_timesteps(tmp_path: Path) -> None:
-    """Catches a plain NeRF transforms file (no timestep, no size but the image's, no suffix) being refused."""
+    """Catches a plain NeRF transforms file (no timestep, no size but the image's, no suffix) being
+    refused."""
     factory.write_images(tmp_path, [0], [0])
     entry = {"file_path": "images/00000_00", "transform_matrix": factory.pose(0).tolist()}
     frame = read_one(tmp_path, entry, camera_angle_x=0.5)
@@ -130,7 +159,8 @@ def test_static_capture_without_timesteps(tmp_path: Path) -> None:
 
 
 def test_union_paths_stay_beside_the_capture(tmp_path: Path) -> None:
-    """Catches union sets (`../<sequence>/images`) being refused, or resolved from the working directory."""
+    """Catches union sets (`../<sequence>/images`) being refused, or resolved from the working
+    directory."""
     root = tmp_path / "union"
     assert inside(root, "../seq_01/images/1.png", "x") == tmp_path / "seq_01/images/1.png"
     assert inside(root, "images/../../seq_01\\1.png", "x") == tmp_path / "seq_01/1.png"
@@ -157,7 +187,8 @@ def test_union_paths_stay_beside_the_capture(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("field", ["file_path", "fg_mask_path", "mesh_path", "flame_param_path"])
 def test_paths_that_leave_are_refused(tmp_path: Path, path: str, field: str) -> None:
-    """Catches path traversal: a downloaded capture must not read files elsewhere, on any operating system."""
+    """Catches path traversal: a downloaded capture must not read files elsewhere, on any operating
+    system."""
     with pytest.raises(StgaError, match=rf"transforms\.json: frames\[0\]\.{field}: "):
         read_one(tmp_path, {**factory.frame(0, 0), field: path})
 
@@ -187,14 +218,16 @@ MALFORMED: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("field", "value"), MALFORMED)
 def test_malformed_fields(tmp_path: Path, field: str, value: Any) -> None:
-    """Catches a wrong value that passes, or ends in a traceback, instead of an error that names file and field."""
+    """Catches a wrong value that passes, or ends in a traceback, instead of an error that names
+    file and field."""
     named = "w" if field == "h" and value is True else field
     with pytest.raises(StgaError, match=rf"transforms\.json: frames\[0\]\.({named}|{field}): "):
         read_one(tmp_path, {**factory.frame(0, 0), field: value})
 
 
 @pytest.mark.parametrize(
-    "document", ["", "[]", "3", "{", '{"frames": {}}', '{"frames": [3]}', '{"frame": []}', "[" * 100000]
+    "document",
+    ["", "[]", "3", "{", '{"frames": {}}', '{"frames": [3]}', '{"frame": []}', "[" * 100000],
 )
 def test_malformed_documents(tmp_path: Path, document: str) -> None:
     """Catches a transforms file that is no object with frames ending in a traceback."""

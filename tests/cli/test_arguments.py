@@ -8,14 +8,25 @@ from stga_addon.options import color, duration
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("1h", 3600), ("1.5m", 90), ("1m30", 90), (" 2m ", 120)],
+    [
+        ("90", 90),
+        ("90s", 90),
+        ("10m", 600),
+        ("1h30m", 5400),
+        ("1h", 3600),
+        ("1.5m", 90),
+        ("1m30", 90),
+        (" 2m ", 120),
+    ],
 )
 def test_durations(text: str, seconds: float) -> None:
     """Catches minutes taken for seconds."""
     assert duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s10m", "1,5m", "٣"])
+@pytest.mark.parametrize(
+    "text", ["", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s10m", "1,5m", "٣"]
+)
 def test_durations_that_are_none(text: str) -> None:
     """Catches a budget that means something else than what was typed."""
     with pytest.raises(StgaError, match="is not a time such as"):
@@ -31,7 +42,8 @@ def test_colors() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "-1,0,0", "nan,0,0", "0,0,inf", "a,b,c"]
+    "text",
+    ["", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "-1,0,0", "nan,0,0", "0,0,inf", "a,b,c"],
 )
 def test_colors_that_are_none(text: str) -> None:
     """Catches 0…255 taken for 0…1, and values that would wrap around in the image."""

@@ -16,13 +16,21 @@ from stga_addon.tracking.torso import FollowedTorso
 
 
 def make(take, out, *more):
-    arguments = ["--model", str(take / "head.npz"), "--out", str(out), "--landmarks", str(take / "points")]
+    arguments = [
+        "--model",
+        str(take / "head.npz"),
+        "--out",
+        str(out),
+        "--landmarks",
+        str(take / "points"),
+    ]
     return main(["avatar", str(take / "footage"), *arguments, "--iterations", "6", *more])
 
 
 @pytest.fixture(scope="module")
 def made(take, tmp_path_factory):
-    """An avatar made in two calls, of which the first was interrupted as the capture was written; and what it said."""
+    """An avatar made in two calls, of which the first was interrupted as the capture was written;
+    and what it said."""
     pytest.importorskip("bpy", reason="bpy is not installed")
     out = tmp_path_factory.mktemp("made") / "out"
 
@@ -36,7 +44,9 @@ def made(take, tmp_path_factory):
         # What takes the longest, and is thrown away here
         patch.setattr("stga_addon.tracking.track.fit_dense", lambda *_, **__: None)
         patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
-        patch.setattr("stga_addon.tracking.track.follow_torso", lambda fit, own, *_: FollowedTorso(fit, own))
+        patch.setattr(
+            "stga_addon.tracking.track.follow_torso", lambda fit, own, *_: FollowedTorso(fit, own)
+        )
         assert make(take, out) == 130
     assert not (out / "run").exists()
     printed = StringIO()
@@ -49,7 +59,14 @@ def test_one_summary_at_the_end(made):
     """Catches a step that is not reported, or reported twice."""
     _, lines = made
     summary = lines[lines.index("") + 1 :]
-    for begin in ("footage: cameras 5, timesteps 5", "tracking: ", "report: ", "avatar: ", "blender: ", "time: "):
+    for begin in (
+        "footage: cameras 5, timesteps 5",
+        "tracking: ",
+        "report: ",
+        "avatar: ",
+        "blender: ",
+        "time: ",
+    ):
         assert sum(line.startswith(begin) for line in summary) == 1, begin
     assert "interpolated: 2" in summary[0]
 
@@ -70,10 +87,14 @@ def test_the_blend_file_shows_the_avatar_on_the_head(made, take):
 
 
 def test_a_finished_avatar_is_not_made_again(made, take):
-    """Catches a second call that tracks or trains from the beginning, also of what a version made that noted less."""
+    """Catches a second call that tracks or trains from the beginning, also of what a version made
+    that noted less."""
     out, _ = made
     inputs = read_json(out / "inputs.json")
-    write_json(out / "inputs.json", {name: inputs[name] for name in inputs if name not in ("sync", "world", "meshes")})
+    write_json(
+        out / "inputs.json",
+        {name: inputs[name] for name in inputs if name not in ("sync", "world", "meshes")},
+    )
     files = [out / "capture/transforms_train.json", out / "run/checkpoint.npz"]
     before = [path.stat().st_mtime_ns for path in files]
     assert make(take, out, "--no-blend") == 0
@@ -98,8 +119,16 @@ def test_other_inputs_are_refused(made, take, capsys, more, expected):
 
 
 def test_a_mistyped_footage_leaves_nothing_behind(take, tmp_path, capsys):
-    """Catches a folder that remembers the mistake, and refuses the mended command as one of other inputs."""
-    mistyped = ["avatar", str(tmp_path / "nowhere"), "--model", str(take / "head.npz"), "--out", str(tmp_path / "out")]
+    """Catches a folder that remembers the mistake, and refuses the mended command as one of other
+    inputs."""
+    mistyped = [
+        "avatar",
+        str(tmp_path / "nowhere"),
+        "--model",
+        str(take / "head.npz"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(mistyped) == 2
     assert "nowhere: is neither a folder nor a video" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -112,7 +141,10 @@ def test_a_folder_of_something_else_is_left_alone(take, tmp_path, capsys):
     """Catches a run or capture of the user's that is taken for a part of this avatar."""
     (tmp_path / "out/run").mkdir(parents=True)
     assert make(take, tmp_path / "out") == 2
-    assert "holds something else (inputs.json is missing); give another --out" in capsys.readouterr().err
+    assert (
+        "holds something else (inputs.json is missing); give another --out"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "out/capture").exists()
 
 

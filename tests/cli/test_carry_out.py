@@ -9,14 +9,17 @@ from stga_addon.progress import Progress
 
 
 def test_messages_have_lines_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a sentence glued to the end of the bar, as where a GPU fails and training goes on on the CPU."""
+    """Catches a sentence glued to the end of the bar, as where a GPU fails and training goes on on
+    the CPU."""
     with ProgressBar() as bar:
         bar.report(Progress(0.5, "Training"))
         logging.getLogger("stga_addon").warning("the GPU failed")
         bar.say("a warning")
         bar.report(Progress(0.6, "Training"))
     written = capsys.readouterr()
-    lines = [line.strip() for line in (written.err + "\n" + written.out).replace("\r", "\n").splitlines()]
+    lines = [
+        line.strip() for line in (written.err + "\n" + written.out).replace("\r", "\n").splitlines()
+    ]
     assert "the GPU failed" in lines
     assert "a warning" in lines
 

@@ -46,7 +46,8 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a threshold that is ignored, timesteps without a line, and masks written under another timestep."""
+    """Catches a threshold that is ignored, timesteps without a line, and masks written under
+    another timestep."""
     out = tmp_path / "selection.npz"
     assert main(["select", str(root), "--threshold", "0.0008", "--out", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -65,8 +66,8 @@ def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_train(trained: Path, root: Path) -> None:
-    """Catches options that do not reach the run, and the paper's settings with jaw and eyes left in, because a
-    threshold replaced the whole selection."""
+    """Catches options that do not reach the run, and the paper's settings with jaw and eyes left
+    in, because a threshold replaced the whole selection."""
     run = read_run(trained)
     assert run.capture == root.resolve()
     assert (run.settings.iterations, run.settings.seconds) == (10, None)
@@ -75,14 +76,20 @@ def test_train(trained: Path, root: Path) -> None:
     assert len(read_avatar(trained / "avatar.npz").splats) >= 15 * 320
 
 
-def test_train_with_defaults_and_every_option(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_with_defaults_and_every_option(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches defaults without the lattice, and a strategy, threshold or seed that is ignored."""
     out = tmp_path / "run"
     options = "--iterations 3 --strategy selective --threshold 0.0005 --seed 5 --device cpu --principal-point vhap"
     assert main(["train", str(root), "--out", str(out), *options.split()]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"avatar: {out / 'avatar.npz'}"
     run = read_run(out)
-    assert (run.settings.seed, run.settings.selection.threshold, run.settings.strategy) == (5, 0.0005, "selective")
+    assert (run.settings.seed, run.settings.selection.threshold, run.settings.strategy) == (
+        5,
+        0.0005,
+        "selective",
+    )
     splats = read_avatar(out / "avatar.npz").splats
     assert (~splats.unbound).sum() == 6 * 320
 
@@ -90,7 +97,16 @@ def test_train_with_defaults_and_every_option(root: Path, tmp_path: Path, capsys
 def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
     """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
     out = tmp_path / "run"
-    arguments = ["train", str(root), "--out", str(out), "--budget", "0.2s", "--strategy", "gaussian-avatars"]
+    arguments = [
+        "train",
+        str(root),
+        "--out",
+        str(out),
+        "--budget",
+        "0.2s",
+        "--strategy",
+        "gaussian-avatars",
+    ]
     assert main(arguments) == 0
     first = read_checkpoint(out)
     assert 0.2 <= first.elapsed_s < 1.5
@@ -100,7 +116,8 @@ def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
 
 
 def test_eval(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches figures of another split, and figures that differ from those of the training's last evaluation."""
+    """Catches figures of another split, and figures that differ from those of the training's last
+    evaluation."""
     for split, views in (("val", 2), ("test", 3), ("train", 4)):
         assert main(["eval", str(trained), "--split", split]) == 0
         assert f"{split}: {views} views, PSNR " in capsys.readouterr().out
@@ -112,8 +129,12 @@ def test_eval(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches pictures that are missing, misnamed, upside down or of another frame or background."""
-    for split, names in (("val", ["00000_02.png", "00001_02.png"]), ("test", [f"00003_{c:02d}.png" for c in CAMERAS])):
+    """Catches pictures that are missing, misnamed, upside down or of another frame or
+    background."""
+    for split, names in (
+        ("val", ["00000_02.png", "00001_02.png"]),
+        ("test", [f"00003_{c:02d}.png" for c in CAMERAS]),
+    ):
         out = tmp_path / split
         cameras = root / f"transforms_{split}.json"
         assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out)]) == 0
@@ -121,14 +142,19 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
     drawn = pixels(tmp_path / "val" / "00000_02.png")
     assert drawn.shape == (60, 40, 3)
     assert (drawn[0] == 255).all()
-    # Ten steps from gray: the ball stands where its silhouette says, in something that is not white.
+    # Ten steps from gray: the ball stands where its silhouette says, in something that is not
+    # white.
     dark = (drawn < 230).any(axis=2)
     assert np.mean(dark == factory.silhouette()) > 0.9
-    assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(factory.CY - 0.5, abs=1.5)
+    assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(
+        factory.CY - 0.5, abs=1.5
+    )
 
 
 @pytest.mark.needs("adapter")
-def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_render_on_a_gpu(
+    trained: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a device that renders something else, or is not asked."""
     from stga_addon.raster.gpu import compose as gpu
 
@@ -137,11 +163,28 @@ def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path, monkeypatch:
     cameras = root / "transforms_val.json"
     for device in ("cpu", "gpu"):
         out = tmp_path / device
-        assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out), "--device", device]) == 0
+        assert (
+            main(
+                [
+                    "render",
+                    str(trained),
+                    "--cameras",
+                    str(cameras),
+                    "--out",
+                    str(out),
+                    "--device",
+                    device,
+                ]
+            )
+            == 0
+        )
     names = sorted(path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.png"))
     assert rendered.call_count == len(names) > 0
     for name in names:
-        one, other = (np.asarray(Image.open(tmp_path / device / name)).astype(int) for device in ("cpu", "gpu"))
+        one, other = (
+            np.asarray(Image.open(tmp_path / device / name)).astype(int)
+            for device in ("cpu", "gpu")
+        )
         assert np.abs(one - other).max() <= 1
         assert one.std() > 5
 
@@ -149,29 +192,54 @@ def test_render_on_a_gpu(trained: Path, root: Path, tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("name", "value"), [("black", (0, 0, 0)), ("1,0,0.2", (255, 0, 51)), ("white", (255, 255, 255))]
 )
-def test_render_background(trained: Path, root: Path, tmp_path: Path, name: str, value: tuple[int, int, int]) -> None:
+def test_render_background(
+    trained: Path, root: Path, tmp_path: Path, name: str, value: tuple[int, int, int]
+) -> None:
     """Catches a background that is not the one asked for."""
     cameras = str(root / "transforms_val.json")
-    assert main(["render", str(trained), "--cameras", cameras, "--out", str(tmp_path), "--background", name]) == 0
+    assert (
+        main(
+            [
+                "render",
+                str(trained),
+                "--cameras",
+                cameras,
+                "--out",
+                str(tmp_path),
+                "--background",
+                name,
+            ]
+        )
+        == 0
+    )
     assert pixels(tmp_path / "00000_02.png")[1, 1].tolist() == list(value)
 
 
 def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches an avatar that is not driven by the frame's own mesh, and a PLY that needs a capture or differs."""
+    """Catches an avatar that is not driven by the frame's own mesh, and a PLY that needs a capture
+    or differs."""
     cameras = ["--cameras", str(root / "transforms_val.json")]
-    for name, source in (("run", [trained]), ("avatar", [trained / "avatar.npz", "--capture", root])):
+    for name, source in (
+        ("run", [trained]),
+        ("avatar", [trained / "avatar.npz", "--capture", root]),
+    ):
         assert main(["render", *map(str, source), *cameras, "--out", str(tmp_path / name)]) == 0
     ply = tmp_path / "frame.ply"
-    assert main(["export", str(trained), "--format", "ply", "--timestep", "1", "--out", str(ply)]) == 0
+    assert (
+        main(["export", str(trained), "--format", "ply", "--timestep", "1", "--out", str(ply)]) == 0
+    )
     assert main(["render", str(ply), *cameras, "--out", str(tmp_path / "ply")]) == 0
     for name in ("00000_02.png", "00001_02.png"):
-        np.testing.assert_array_equal(pixels(tmp_path / "run" / name), pixels(tmp_path / "avatar" / name))
+        np.testing.assert_array_equal(
+            pixels(tmp_path / "run" / name), pixels(tmp_path / "avatar" / name)
+        )
     right, baked = (pixels(tmp_path / kind / "00001_02.png").astype(int) for kind in ("run", "ply"))
     assert np.abs(right - baked).max() <= 1
 
 
 def test_render_names(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches pictures that overwrite each other: a name used in two folders, or twice; images need not exist."""
+    """Catches pictures that overwrite each other: a name used in two folders, or twice; images need
+    not exist."""
     document = json.loads((root / "transforms_val.json").read_text())
     first = document["frames"][0]
     paths = ["a/0.png", "b/0.png", "b/1.jpg", "b/1.jpg", "../c/2"]
@@ -191,11 +259,20 @@ def test_render_names(trained: Path, root: Path, tmp_path: Path) -> None:
 
 def test_names_of_a_long_capture() -> None:
     """Catches minutes before the first image of thousands, and two images with one name."""
-    paths = [f"images/{timestep:05d}_{camera:02d}.png" for timestep in range(1000) for camera in range(16)]
+    paths = [
+        f"images/{timestep:05d}_{camera:02d}.png"
+        for timestep in range(1000)
+        for camera in range(16)
+    ]
     begin = process_time()
     assert unique_names(paths) == [Path(path).name for path in paths]
     assert process_time() - begin < 5
-    assert unique_names(["a.png", "a.png", "a_2.png", "a.png"]) == ["a.png", "a_2.png", "a_2_2.png", "a_3.png"]
+    assert unique_names(["a.png", "a.png", "a_2.png", "a.png"]) == [
+        "a.png",
+        "a_2.png",
+        "a_2_2.png",
+        "a_3.png",
+    ]
 
 
 def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
@@ -206,41 +283,77 @@ def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
         out = tmp_path / f"{timestep}.ply"
         chosen = [] if timestep is None else ["--timestep", str(timestep)]
         assert main(["export", str(trained), "--format", "ply", "--out", str(out), *chosen]) == 0
-        expected = to_world(avatar.splats, face_frames(mesh, avatar.faces, avatar.neutral, avatar.convention))
+        expected = to_world(
+            avatar.splats, face_frames(mesh, avatar.faces, avatar.neutral, avatar.convention)
+        )
         again = read_ply(out)
         np.testing.assert_allclose(again.xyz, expected.xyz, atol=1e-6)
         np.testing.assert_allclose(again.log_scale, expected.log_scale, atol=1e-5)
-    assert np.abs(read_ply(tmp_path / "3.ply").xyz - read_ply(tmp_path / "None.ply").xyz).max() > 0.002
-    assert np.linalg.norm(read_ply(tmp_path / "None.ply").xyz, axis=1).mean() == pytest.approx(0.1, abs=0.01)
+    assert (
+        np.abs(read_ply(tmp_path / "3.ply").xyz - read_ply(tmp_path / "None.ply").xyz).max() > 0.002
+    )
+    assert np.linalg.norm(read_ply(tmp_path / "None.ply").xyz, axis=1).mean() == pytest.approx(
+        0.1, abs=0.01
+    )
 
 
-def test_export_says_which_frames_there_are(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a range that is cut to the capture's without a message, a message about one that is not, and frames
-    numbered from zero instead of by their timestep."""
+def test_export_says_which_frames_there_are(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a range that is cut to the capture's without a message, a message about one that is
+    not, and frames numbered from zero instead of by their timestep."""
     sequence = ["export", str(trained), "--format", "ply-sequence"]
     for span, said in (("1:999999", True), ("0:3", False), ("0:2", False)):
         assert main([*sequence, "--frames", span, "--out", str(tmp_path / span[2:])]) == 0
-        assert (f"--frames {span}: the capture has timesteps 0 to 3\n" in capsys.readouterr().out) == said
+        assert (
+            f"--frames {span}: the capture has timesteps 0 to 3\n" in capsys.readouterr().out
+        ) == said
     files = sorted((tmp_path / "3").glob("*.ply"))
     assert [path.name for path in files] == ["00000.ply", "00001.ply", "00003.ply"]
     low = [read_ply(path).xyz[:, 1].min() for path in files]
     assert low[0] > low[1] > low[2]
 
 
-def test_export_a_range_as_usd(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_a_range_as_usd(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches timesteps outside the range, and a size that is not told before."""
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     out = tmp_path / "a.usdc"
-    assert main(["export", str(trained), "--format", "usd", "--frames", "1:3", "--fps", "50", "--out", str(out)]) == 0
+    assert (
+        main(
+            [
+                "export",
+                str(trained),
+                "--format",
+                "usd",
+                "--frames",
+                "1:3",
+                "--fps",
+                "50",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     assert "2 frames of" in capsys.readouterr().out
     stage = usd.Stage.Open(str(out))
     assert stage.GetTimeCodesPerSecond() == 50
-    assert stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions").GetTimeSamples() == [1, 3]
+    assert stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions").GetTimeSamples() == [
+        1,
+        3,
+    ]
 
 
-@pytest.mark.parametrize(("format", "suffix", "magic"), [("gltf", ".glb", b"glTF"), ("spz", ".spz", b"\x1f\x8b")])
-def test_export_one_frame(trained: Path, tmp_path: Path, format: str, suffix: str, magic: bytes) -> None:
-    """Catches a format that the command cannot write, or writes for another frame than asked for."""
+@pytest.mark.parametrize(
+    ("format", "suffix", "magic"), [("gltf", ".glb", b"glTF"), ("spz", ".spz", b"\x1f\x8b")]
+)
+def test_export_one_frame(
+    trained: Path, tmp_path: Path, format: str, suffix: str, magic: bytes
+) -> None:
+    """Catches a format that the command cannot write, or writes for another frame than asked
+    for."""
     files = [tmp_path / f"neutral{suffix}", tmp_path / f"frame{suffix}"]
     for out, chosen in zip(files, ([], ["--timestep", "3"]), strict=True):
         assert main(["export", str(trained), "--format", format, "--out", str(out), *chosen]) == 0
@@ -251,18 +364,24 @@ def test_export_one_frame(trained: Path, tmp_path: Path, format: str, suffix: st
 
 @pytest.mark.parametrize("format", ["ply-sequence", "web"])
 def test_export_to_a_full_disk(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, format: str
+    trained: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    format: str,
 ) -> None:
     """Catches a range that fills the disk."""
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
     out = tmp_path / ("o.html" if format == "web" else "o")
-    assert "1.0 kB are free there" in refused(capsys, "export", trained, "--format", format, "--out", out)
+    assert "1.0 kB are free there" in refused(
+        capsys, "export", trained, "--format", format, "--out", out
+    )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_run_of_a_flame_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches an exported pair without motion, and a run that cannot be measured any more because its FLAME file is
-    elsewhere now."""
+    """Catches an exported pair without motion, and a run that cannot be measured any more because
+    its FLAME file is elsewhere now."""
     root, model = factory.write_flame_capture(tmp_path / "flame")
     out, pair, elsewhere = tmp_path / "run", tmp_path / "pair", tmp_path / "elsewhere.npz"
     options = ["--flame", str(model), "--iterations", "2", "--strategy", "gaussian-avatars"]
@@ -279,14 +398,22 @@ def test_run_of_a_flame_capture(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_eval_with_a_capture_that_has_moved(
     trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a run that cannot be evaluated where its capture lies elsewhere, and one measured on another capture."""
-    run, moved = Path(shutil.copytree(trained, tmp_path / "run")), Path(shutil.copytree(root, tmp_path / "moved"))
+    """Catches a run that cannot be evaluated where its capture lies elsewhere, and one measured on
+    another capture."""
+    run, moved = (
+        Path(shutil.copytree(trained, tmp_path / "run")),
+        Path(shutil.copytree(root, tmp_path / "moved")),
+    )
     factory.edit(run / "run.json", lambda document: document.update(capture=str(tmp_path / "gone")))
     assert "gone" in refused(capsys, "eval", run)
     assert main(["eval", str(run), "--capture", str(moved)]) == 0
     assert main(["eval", str(trained)]) == 0
-    assert json.loads((run / "quality_val.json").read_text()) == json.loads((trained / "quality_val.json").read_text())
-    factory.edit(moved / "transforms_val.json", lambda document: document["frames"][0].update(fl_x=300.0))
+    assert json.loads((run / "quality_val.json").read_text()) == json.loads(
+        (trained / "quality_val.json").read_text()
+    )
+    factory.edit(
+        moved / "transforms_val.json", lambda document: document["frames"][0].update(fl_x=300.0)
+    )
     assert "other camera poses or intrinsics" in refused(capsys, "eval", run, "--capture", moved)
 
 
@@ -305,12 +432,19 @@ NONSENSE_OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("command", "option", "value"), NONSENSE_OPTIONS, ids=lambda text: ascii(text)[:20])
+@pytest.mark.parametrize(
+    ("command", "option", "value"), NONSENSE_OPTIONS, ids=lambda text: ascii(text)[:20]
+)
 def test_option_values_without_meaning(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, option: str, value: str
+    root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    option: str,
+    value: str,
 ) -> None:
-    """Catches a traceback from deep inside, a run that trains nothing, for ever or everything, a selection of nothing
-    or everything, one of two budgets that is ignored, and a long sentence."""
+    """Catches a traceback from deep inside, a run that trains nothing, for ever or everything, a
+    selection of nothing or everything, one of two budgets that is ignored, and a long sentence."""
     *others, name = option.split()
     out = [f"--out={tmp_path / 'run'}"] if name != "--out" else []
     with pytest.raises(SystemExit, match="2"):
@@ -326,7 +460,9 @@ def test_an_image_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[
     root = factory.write_mesh_capture(tmp_path / "capture", TIMESTEPS, CAMERAS)
     Image.new("RGB", (41, 60)).save(root / "images" / "00001_01.png")
     out = tmp_path / "run"
-    message = refused(capsys, "train", root, "--out", out, "--iterations", 30, "--strategy", "gaussian-avatars")
+    message = refused(
+        capsys, "train", root, "--out", out, "--iterations", 30, "--strategy", "gaussian-avatars"
+    )
     assert "00001_01.png: the image has 41 x 60 pixels" in message
     assert not (out / "run.lock").exists()
 
@@ -335,12 +471,25 @@ def test_an_image_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def commands_of(parser: argparse.ArgumentParser) -> set[str]:
-    return set(next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices)
+    return set(
+        next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices
+    )
 
 
 def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a command that the parser lost, and an extension without `development` whose parser needs it."""
-    shipped = {"train", "refine", "presets", "render", "eval", "select", "export", "info", "perform"}
+    """Catches a command that the parser lost, and an extension without `development` whose parser
+    needs it."""
+    shipped = {
+        "train",
+        "refine",
+        "presets",
+        "render",
+        "eval",
+        "select",
+        "export",
+        "info",
+        "perform",
+    }
     shipped |= {"avatar", "batch", "drive", "extend", "relight", "track"}
     assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
     monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
@@ -357,17 +506,31 @@ NUMPY_ALONE = "torch numba wgpu trimesh scipy PIL tqdm matplotlib platformdirs b
 
 
 def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -> None:
-    """Catches an import by which a capture can only be looked at where it could be trained, or by which `select` and
-    `export` need more than the numpy of Blender's own Python; and a capture asked for where none is needed."""
+    """Catches an import by which a capture can only be looked at where it could be trained, or by
+    which `select` and `export` need more than the numpy of Blender's own Python; and a capture
+    asked for where none is needed."""
     flame, model = factory.write_flame_capture(tmp_path / "flame")
-    exported = ["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(tmp_path / "a.ply")]
+    exported = [
+        "export",
+        str(trained / "avatar.npz"),
+        "--format",
+        "ply",
+        "--out",
+        str(tmp_path / "a.ply"),
+    ]
     for missing, arguments, says in (
-        ("torch numba wgpu", ["info", str(root)], ("162 vertices, 320 triangles", "40 x 60", "view-color")),
+        (
+            "torch numba wgpu",
+            ["info", str(root)],
+            ("162 vertices, 320 triangles", "40 x 60", "view-color"),
+        ),
         (NUMPY_ALONE, ["select", str(flame), "--flame", str(model)], ("320 triangles",)),
         (NUMPY_ALONE, exported, ()),
     ):
         command = [sys.executable, "-c", WITHOUT, missing, *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+        done = subprocess.run(
+            command, capture_output=True, text=True, cwd=Path(__file__).parents[2]
+        )
         assert (done.returncode, done.stderr) == (0, "")
         assert all(part in done.stdout for part in says)
     assert len(read_ply(tmp_path / "a.ply")) == len(read_avatar(trained / "avatar.npz").splats)
@@ -376,7 +539,8 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
 def test_interruption_and_mistakes_have_their_codes(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a traceback after Ctrl-C, and an unexpected exception reported as the user's mistake."""
+    """Catches a traceback after Ctrl-C, and an unexpected exception reported as the user's
+    mistake."""
 
     def fails_with(error: BaseException) -> None:
         def run(options: argparse.Namespace, head: object) -> None:
@@ -406,7 +570,10 @@ def test_as_a_module(tmp_path: Path) -> None:
     """Catches a broken entry point, and an exit code or stream that gets lost."""
     missing = tmp_path / "none"
     says = f"stga: {missing}: is not a folder; expected that of a capture\n"
-    for arguments, expected in ((["--version"], (0, f"{__version__}\n", "")), (["info", str(missing)], (2, "", says))):
+    for arguments, expected in (
+        (["--version"], (0, f"{__version__}\n", "")),
+        (["info", str(missing)], (2, "", says)),
+    ):
         command = [sys.executable, "-m", "stga_addon", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120)
         assert (done.returncode, done.stdout, done.stderr) == expected
@@ -414,7 +581,10 @@ def test_as_a_module(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["{}", "[]", "null", "3", '{"capture": 5}', "{", None])
 def test_damaged_folder_of_the_open_head(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, content: str | None
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    content: str | None,
 ) -> None:
     """Catches a traceback for a folder in STGA_HEAD that is damaged, empty or missing."""
     if content is not None:
@@ -424,23 +594,45 @@ def test_damaged_folder_of_the_open_head(
 
 
 def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a refinement that is put into the run's own folder, one that cannot be evaluated or refined again, and
-    one that says nothing about what it gained."""
+    """Catches a refinement that is put into the run's own folder, one that cannot be evaluated or
+    refined again, and one that says nothing about what it gained."""
     runs = Path(shutil.copytree(trained, tmp_path / "anna"))
-    assert main(["refine", str(runs), "--region", "mouth", "--frames", "1-3", "--iterations", "6"]) == 0
+    assert (
+        main(["refine", str(runs), "--region", "mouth", "--frames", "1-3", "--iterations", "6"])
+        == 0
+    )
     printed = capsys.readouterr().out
     assert "region: " in printed
     assert f"avatar: {tmp_path / 'anna_2' / 'avatar.npz'}" in printed
-    assert main(["refine", str(tmp_path / "anna_2"), "--region", "mouth", "--iterations", "3", "--growth", "0.5"]) == 0
+    assert (
+        main(
+            [
+                "refine",
+                str(tmp_path / "anna_2"),
+                "--region",
+                "mouth",
+                "--iterations",
+                "3",
+                "--growth",
+                "0.5",
+            ]
+        )
+        == 0
+    )
     assert read_checkpoint(tmp_path / "anna_3").iteration == 3
     assert main(["refine", str(tmp_path / "anna_3"), "--resume"]) == 0
     assert main(["eval", str(tmp_path / "anna_3")]) == 0
 
 
-def test_extend(trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches an extended run that cannot be evaluated, rendered or extended again, and one that does not say what it
-    learned and forgot."""
-    runs, take = Path(shutil.copytree(trained, tmp_path / "anna")), Path(shutil.copytree(root, tmp_path / "smile"))
+def test_extend(
+    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches an extended run that cannot be evaluated, rendered or extended again, and one that
+    does not say what it learned and forgot."""
+    runs, take = (
+        Path(shutil.copytree(trained, tmp_path / "anna")),
+        Path(shutil.copytree(root, tmp_path / "smile")),
+    )
     assert main(["extend", str(runs), str(take), "--iterations", "6"]) == 0
     printed = capsys.readouterr().out
     assert "take 1: " in printed

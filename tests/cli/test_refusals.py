@@ -85,11 +85,19 @@ REFUSALS = [
 
 
 @pytest.fixture(scope="session")
-def refusable(root: Path, trained: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def refusable(
+    root: Path, trained: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
     """What REFUSALS name, by name."""
     folder = tmp_path_factory.mktemp("refusals")
-    names = {name: folder / name for name in ("broken", "bare", "cameras5", "coarse", "moved", "file", "none", "o")}
-    names |= {"run": Path(shutil.copytree(trained, folder / "run")), "avatar": folder / "run" / "avatar.npz"}
+    names = {
+        name: folder / name
+        for name in ("broken", "bare", "cameras5", "coarse", "moved", "file", "none", "o")
+    }
+    names |= {
+        "run": Path(shutil.copytree(trained, folder / "run")),
+        "avatar": folder / "run" / "avatar.npz",
+    }
     names |= {
         "root": Path(shutil.copytree(root, folder / "ball")),
         "folder": folder,
@@ -103,8 +111,12 @@ def refusable(root: Path, trained: Path, tmp_path_factory: pytest.TempPathFactor
     for split in ("train", "test"):
         (names["bare"] / f"transforms_{split}.json").unlink()
     shutil.copytree(trained, names["moved"])
-    factory.edit(names["moved"] / "run.json", lambda document: document.update(capture=str(names["bare"])))
-    factory.edit(names["run"] / "run.json", lambda document: document.update(capture=str(names["root"])))
+    factory.edit(
+        names["moved"] / "run.json", lambda document: document.update(capture=str(names["bare"]))
+    )
+    factory.edit(
+        names["run"] / "run.json", lambda document: document.update(capture=str(names["root"]))
+    )
     sphere = trimesh.creation.icosphere(1, factory.RADIUS)
     for path in (names["coarse"] / "meshes").iterdir():
         factory.write_mesh(path, np.array(sphere.vertices), np.array(sphere.faces))
@@ -114,18 +126,24 @@ def refusable(root: Path, trained: Path, tmp_path_factory: pytest.TempPathFactor
     whole = names["avatar"].read_bytes()
     (folder / "half.npz").write_bytes(whole[: len(whole) // 2])
     np.savez(folder / "foreign.npz", a=np.zeros(3))
-    (folder / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    (folder / "mesh.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
+    )
     names["file"].write_text("x")
     return names
 
 
 @pytest.mark.parametrize(("command", "says"), REFUSALS, ids=[command for command, _ in REFUSALS])
-def test_refusals(refusable: dict[str, Path], capsys: pytest.CaptureFixture[str], command: str, says: str) -> None:
-    """Catches a traceback, an option that does nothing, talk of something else, and a command that fails but has made
-    a folder, or overwritten a run or a recording."""
+def test_refusals(
+    refusable: dict[str, Path], capsys: pytest.CaptureFixture[str], command: str, says: str
+) -> None:
+    """Catches a traceback, an option that does nothing, talk of something else, and a command that
+    fails but has made a folder, or overwritten a run or a recording."""
     before = {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()}
     assert says.format(**refusable) in refused(capsys, *command.format(**refusable).split())
-    assert {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()
+    } == before
     assert not refusable["o"].exists()
     assert not refusable["none"].exists()
 

@@ -21,12 +21,16 @@ WHITE = (1.0, 1.0, 1.0)
 
 @pytest.fixture
 def parts(tmp_path: Path) -> dict[str, Path]:
-    """A capture with three timesteps and three cameras, and an avatar whose every splat has its own color."""
+    """A capture with three timesteps and three cameras, and an avatar whose every splat has its own
+    color."""
     root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 3), range(3))
     capture = open_capture(root)
     splats = lattice_splats(capture.neutral, capture.faces, order=0)
     splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
-    write_avatar(tmp_path / "a.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces))
+    write_avatar(
+        tmp_path / "a.npz",
+        Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces),
+    )
     return {"avatar": tmp_path / "a.npz", "capture": root}
 
 
@@ -38,7 +42,9 @@ def decoded(path: Path) -> tuple[float, list[np.ndarray]]:
     with av.open(str(path)) as container:
         rate = container.streams.video[0].average_rate
         assert rate is not None
-        return float(rate), [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        return float(rate), [
+            frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)
+        ]
 
 
 def test_video_of_the_motion(parts: dict[str, Path], tmp_path: Path) -> None:
@@ -47,17 +53,23 @@ def test_video_of_the_motion(parts: dict[str, Path], tmp_path: Path) -> None:
     rate, images = decoded(tmp_path / "v.mp4")
     assert (rate, len(images)) == (10, 3)
     avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
-    camera = next(view.camera for views in capture.views.values() for view in views if view.camera_index == 2)
+    camera = next(
+        view.camera for views in capture.views.values() for view in views if view.camera_index == 2
+    )
     for image, timestep in zip(images, (0, 1, 3), strict=True):
         errors = {
-            other: np.abs(to_uint8(render_avatar(avatar, capture.mesh(other), camera)).astype(int) - image).mean()
+            other: np.abs(
+                to_uint8(render_avatar(avatar, capture.mesh(other), camera)).astype(int) - image
+            ).mean()
             for other in capture.timesteps
         }
         assert min(errors, key=errors.__getitem__) == timestep
         assert errors[timestep] < 12  # colors at half the resolution: splats are a few pixels wide
 
 
-def test_a_range_of_frames(parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_range_of_frames(
+    parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches ranges that leave a frame to nobody, render it twice, or change it."""
     cameras = ["--cameras", parts["capture"] / "transforms_train.json"]
     names = {}
@@ -79,19 +91,27 @@ def test_a_range_of_frames(parts: dict[str, Path], tmp_path: Path, capsys: pytes
 def test_video_at_the_rate_of_the_footage(parts: dict[str, Path], tmp_path: Path) -> None:
     """Catches footage of 60 frames a second that plays 2.4 times too slowly."""
     assert render(parts, "--video", tmp_path / "unknown.mp4") == 0
-    factory.edit(parts["capture"] / "transforms_train.json", lambda document: document.update(fps=60))
+    factory.edit(
+        parts["capture"] / "transforms_train.json", lambda document: document.update(fps=60)
+    )
     assert render(parts, "--video", tmp_path / "known.mp4") == 0
     assert [decoded(tmp_path / name)[0] for name in ("unknown.mp4", "known.mp4")] == [25, 60]
 
 
 def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
-    """Catches a turn about another point, one that leaves out a part of the circle, and motion that does not play."""
+    """Catches a turn about another point, one that leaves out a part of the circle, and motion that
+    does not play."""
     out = tmp_path / "turn"
-    assert render(parts, "--turntable", 360, "--out", out, "--seconds", 2, "--fps", 4, "--camera", 0) == 0
+    assert (
+        render(parts, "--turntable", 360, "--out", out, "--seconds", 2, "--fps", 4, "--camera", 0)
+        == 0
+    )
     pictures = sorted(out.glob("*.png"))
     assert [path.name for path in pictures] == [f"{index:04d}.png" for index in range(1, 9)]
     avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
-    start = next(view.camera for views in capture.views.values() for view in views if view.camera_index == 0)
+    start = next(
+        view.camera for views in capture.views.values() for view in views if view.camera_index == 0
+    )
     first = capture.mesh(0)
     center = (first.min(0) + first.max(0)) / 2
     for index, timestep in ((0, 0), (2, 3), (3, 1), (5, 1)):
@@ -117,12 +137,18 @@ def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
         (["--video", "v.mp4", "--camera", "7"], "there are only 0, 1, 2"),
         (["--video", "v.mp4", "--fps", "0"], "frame rate (--fps) must be from 0.01"),
         (["--out", "pictures"], "needs --cameras"),
-        (["--out", "pictures", "--camera", "1"], "--camera: has no effect without --video or --turntable"),
+        (
+            ["--out", "pictures", "--camera", "1"],
+            "--camera: has no effect without --video or --turntable",
+        ),
         (
             ["--out", "pictures", "--turntable", "--seconds", "1e9"],
             "--seconds 1e+09: is 25000000000 images at 25 frames per second; expected up to 100000",
         ),
-        (["--video", "v.mp4", "--turntable", "--seconds", "1", "--fps", "1e6"], "is 1000000 images at 1e+06 frames"),
+        (
+            ["--video", "v.mp4", "--turntable", "--seconds", "1", "--fps", "1e6"],
+            "is 1000000 images at 1e+06 frames",
+        ),
     ],
 )
 def test_mistakes(

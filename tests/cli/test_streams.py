@@ -1,4 +1,5 @@
-"""Standard streams of the command line: closed pipes, full devices, ASCII, closed descriptors, interruption."""
+"""Standard streams of the command line: closed pipes, full devices, ASCII, closed descriptors,
+interruption."""
 
 import os
 import signal
@@ -20,10 +21,16 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a bash command line in which `stga` is the command line and PIPESTATUS[0] is its exit code."""
+    """Run a bash command line in which `stga` is the command line and PIPESTATUS[0] is its exit
+    code."""
     script = f'stga() {{ {STGA} "$@"; }}\n{command}\nexit ${{PIPESTATUS[0]}}'
     return subprocess.run(
-        ["bash", "-c", script], capture_output=True, text=True, cwd=ROOT, env={**os.environ, **environment}, timeout=120
+        ["bash", "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        timeout=120,
     )
 
 
@@ -44,9 +51,12 @@ def test_full_device(capture: Path) -> None:
     assert shell("stga info /none 2> /dev/full").returncode == 2
 
 
-@pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}])
+@pytest.mark.parametrize(
+    "environment", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}]
+)
 def test_ascii_streams(tmp_path: Path, environment: dict[str, str]) -> None:
-    """Catches a UnicodeEncodeError for a folder's name, in what is printed and in the error sentence."""
+    """Catches a UnicodeEncodeError for a folder's name, in what is printed and in the error
+    sentence."""
     capture = factory.write_mesh_capture(tmp_path / "Käthe−²")
     done = shell(f"stga info {capture}", PYTHONUTF8="0", **environment)
     assert (done.returncode, done.stderr) == (0, "")
@@ -57,7 +67,8 @@ def test_ascii_streams(tmp_path: Path, environment: dict[str, str]) -> None:
     assert "Traceback" not in done.stderr
 
 
-# Three commands of one process, which is started with all streams closed: any file may get any of their descriptors.
+# Three commands of one process, which is started with all streams closed: any file may get any of
+# their descriptors.
 THREE = """
 import os, sys
 from stga_addon.cli.main import main
@@ -71,7 +82,8 @@ assert codes == [0, 0, 2] and all(os.path.samestat(os.fstat(number), null) for n
 
 
 def test_closed_descriptors(capture: Path, tmp_path: Path) -> None:
-    """Catches a progress bar that cannot do without stderr, and files that get the descriptor of a closed stream."""
+    """Catches a progress bar that cannot do without stderr, and files that get the descriptor of a
+    closed stream."""
     done = shell(f"\"{sys.executable}\" -c '{THREE}' {capture} {tmp_path} <&- >&- 2>&-")
     assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
     assert (tmp_path / "run/avatar.npz").exists()
@@ -81,11 +93,23 @@ def test_closed_descriptors(capture: Path, tmp_path: Path) -> None:
 
 
 def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path) -> None:
-    """Catches a progress bar that breaks without a terminal, and a traceback or another exit code than 130 after
-    Ctrl-C."""
+    """Catches a progress bar that breaks without a terminal, and a traceback or another exit code
+    than 130 after Ctrl-C."""
     out = tmp_path / "run"
-    command = [sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out), "--budget", "60s"]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "stga_addon",
+        "train",
+        str(capture),
+        "--out",
+        str(out),
+        "--budget",
+        "60s",
+    ]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
     end = time.monotonic() + 60
     while not (out / "run.json").exists() and time.monotonic() < end:
         time.sleep(0.1)
@@ -98,7 +122,8 @@ def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path)
     assert "Traceback" not in error
 
 
-# A command that is interrupted while a library makes an object, which then complains when it is collected.
+# A command that is interrupted while a library makes an object, which then complains when it is
+# collected.
 HALF_MADE = """
 from dataclasses import replace
 from stga_addon.cli import main
@@ -113,6 +138,7 @@ raise SystemExit(main.main(["info", "capture"]))
 
 
 def test_interruption_says_nothing_of_what_was_half_made() -> None:
-    """Catches the traceback of a library's destructor below the sentence, where Ctrl-C came while it made an object."""
+    """Catches the traceback of a library's destructor below the sentence, where Ctrl-C came while
+    it made an object."""
     done = shell(f"\"{sys.executable}\" -c '{HALF_MADE}'")
     assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")

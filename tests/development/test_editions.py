@@ -1,4 +1,5 @@
-"""The editions' wheels, manifests and files, and the repository's page; Blender's part is in tests/blender."""
+"""The editions' wheels, manifests and files, and the repository's page; Blender's part is in
+tests/blender."""
 
 import os
 import re
@@ -42,7 +43,8 @@ def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: s
 
 
 def wheel_set(folder: Path, target: Target) -> list[Path]:
-    """A wheel of the pinned version for each package that training needs; torch and numba with their dependencies."""
+    """A wheel of the pinned version for each package that training needs; torch and numba with
+    their dependencies."""
     pins = {pin.split("==")[0]: pin.split("==")[1] for key in ("", "3.11") for pin in PINS[key]}
     tag = NATIVE[target.platform].format(target.python.replace(".", ""))
     extra = {
@@ -50,13 +52,16 @@ def wheel_set(folder: Path, target: Target) -> list[Path]:
         "numba": ("llvmlite",),
     }
     names = {text.split(">=")[0] for text in REQUIREMENTS.values()} - {"numpy"} | {"llvmlite"}
-    wheels = [make_wheel(folder, name, pins[name], tag, *extra.get(name, ())) for name in sorted(names)]
+    wheels = [
+        make_wheel(folder, name, pins[name], tag, *extra.get(name, ())) for name in sorted(names)
+    ]
     return [*wheels, make_wheel(folder, "sympy", "1.14.0", "py3-none-any")]
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
 def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
-    """Catches wheels of another system or Python in a zip, and a missing or too old dependency, on every target."""
+    """Catches wheels of another system or Python in a zip, and a missing or too old dependency, on
+    every target."""
     wheels = wheel_set(tmp_path, target)
     check_wheels(wheels, target)
     for other in TARGETS:
@@ -78,8 +83,9 @@ def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
 def test_only_when_told_to_does_a_zip_have_cuda(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a zip of gigabytes that nothing uses, also by a wheel of an earlier build; a CPU build that pip's
-    configuration sees and that is not taken; and a refusal that does not say how to go on."""
+    """Catches a zip of gigabytes that nothing uses, also by a wheel of an earlier build; a CPU
+    build that pip's configuration sees and that is not taken; and a refusal that does not say how
+    to go on."""
     monkeypatch.setattr("stga_addon.development.package.ROOT", tmp_path)
     wheels, offered, index = wheel_folder(LINUX), tmp_path / "offered", tmp_path / "index"
     for folder in (wheels, offered, index):
@@ -104,7 +110,9 @@ def test_only_when_told_to_does_a_zip_have_cuda(
     def built(name: str, *more: str) -> set[str]:
         assert main(["--edition", "complete", "--out", str(tmp_path / name), *more]) == 0
         with zipfile.ZipFile(next((tmp_path / name).glob("*.zip"))) as archive:
-            names = {Path(entry).name for entry in archive.namelist() if entry.startswith("wheels/")}
+            names = {
+                Path(entry).name for entry in archive.namelist() if entry.startswith("wheels/")
+            }
         return {wheel for wheel in names if wheel.startswith(("torch", "nvidia"))}
 
     def refusal() -> str:
@@ -116,13 +124,16 @@ def test_only_when_told_to_does_a_zip_have_cuda(
     cpu.unlink()
     (wheels / cpu.name).unlink()
     said = refusal()
-    assert all(part in said for part in ("torch==2.13.0+cpu", str(wheels), "--allow-cuda", "CUDA=1"))
+    assert all(
+        part in said for part in ("torch==2.13.0+cpu", str(wheels), "--allow-cuda", "CUDA=1")
+    )
     assert built("allowed", "--allow-cuda") == with_cuda
     assert refusal() == said
 
 
 def test_markers_are_those_of_the_target(tmp_path: Path) -> None:
-    """Catches dependencies of this computer in the zip of another system: pip evaluates markers where it runs."""
+    """Catches dependencies of this computer in the zip of another system: pip evaluates markers
+    where it runs."""
     wheel = make_wheel(
         tmp_path, "torch", "2.13.0", "py3-none-any", 'cuda; platform_system == "Linux"', 'dll; os_name == "nt"',
         'old; python_version < "3.12"', 'more; extra == "more"',
@@ -139,18 +150,27 @@ def test_manifest_of_an_edition() -> None:
         assert (made["platforms"], made["wheels"]) == ([target.platform], ["./wheels/a.whl"])
         assert made["blender_version_min"] == target.blender[0]
         assert made.get("blender_version_max", "") == target.blender[1]
-    small = tomllib.loads(edition_manifest(manifest, SMALL, [Path(name).name for name in manifest["wheels"]]))
+    small = tomllib.loads(
+        edition_manifest(manifest, SMALL, [Path(name).name for name in manifest["wheels"]])
+    )
     assert small == {name: value for name, value in manifest.items() if name != "build"}
 
 
 @pytest.mark.parametrize("edition", [SMALL, complete(LINUX)], ids=["small", "complete"])
-def test_no_way_to_install_packages(edition: Edition, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches code in a zip that installs packages, downloads something, or runs what it downloaded."""
+def test_no_way_to_install_packages(
+    edition: Edition, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches code in a zip that installs packages, downloads something, or runs what it
+    downloaded."""
     monkeypatch.setattr("stga_addon.development.package.edition_wheels", lambda folder, edition: [])
     forbidden = re.compile(r"\bpip\b|ensurepip|\"venv\"|urllib|http\.client|import requests\b")
-    assert forbidden.search((ROOT / "stga_addon/development/wheels.py").read_text()), "the search finds what is there"
+    assert forbidden.search((ROOT / "stga_addon/development/wheels.py").read_text()), (
+        "the search finds what is there"
+    )
     with zipfile.ZipFile(build_zip(tmp_path, edition=edition)) as archive:
-        texts = {name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")}
+        texts = {
+            name: archive.read(name).decode() for name in archive.namelist() if name.endswith(".py")
+        }
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
     assert {name: found for name, text in texts.items() if (found := forbidden.search(text))} == {}
     assert "ownload" not in str(manifest["permissions"])

@@ -25,7 +25,8 @@ SAMPLES = 400
 
 
 def generated_flame(shared_data: Path, components: int) -> FlameModel:
-    """FLAME 2023 Open's template and 60 identity components, a jaw and eyes, and expressions (`with_expressions`)."""
+    """FLAME 2023 Open's template and 60 identity components, a jaw and eyes, and expressions
+    (`with_expressions`)."""
     model = _with_eyes(open_flame(shared_data))
     return with_expressions(replace(model, posedirs=0 * model.posedirs), components)
 
@@ -33,8 +34,8 @@ def generated_flame(shared_data: Path, components: int) -> FlameModel:
 def with_expressions(model: FlameModel, components: int) -> FlameModel:
     """The model with other expressions: FLAME's own are not published openly.
 
-    They are principal components of what random combinations of ICT-FaceKit's shapes other than the jaw's do, spread
-    from the face's points over the mesh.
+    They are principal components of what random combinations of ICT-FaceKit's shapes other than the
+    jaw's do, spread from the face's points over the mesh.
     """
     identity = model.shapedirs[:, :, : model.n_identity]
     places, used = face_points(model, "head")
@@ -42,22 +43,31 @@ def with_expressions(model: FlameModel, components: int) -> FlameModel:
     distance = np.linalg.norm(model.v_template[:, None] - points, axis=2)
     spread = np.exp(-0.5 * (distance / KERNEL_M) ** 2)
     spread /= np.maximum(spread.sum(axis=1, keepdims=True), 1e-9)
-    spread *= np.exp(-((np.maximum(distance.min(axis=1), REACH_M) - REACH_M) ** 2) / REACH_M**2)[:, None]
+    spread *= np.exp(-((np.maximum(distance.min(axis=1), REACH_M) - REACH_M) ** 2) / REACH_M**2)[
+        :, None
+    ]
     spread[model.weights[:, 3:].any(axis=1)] = 0
     kept = [column for column, name in enumerate(ARKIT_SHAPES) if name not in RIGID]
-    moved = np.einsum("vp,spc->svc", spread, face_shapes().shapes[kept][:, used]).reshape(len(kept), -1)
+    moved = np.einsum("vp,spc->svc", spread, face_shapes().shapes[kept][:, used]).reshape(
+        len(kept), -1
+    )
     weights = random_poses(SAMPLES, np.random.default_rng(0))[:, kept]
     # Principal components of weights @ moved, from the small matrix of the shapes' products.
     values, vectors = np.linalg.eigh(moved @ moved.T)
     root = vectors * np.sqrt(np.maximum(values, 0))
     _, sizes, axes = np.linalg.svd((weights - weights.mean(axis=0)) @ root, full_matrices=False)
-    axes = axes[:components] @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T @ moved
-    expressions = (sizes[:components, None] * axes / np.sqrt(SAMPLES)).T.reshape(-1, 3, min(components, len(kept)))
+    axes = (
+        axes[:components] @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T @ moved
+    )
+    expressions = (sizes[:components, None] * axes / np.sqrt(SAMPLES)).T.reshape(
+        -1, 3, min(components, len(kept))
+    )
     return replace(model, shapedirs=np.concatenate([identity, expressions], axis=2))
 
 
 def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 52) weights as of a face in motion: a third of the shapes, no opposites, a third with closed lips."""
+    """(count, 52) weights as of a face in motion: a third of the shapes, no opposites, a third with
+    closed lips."""
     weights = rng.random((count, COUNT)) * (rng.random((count, COUNT)) < 1 / 3)
     for pair in OPPOSITES:
         chosen = rng.integers(0, 2, count)
@@ -65,7 +75,9 @@ def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
             weights[:, COLUMN[name]] *= chosen == number
     closed = rng.random(count) < 1 / 3
     weights[closed, COLUMN["jawOpen"]] = rng.random(int(closed.sum()))
-    weights[:, COLUMN["mouthClose"]] = np.where(closed, weights[:, COLUMN["jawOpen"]] * rng.random(count), 0)
+    weights[:, COLUMN["mouthClose"]] = np.where(
+        closed, weights[:, COLUMN["jawOpen"]] * rng.random(count), 0
+    )
     weights[:, COLUMN["tongueOut"]] = 0
     return np.asarray(weights)
 

@@ -23,13 +23,18 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> dict[str, Path]:
-    """The small head's model, an avatar of another identity of it, and ten frames in which head and jaw turn left and
-    the jaw opens."""
+    """The small head's model, an avatar of another identity of it, and ten frames in which head and
+    jaw turn left and the jaw opens."""
     folder = tmp_path_factory.mktemp("drive")
     model = small_head(0)
     write_flame(model, folder / "flame.npz")
-    neutral = flame_forward(model, np.full(model.n_identity, 0.5), neutral_frame(model)).astype(np.float32)
-    write_avatar(folder / "a.npz", Avatar(lattice_splats(neutral, model.faces, order=0), "stga", neutral, model.faces))
+    neutral = flame_forward(model, np.full(model.n_identity, 0.5), neutral_frame(model)).astype(
+        np.float32
+    )
+    write_avatar(
+        folder / "a.npz",
+        Avatar(lattice_splats(neutral, model.faces, order=0), "stga", neutral, model.faces),
+    )
     weights = np.zeros((10, 52))
     weights[:, COLUMN["jawOpen"]] = np.linspace(0, 0.9, 10)
     weights[:, COLUMN["jawLeft"]] = np.linspace(0, 0.5, 10)
@@ -45,11 +50,20 @@ def files(tmp_path_factory) -> dict[str, Path]:
 
 
 def test_convert_there_and_back(files, tmp_path, capsys):
-    """Catches a motion that `read_motion` refuses, another rate, a mirror that does not exchange sides, and a strength
-    that changes no CSV, or a motion twice."""
+    """Catches a motion that `read_motion` refuses, another rate, a mirror that does not exchange
+    sides, and a strength that changes no CSV, or a motion twice."""
     out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
     assert (
-        main(["drive", *map(str, (files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out))]) == 0
+        main(
+            [
+                "drive",
+                *map(
+                    str,
+                    (files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out),
+                ),
+            ]
+        )
+        == 0
     )
     model = small_head(0)
     motion = read_motion(out, model)
@@ -62,7 +76,11 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     np.testing.assert_allclose(weights[-1, COLUMN["jawOpen"]], 0.9, atol=0.01)
     np.testing.assert_allclose(weights[-1, COLUMN["jawRight"]], 0.5, atol=0.01)
     weak = ["--flame", files["flame.npz"], "--strength", 0.5, "--out"]
-    for source, output in (("take.csv", "weak.csv"), ("take.csv", "weak.npz"), ("weak.npz", "weaker.csv")):
+    for source, output in (
+        ("take.csv", "weak.csv"),
+        ("take.csv", "weak.npz"),
+        ("weak.npz", "weaker.csv"),
+    ):
         source = files.get(source, tmp_path / source)
         assert main(["drive", *map(str, (source, *weak, tmp_path / output))]) == 0
     for output, share in (("weak.csv", 0.5), ("weaker.csv", 0.25)):
@@ -74,8 +92,8 @@ def test_convert_there_and_back(files, tmp_path, capsys):
 
 
 def test_the_bundled_heads_motion_needs_no_model(files, tmp_path):
-    """Catches a performance that asks for a FLAME file, a motion that does not know whose it is, and weights that are
-    fitted although they are the head's own coefficients."""
+    """Catches a performance that asks for a FLAME file, a motion that does not know whose it is,
+    and weights that are fitted although they are the head's own coefficients."""
     out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
     assert main(["drive", str(files["take.csv"]), "--out", str(out)]) == 0
     assert main(["drive", str(out), "--out", str(back)]) == 0
@@ -86,7 +104,14 @@ def test_the_bundled_heads_motion_needs_no_model(files, tmp_path):
 
 def test_render_and_export_a_performance(files, tmp_path, capsys):
     """Catches a command that takes FLAME motions alone, or options that change nothing."""
-    base = ["render", files["a.npz"], "--cameras", files["cameras.json"], "--motion", files["take.csv"]]
+    base = [
+        "render",
+        files["a.npz"],
+        "--cameras",
+        files["cameras.json"],
+        "--motion",
+        files["take.csv"],
+    ]
     base += ["--flame", files["flame.npz"], "--gain", "head=0", "--device", "cpu", "--out"]
     assert main([str(a) for a in [*base, tmp_path / "full"]]) == 0
     assert main([str(a) for a in [*base, tmp_path / "less", "--gain", "jaw=0.2"]]) == 0
@@ -97,7 +122,16 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
     assert len(full) == len(less) == 10
     assert np.abs(full[0] - less[0]).max() <= 1
     assert np.abs(full[9] - full[0]).sum() > 2 * np.abs(less[9] - less[0]).sum() > 0
-    ply = [files["a.npz"], "--format", "ply", "--timestep", 9, "--motion", files["take.csv"], "--flame"]
+    ply = [
+        files["a.npz"],
+        "--format",
+        "ply",
+        "--timestep",
+        9,
+        "--motion",
+        files["take.csv"],
+        "--flame",
+    ]
     assert main(["export", *map(str, [*ply, files["flame.npz"], "--out", tmp_path / "a.ply"])]) == 0
     assert (tmp_path / "a.ply").stat().st_size > 1000
     assert main([str(a) for a in [*base, tmp_path / "x", "--stay-trained"]]) == 2

@@ -47,8 +47,8 @@ def video(tmp_path: Path) -> Path:
 
 
 def test_a_video_becomes_a_performance(network, video, tmp_path):
-    """Catches another rate or time, a frame without a face that is taken as a face at rest, names in another order, and
-    a rotation that is not relative to the first frame."""
+    """Catches another rate or time, a frame without a face that is taken as a face at rest, names
+    in another order, and a rotation that is not relative to the first frame."""
     assert main(["drive", str(video), "--out", str(tmp_path / "a.csv")]) == 0
     take = read_performance(tmp_path / "a.csv")
     assert take.fps == pytest.approx(25, rel=1e-4)

@@ -1,4 +1,5 @@
-"""ARKit's shapes on a head of any mesh, against its own masks, the face networks, and a nonlinear solver."""
+"""ARKit's shapes on a head of any mesh, against its own masks, the face networks, and a nonlinear
+solver."""
 
 from dataclasses import replace
 
@@ -8,7 +9,12 @@ from flame.small_head import small_head
 from scipy.optimize import least_squares
 
 from stga_addon.driving.head_map import head_map, head_turns
-from stga_addon.driving.inverse import arkit_weights, captured_performance, head_angles, write_performance
+from stga_addon.driving.inverse import (
+    arkit_weights,
+    captured_performance,
+    head_angles,
+    write_performance,
+)
 from stga_addon.driving.open_motion import MotionOptions, performed
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
@@ -24,7 +30,9 @@ MOUTH_LEFT, MOUTH_RIGHT = 291, 61
 
 
 def sequence_of(model, shape=None) -> FlameSequence:
-    return FlameSequence(model, np.zeros(model.n_identity) if shape is None else shape, None, (), {}.__getitem__)
+    return FlameSequence(
+        model, np.zeros(model.n_identity) if shape is None else shape, None, (), {}.__getitem__
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +44,8 @@ def demo():
 
 @pytest.fixture(scope="module")
 def rich():
-    """The small head with 48 expressions that reach most shapes, of another identity, and its map."""
+    """The small head with 48 expressions that reach most shapes, of another identity, and its
+    map."""
     model = with_expressions(small_head(0), 48)
     sequence = sequence_of(model, np.random.default_rng(0).normal(0, 0.5, model.n_identity))
     return sequence, head_map(sequence, "rich")
@@ -47,7 +56,9 @@ def posed(sequence, found, weights) -> np.ndarray:
     row = found.parameters(weights[None])[0]
     count, zero = sequence.model.n_expression, np.zeros(3)
     frame = FlameFrame(row[:count], zero, zero, row[count : count + 3], zero, row[count + 3 :])
-    return found.points.on(flame_forward(sequence.model, sequence.shape, frame), sequence.model.faces)
+    return found.points.on(
+        flame_forward(sequence.model, sequence.shape, frame), sequence.model.faces
+    )
 
 
 def weights_of(**values: float) -> np.ndarray:
@@ -74,7 +85,8 @@ def test_points_lie_where_the_masks_are(demo):
 
 @pytest.mark.slow
 def test_points_agree_with_the_detector(shared_data):
-    """Catches a registration that slides along the face: the networks' landmarks on pictures of the same head."""
+    """Catches a registration that slides along the face: the networks' landmarks on pictures of the
+    same head."""
     pytest.importorskip("cv2")
     from stga_addon.tracking.correspondence import calibrate
     from stga_addon.tracking.face_networks import FaceNetworks
@@ -89,7 +101,8 @@ def test_points_agree_with_the_detector(shared_data):
 
 
 def test_directions(demo):
-    """Catches a jaw that closes, left for right, eyes that look the other way, and a tongue that does anything."""
+    """Catches a jaw that closes, left for right, eyes that look the other way, and a tongue that
+    does anything."""
     sequence, found = demo
     model, rest = sequence.model, posed(*demo, weights_of())
     row = {number: index for index, number in enumerate(np.flatnonzero(found.used))}
@@ -101,10 +114,16 @@ def test_directions(demo):
     assert posed(*demo, weights_of(jawLeft=1.0))[row[CHIN], 0] > rest[row[CHIN], 0] + 0.002
     np.testing.assert_allclose(posed(*demo, weights_of(tongueOut=1.0)), rest, atol=1e-12)
     assert found.reach[COLUMN["tongueOut"]] == 0
-    for name, axis, sign in (("eyeLookUpLeft", 1, 1), ("eyeLookOutLeft", 0, 1), ("eyeLookInLeft", 0, -1)):
+    for name, axis, sign in (
+        ("eyeLookUpLeft", 1, 1),
+        ("eyeLookOutLeft", 0, 1),
+        ("eyeLookInLeft", 0, -1),
+    ):
         row_ = found.parameters(weights_of(**{name: 1.0})[None])[0]
         zero = np.zeros(3)
-        frame = FlameFrame(np.zeros(model.n_expression), zero, zero, zero, zero, row_[model.n_expression + 3 :])
+        frame = FlameFrame(
+            np.zeros(model.n_expression), zero, zero, zero, zero, row_[model.n_expression + 3 :]
+        )
         ball = model.weights[:, 3] > 0.9
         before = model.v_template[ball]
         pupil = before[:, 2].argmax()
@@ -127,15 +146,19 @@ def test_combinations_against_a_free_fit(rich):
             return found.points.on(flame_forward(sequence.model, sequence.shape, frame), faces)
 
         start = found.parameters(row[None])[0, : count + 3]
-        free = least_squares(lambda values: (points(values) - wanted).ravel() * 1000, start, max_nfev=6)  # noqa: B023
+        free = least_squares(
+            lambda values: (points(values) - wanted).ravel() * 1000,  # noqa: B023
+            start,
+            max_nfev=6,
+        )
         missed.append(np.linalg.norm(posed(sequence, found, row) - wanted, axis=1).mean())
         best.append(np.linalg.norm(points(free.x) - wanted, axis=1).mean())
     assert np.mean(missed) < 1.2 * np.mean(best)  # 1.16; of FLAME 1.06 (benchmarks/driving.py)
 
 
 def test_there_and_back(rich, tmp_path):
-    """Catches weights lost on the way to a FLAME motion and back to a file: within 0.01 where the head tells them
-    apart."""
+    """Catches weights lost on the way to a FLAME motion and back to a file: within 0.01 where the
+    head tells them apart."""
     sequence, found = rich
     weights = random_poses(40, np.random.default_rng(5)) * 0.8
     head = np.random.default_rng(6).normal(0, 0.2, (40, 3))
@@ -150,9 +173,15 @@ def test_there_and_back(rich, tmp_path):
     np.testing.assert_allclose(again.times, take.times, atol=1e-4)
     np.testing.assert_allclose(again.head, head, atol=1e-5)
     error = np.abs(again.weights - effective_weights(weights)).max(axis=0)
-    sure = [COLUMN[name] for name in ARKIT_SHAPES if name.startswith(("eyeLook", "jawOpen", "jawLeft", "jawRight"))]
+    sure = [
+        COLUMN[name]
+        for name in ARKIT_SHAPES
+        if name.startswith(("eyeLook", "jawOpen", "jawLeft", "jawRight"))
+    ]
     assert error[sure].max() < 0.01
-    assert (error < 0.01).sum() >= 30, {name: round(float(e), 3) for name, e in zip(ARKIT_SHAPES, error, strict=True)}
+    assert (error < 0.01).sum() >= 30, {
+        name: round(float(e), 3) for name, e in zip(ARKIT_SHAPES, error, strict=True)
+    }
     # What cannot be told apart still looks the same.
     frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
     for number, row in enumerate(arkit_weights(frames, found, sequence)[:5]):

@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance, arkit_name, mirrored, resampled, smoothed
+from stga_addon.driving.performance import (
+    ARKIT_SHAPES,
+    COLUMN,
+    Performance,
+    arkit_name,
+    mirrored,
+    resampled,
+    smoothed,
+)
 from stga_addon.driving.read_performance import is_performance, read_performance
 from stga_addon.errors import StgaError
 
@@ -23,20 +31,30 @@ RNG = np.random.default_rng(0)
 WEIGHTS = RNG.random((6, 52)).round(4)
 
 
-def write_csv(path: Path, codes: list[str], weights: np.ndarray, header: list[str] = HEADER) -> Path:
+def write_csv(
+    path: Path, codes: list[str], weights: np.ndarray, header: list[str] = HEADER
+) -> Path:
     """A Live Link Face file; head rotation is (0.1, 0.2, 0.3) in each row."""
-    values = {**dict(zip(PASCAL, weights.T, strict=True)), **{n: np.full(len(weights), 0.0) for n in ROTATIONS}}
+    values = {
+        **dict(zip(PASCAL, weights.T, strict=True)),
+        **{n: np.full(len(weights), 0.0) for n in ROTATIONS},
+    }
     values |= {name: np.full(len(weights), 0.1 * (k + 1)) for k, name in enumerate(ROTATIONS[:3])}
-    rows = [",".join([code, "61", *(f"{values[name][n]:.6f}" for name in header[2:])]) for n, code in enumerate(codes)]
+    rows = [
+        ",".join([code, "61", *(f"{values[name][n]:.6f}" for name in header[2:])])
+        for n, code in enumerate(codes)
+    ]
     path.write_text("\n".join([",".join(header), *rows]) + "\n")
     return path
 
 
 def test_live_link_face_rows_at_half_the_timecodes_rate_over_midnight(tmp_path):
-    """Catches columns read by place, a time base guessed from the rows, and a jump of a day at midnight."""
+    """Catches columns read by place, a time base guessed from the rows, and a jump of a day at
+    midnight."""
     frames = np.arange(0, 130, 2) + 60 * 86_399 + 31  # of 60 a second
     codes = [
-        f"{n // 216000 % 24:02d}:{n // 3600 % 60:02d}:{n // 60 % 60:02d}:{n % 60:02d}.250" for n in frames.tolist()
+        f"{n // 216000 % 24:02d}:{n // 3600 % 60:02d}:{n // 60 % 60:02d}:{n % 60:02d}.250"
+        for n in frames.tolist()
     ]
     weights = np.random.default_rng(1).random((len(codes), 52)).round(5)
     swapped = HEADER.copy()
@@ -49,7 +67,8 @@ def test_live_link_face_rows_at_half_the_timecodes_rate_over_midnight(tmp_path):
 
 
 def test_lost_rows_and_rows_without_a_face(tmp_path):
-    """Catches a performance that plays faster where rows are missing, and a face of zeros where none was seen."""
+    """Catches a performance that plays faster where rows are missing, and a face of zeros where
+    none was seen."""
     codes = [f"10:00:{n // 60:02d}:{n % 60:02d}.000" for n in range(55, 65)]
     weights = np.repeat(np.linspace(0, 0.9, 10)[:, None], 52, axis=1)
     lines = write_csv(tmp_path / "take.csv", codes, weights).read_text().splitlines()
@@ -64,7 +83,9 @@ def test_lost_rows_and_rows_without_a_face(tmp_path):
 
 def test_drop_frame_timecode_keeps_time_over_a_minute(tmp_path):
     """Catches frame numbers that 29.97 timecode leaves out counted as lost frames."""
-    codes = [f"00:00:59;{n:02d}" for n in range(20, 30)] + [f"00:01:00;{n:02d}" for n in range(2, 12)]
+    codes = [f"00:00:59;{n:02d}" for n in range(20, 30)] + [
+        f"00:01:00;{n:02d}" for n in range(2, 12)
+    ]
     found = read_performance(write_csv(tmp_path / "take.csv", codes, np.zeros((20, 52))))
     np.testing.assert_allclose(np.diff(found.times), 1001 / 30000, atol=1e-9)
 
@@ -73,7 +94,9 @@ def test_fifty_one_shapes_and_a_takes_folder(tmp_path):
     """Catches a source without the tongue, and the extra files of a take's folder."""
     header = [name for name in HEADER if name != "TongueOut"]
     (tmp_path / "take").mkdir()
-    write_csv(tmp_path / "take/Slate_1.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], WEIGHTS, header)
+    write_csv(
+        tmp_path / "take/Slate_1.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], WEIGHTS, header
+    )
     write_csv(tmp_path / "take/Slate_1_neutral.csv", ["01:00:00:00.0"], WEIGHTS[:1])
     assert is_performance(tmp_path / "take")
     found = read_performance(tmp_path / "take")
@@ -87,9 +110,17 @@ def test_every_json_form_and_audio2face_csv(tmp_path):
     names = [ARKIT_SHAPES[k] for k in order]
     rows = WEIGHTS[:, order].tolist()
     categories = [[("_neutral", 0.5), *zip(names, row, strict=True)] for row in rows]
-    mediapipe = [{"blendshapes": [{"categoryName": n, "score": v} for n, v in frame]} for frame in categories]
+    mediapipe = [
+        {"blendshapes": [{"categoryName": n, "score": v} for n, v in frame]} for frame in categories
+    ]
     documents = {
-        "audio2face": {"exportFps": 25.0, "numPoses": 52, "numFrames": 6, "facsNames": names, "weightMat": rows},
+        "audio2face": {
+            "exportFps": 25.0,
+            "numPoses": 52,
+            "numFrames": 6,
+            "facsNames": names,
+            "weightMat": rows,
+        },
         "lam": {
             "names": names,
             "metadata": {"fps": 25.0},
@@ -117,8 +148,13 @@ def test_facial_mocap_lines(tmp_path):
     lines = []
     for n, row in enumerate(WEIGHTS):
         sign = "&" if n % 2 else "-"
-        fields = [f"{short[name]}{sign}{100 * value:.2f}" for name, value in zip(ARKIT_SHAPES, row, strict=True)]
-        lines.append("|".join(fields) + "|=head#90,45,-30,0.1,0.2,0.3|rightEye#1,2,3|leftEye#1,2,3|")
+        fields = [
+            f"{short[name]}{sign}{100 * value:.2f}"
+            for name, value in zip(ARKIT_SHAPES, row, strict=True)
+        ]
+        lines.append(
+            "|".join(fields) + "|=head#90,45,-30,0.1,0.2,0.3|rightEye#1,2,3|leftEye#1,2,3|"
+        )
     (tmp_path / "take.txt").write_text("\n".join(lines))
     found = read_performance(tmp_path / "take.txt")
     np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-9)
@@ -129,19 +165,27 @@ def test_facial_mocap_lines(tmp_path):
     ("change", "sentence"),
     [
         (lambda text: text.replace("JawOpen", "JawOpne"), "lacks jawOpen; it has 'JawOpne'"),
-        (lambda text: text.replace("MouthClose,", "Other,").replace("JawLeft", "X"), "lacks jawLeft, mouthClose"),
+        (
+            lambda text: text.replace("MouthClose,", "Other,").replace("JawLeft", "X"),
+            "lacks jawLeft, mouthClose",
+        ),
         (lambda text: "Timecode,JawOpen\n0,1\n", "names 1 of ARKit's 52"),
         (lambda text: text.replace("0.5", "half", 1), "expected a number"),
         (lambda text: text.replace("01:00:00:00.0", "noon"), "Timecode is 'noon'"),
         (lambda text: text.splitlines()[0], "has no row with a face"),
         (lambda text: text.replace("0.1", "91.1"), "beyond"),
         (lambda text: "", "is empty"),
-        (lambda text: re.sub("(?m)^([^,]*),(.*)$", r"\2,\1", text).rpartition(",")[0], "row 6: Timecode is ''"),
+        (
+            lambda text: re.sub("(?m)^([^,]*),(.*)$", r"\2,\1", text).rpartition(",")[0],
+            "row 6: Timecode is ''",
+        ),
     ],
 )
 def test_mistakes_are_one_sentence(tmp_path, change, sentence):
     """Catches tracebacks, and sentences that do not say which names are missing."""
-    path = write_csv(tmp_path / "take.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], np.full((6, 52), 0.5))
+    path = write_csv(
+        tmp_path / "take.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], np.full((6, 52), 0.5)
+    )
     path.write_text(change(path.read_text()))
     with pytest.raises(StgaError, match=sentence) as caught:
         read_performance(path)
@@ -152,7 +196,10 @@ def test_mistakes_are_one_sentence(tmp_path, change, sentence):
     ("document", "sentence"),
     [
         ({"names": ["jawOpen"], "frames": [[0.1, 0.2]]}, "has 2 weights, but the file names 1"),
-        ({"frames": [dict.fromkeys(ARKIT_SHAPES[:-3], 0.1)]}, "lacks noseSneerLeft, noseSneerRight"),
+        (
+            {"frames": [dict.fromkeys(ARKIT_SHAPES[:-3], 0.1)]},
+            "lacks noseSneerLeft, noseSneerRight",
+        ),
         ({"frames": [dict.fromkeys(ARKIT_SHAPES, 0.1), {}]}, "frame 2: lacks 'eyeBlinkLeft'"),
         ({"frames": [dict.fromkeys(ARKIT_SHAPES, "x")]}, "expected a number"),
         ({"other": 1}, "has no list of frames"),
@@ -168,7 +215,8 @@ def test_mistakes_in_json(tmp_path, document, sentence):
 
 
 def test_names_in_every_spelling():
-    """Catches a shape that is another tool's by its spelling, and words that only look like shapes."""
+    """Catches a shape that is another tool's by its spelling, and words that only look like
+    shapes."""
     for spelled in (
         "mouthSmileLeft",
         "MouthSmileLeft",
@@ -182,8 +230,11 @@ def test_names_in_every_spelling():
 
 
 def test_mirror_and_smoothing():
-    """Catches a pair that is not exchanged, and smoothing that moves a take in time or changes a held pose."""
-    base = Performance(np.arange(40) / 30, np.zeros((40, 52)), np.tile([0.1, 0.2, 0.3], (40, 1)), 30.0)
+    """Catches a pair that is not exchanged, and smoothing that moves a take in time or changes a
+    held pose."""
+    base = Performance(
+        np.arange(40) / 30, np.zeros((40, 52)), np.tile([0.1, 0.2, 0.3], (40, 1)), 30.0
+    )
     base.weights[20, COLUMN["eyeBlinkLeft"]] = 1.0
     base.weights[:, COLUMN["jawOpen"]] = 0.4
     other = mirrored(base)
@@ -202,9 +253,14 @@ def test_damaged_files_are_one_sentence(tmp_path):
     """Catches tracebacks for bytes that are lost, doubled or changed anywhere in a file."""
     rng = np.random.default_rng(8)
     whole = {
-        ".csv": write_csv(tmp_path / "a.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], WEIGHTS).read_bytes(),
-        ".json": json.dumps({"fps": 25, "names": ARKIT_SHAPES, "frames": WEIGHTS.tolist()}).encode(),
-        ".txt": "|".join(f"{name}-{n}" for n, name in enumerate(ARKIT_SHAPES)).encode() + b"|=head#1,2,3,4,5,6|\n",
+        ".csv": write_csv(
+            tmp_path / "a.csv", [f"01:00:00:{n:02d}.0" for n in range(6)], WEIGHTS
+        ).read_bytes(),
+        ".json": json.dumps(
+            {"fps": 25, "names": ARKIT_SHAPES, "frames": WEIGHTS.tolist()}
+        ).encode(),
+        ".txt": "|".join(f"{name}-{n}" for n, name in enumerate(ARKIT_SHAPES)).encode()
+        + b"|=head#1,2,3,4,5,6|\n",
     }
     refused = 0
     for number in range(600):

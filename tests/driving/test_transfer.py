@@ -23,14 +23,19 @@ FRAME = FlameFrame(np.zeros(4), ZERO, ZERO, ZERO, ZERO, np.zeros(6))
 
 
 def talking(bias: np.ndarray, count: int = 60) -> list[FlameFrame]:
-    """Quiet for a third of the time, on top of a bias that the person's own face leaves in the coefficients."""
+    """Quiet for a third of the time, on top of a bias that the person's own face leaves in the
+    coefficients."""
     time = np.arange(count)
     moves = np.where(time < count // 3, 0, np.sin(time))[:, None] * [2.0, -1.0, 0.5, 0.0]
-    return [replace(FRAME, expr=bias + row, jaw_pose=np.array([0.1 * max(row[0], 0), 0, 0])) for row in moves]
+    return [
+        replace(FRAME, expr=bias + row, jaw_pose=np.array([0.1 * max(row[0], 0), 0, 0]))
+        for row in moves
+    ]
 
 
 def test_the_performers_own_face_is_left_out():
-    """Catches a neutral taken from the middle of speech, and one that keeps the other person's face."""
+    """Catches a neutral taken from the middle of speech, and one that keeps the other person's
+    face."""
     bias, own = np.array([1.5, -0.7, 0.3, 2.0]), np.array([0.2, 0.0, -0.1, 0.0])
     frames = talking(bias)
     theirs = quiet_neutral(frames)
@@ -43,7 +48,8 @@ def test_the_performers_own_face_is_left_out():
 
 
 def test_a_quiet_face_needs_no_order():
-    """Catches a neutral that is sought by speed, which single expressions recorded one after another do not have."""
+    """Catches a neutral that is sought by speed, which single expressions recorded one after
+    another do not have."""
     frames = talking(np.array([0.5, 0.0, 0.0, 0.0]), 3000)
     shuffled = [frames[row] for row in np.random.default_rng(0).permutation(len(frames))]
     np.testing.assert_allclose(quiet_neutral(shuffled)["face"], [0.5, 0, 0, 0], atol=1e-12)
@@ -59,7 +65,9 @@ def test_a_motion_begins_on_the_heads_own_face(choice):
     moved, _ = adapted(talking(rest), MotionOptions(neutral=choice), trained)
     expected = own[0].expr if choice == "first" else own[1].expr
     np.testing.assert_allclose(moved[0].expr, expected, atol=1e-12)
-    np.testing.assert_allclose(moved[-1].expr - moved[0].expr, talking(rest)[-1].expr - rest, atol=1e-12)
+    np.testing.assert_allclose(
+        moved[-1].expr - moved[0].expr, talking(rest)[-1].expr - rest, atol=1e-12
+    )
 
 
 def test_a_resting_face_that_is_not_zero():
@@ -76,7 +84,8 @@ def test_a_resting_face_that_is_not_zero():
 
 
 def test_led_back_to_what_was_trained():
-    """Catches a motion that is changed where it was trained, is led beyond the range, or is cut off without motion."""
+    """Catches a motion that is changed where it was trained, is led beyond the range, or is cut off
+    without motion."""
     trained = trained_range(talking(np.zeros(4), 200))
     inside = talking(np.zeros(4))
     for before, after in zip(inside, led_back(inside, trained), strict=True):

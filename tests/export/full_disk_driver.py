@@ -1,7 +1,7 @@
 """Exports every format to a disk that is full; run by test_formats.py.
 
-`full_disk_driver.py DISK` prints, for each format and share of the room that it needs, its message and what it left.
-DISK must be a small mount that nobody else sees.
+`full_disk_driver.py DISK` prints, for each format and share of the room that it needs, its message
+and what it left. DISK must be a small mount that nobody else sees.
 """
 
 import json
@@ -16,7 +16,8 @@ from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 
 SHARES = {".usdz": (0.0, 0.6, 1.4)}
-"""Of the size of the files, per suffix: how much room there is. A .usdz is packed from a file as large as itself."""
+"""Of the size of the files, per suffix: how much room there is. A .usdz is packed from a file as
+large as itself."""
 
 
 def main(disk: Path) -> list[dict[str, object]]:
@@ -36,8 +37,18 @@ def main(disk: Path) -> list[dict[str, object]]:
                     message = str(error)
                 except Exception as error:
                     message = f"not a StgaError: {error!r}"
-                left = [str(item.relative_to(disk)) for item in disk.rglob("*") if item.name != "filler"]
-                found.append({"format": format, "path": str(path), "share": share, "message": message, "left": left})
+                left = [
+                    str(item.relative_to(disk)) for item in disk.rglob("*") if item.name != "filler"
+                ]
+                found.append(
+                    {
+                        "format": format,
+                        "path": str(path),
+                        "share": share,
+                        "message": message,
+                        "left": left,
+                    }
+                )
                 (disk / "filler").unlink()
                 empty(path.parent)
     return found

@@ -20,7 +20,10 @@ from stga_addon.flame.sequence import FlameSequence, neutral_mesh, read_motion, 
 VERTICES, IDENTITY, EXPRESSION = 20, 6, 4
 PLY_HEADER = (
     "ply\nformat binary_little_endian 1.0\nelement vertex 50\n"
-    + "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"))
+    + "".join(
+        f"property float {name}\n"
+        for name in ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+    )
     + "".join(f"property float f_rest_{i}\n" for i in range(45))
     + "property float opacity\n"
     + "".join(f"property float scale_{i}\n" for i in range(3))
@@ -31,7 +34,8 @@ PLY_HEADER = (
 
 @pytest.fixture
 def sequence() -> FlameSequence:
-    """A model of twenty vertices that moves; timesteps with a gap, a dynamic offset in one of them."""
+    """A model of twenty vertices that moves; timesteps with a gap, a dynamic offset in one of
+    them."""
     rng = np.random.default_rng(5)
     template, faces = random_mesh(5, VERTICES)
     model = FlameModel(
@@ -49,11 +53,15 @@ def sequence() -> FlameSequence:
         return rng.normal(size=shape).astype(np.float32).astype(np.float64) * 0.25
 
     frames = {
-        timestep: FlameFrame(float32(EXPRESSION), float32(3), float32(3), float32(3), float32(3), float32(6))
+        timestep: FlameFrame(
+            float32(EXPRESSION), float32(3), float32(3), float32(3), float32(3), float32(6)
+        )
         for timestep in (0, 2, 5)
     }
     frames[2] = replace(frames[2], dynamic_offset=float32(VERTICES, 3))
-    return FlameSequence(model, float32(IDENTITY), float32(VERTICES, 3), (0, 2, 5), frames.__getitem__)
+    return FlameSequence(
+        model, float32(IDENTITY), float32(VERTICES, 3), (0, 2, 5), frames.__getitem__
+    )
 
 
 def avatar_on(sequence: FlameSequence, convention: str) -> Avatar:
@@ -104,25 +112,32 @@ def test_sequence_without_offsets_writes_zeros(tmp_path, sequence):
 
 
 def bound_splats(path: Path) -> Splats:
-    """Splats in the "gaussian_avatars" convention, with the triangles that the property binding_0 names."""
+    """Splats in the "gaussian_avatars" convention, with the triangles that the property binding_0
+    names."""
     return replace(read_ply(path), face=read_vertices(path)["binding_0"].astype(np.int32))
 
 
 def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
-    """Catches a motion or binding that has changed on the way: every frame's world splats must be the same."""
+    """Catches a motion or binding that has changed on the way: every frame's world splats must be
+    the same."""
     avatar = avatar_on(sequence, "gaussian_avatars")
     write_gaussian_avatars(tmp_path, avatar, sequence)
     splats = bound_splats(tmp_path / "point_cloud.ply")
     motion = read_motion(tmp_path / "flame_param.npz", sequence.model)
     for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound"):
-        np.testing.assert_array_equal(getattr(splats, name), getattr(avatar.splats, name), err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(splats, name), getattr(avatar.splats, name), err_msg=name
+        )
         assert getattr(splats, name).dtype == getattr(avatar.splats, name).dtype
     for mine, timestep in zip(motion.timesteps, sequence.timesteps, strict=True):
-        np.testing.assert_allclose(sequence_mesh(motion, mine), sequence_mesh(sequence, timestep), atol=1e-12)
+        np.testing.assert_allclose(
+            sequence_mesh(motion, mine), sequence_mesh(sequence, timestep), atol=1e-12
+        )
 
 
 def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) and covariance (3, 3) of one splat on its triangle (3, 3), by GaussianAvatars' definition."""
+    """Position (3,) and covariance (3, 3) of one splat on its triangle (3, 3), by GaussianAvatars'
+    definition."""
     p, q, r = corners
     first = (q - p) / np.linalg.norm(q - p)
     normal = np.cross(q - p, r - p)
@@ -137,11 +152,16 @@ def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.nd
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
-    """Catches a pair that leaves out what strain color adds at rest: the least compression that it follows is not 0."""
+    """Catches a pair that leaves out what strain color adds at rest: the least compression that it
+    follows is not 0."""
     avatar = avatar_on(sequence, convention)
     strain_color = np.random.default_rng(1).normal(0, 0.2, (50, 3, 3)).astype(np.float32)
-    limits = np.broadcast_to(np.array([[-1, -1, -1], [-0.2, -0.2, 1]], np.float32), (len(avatar.faces), 2, 3)).copy()
-    avatar = replace(avatar, splats=replace(avatar.splats, strain_color=strain_color), strain_range=limits)
+    limits = np.broadcast_to(
+        np.array([[-1, -1, -1], [-0.2, -0.2, 1]], np.float32), (len(avatar.faces), 2, 3)
+    ).copy()
+    avatar = replace(
+        avatar, splats=replace(avatar.splats, strain_color=strain_color), strain_range=limits
+    )
     write_gaussian_avatars(tmp_path, avatar, sequence)
     written = bound_splats(tmp_path / "point_cloud.ply").sh
     added = -0.2 * (strain_color[:, 0] + strain_color[:, 1]) / 0.28209479177387814
@@ -150,7 +170,8 @@ def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
 
 
 def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence):
-    """Catches a conversion that is only approximately right, checked by the viewer's own arithmetic."""
+    """Catches a conversion that is only approximately right, checked by the viewer's own
+    arithmetic."""
     avatar = avatar_on(sequence, "stga")
     write_gaussian_avatars(tmp_path, avatar, sequence)
     splats = bound_splats(tmp_path / "point_cloud.ply")
@@ -159,18 +180,26 @@ def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence
     np.testing.assert_array_equal(splats.face, avatar.splats.face)
     np.testing.assert_array_equal(splats.sh, avatar.splats.sh)
     for i, face in enumerate(splats.face):
-        row = {name: getattr(splats, name)[i].astype(np.float64) for name in ("xyz", "rotation", "log_scale")}
+        row = {
+            name: getattr(splats, name)[i].astype(np.float64)
+            for name in ("xyz", "rotation", "log_scale")
+        }
         position, covariance = viewer_world(row, neutral[avatar.faces[face]])
-        axes = Rotation.from_quat(world.rotation[i, [1, 2, 3, 0]]).as_matrix() * np.exp(world.log_scale[i])
+        axes = Rotation.from_quat(world.rotation[i, [1, 2, 3, 0]]).as_matrix() * np.exp(
+            world.log_scale[i]
+        )
         np.testing.assert_allclose(position, world.xyz[i], atol=2e-6)
         np.testing.assert_allclose(covariance, axes @ axes.T, atol=5e-6 * np.abs(covariance).max())
 
 
 def test_conversion_there_and_back_keeps_precision_far_from_the_origin(sequence):
-    """Catches a detour through world coordinates, which costs digits where the head is meters away."""
+    """Catches a detour through world coordinates, which costs digits where the head is meters
+    away."""
     avatar = avatar_on(sequence, "stga")
     far = replace(avatar, neutral=avatar.neutral + np.float32(64))
-    there = replace(far, splats=in_convention(far, "gaussian_avatars"), convention="gaussian_avatars")
+    there = replace(
+        far, splats=in_convention(far, "gaussian_avatars"), convention="gaussian_avatars"
+    )
     back = in_convention(there, "stga")
     np.testing.assert_allclose(back.xyz, avatar.splats.xyz, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(back.log_scale, avatar.splats.log_scale, atol=1e-5)

@@ -1,4 +1,5 @@
-"""glTF: against the extension's specification, by trimesh, and by the loader of three.js where it is installed."""
+"""glTF: against the extension's specification, by trimesh, and by the loader of three.js where it
+is installed."""
 
 import json
 import os
@@ -23,7 +24,8 @@ COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def parsed(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The document and the attributes of the only primitive; checks what glTF demands of the container."""
+    """The document and the attributes of the only primitive; checks what glTF demands of the
+    container."""
     data = path.read_bytes()
     magic, version, length, size, kind = struct.unpack("<4sIII4s", data[:20])
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -35,7 +37,9 @@ def parsed(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     assert binary_size == document["buffers"][0]["byteLength"] == len(data) - 28 - size
     binary = data[28 + size :]
     primitive = document["meshes"][0]["primitives"][0]
-    return document, {name: column(document, binary, i) for name, i in primitive["attributes"].items()}
+    return document, {
+        name: column(document, binary, i) for name, i in primitive["attributes"].items()
+    }
 
 
 def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
@@ -45,19 +49,23 @@ def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
     dtype = np.dtype({FLOAT: "<f4", UNSIGNED_BYTE: "u1"}[accessor["componentType"]])
     assert view["byteOffset"] % 4 == 0
     assert view["byteLength"] == accessor["count"] * width * dtype.itemsize
-    return np.frombuffer(binary, dtype, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)
+    return np.frombuffer(binary, dtype, accessor["count"] * width, view["byteOffset"]).reshape(
+        -1, width
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_keeps_the_specification(avatar, tmp_path, degree):
-    """Catches missing fields, partly defined degrees, wrong component types, and values out of their range."""
+    """Catches missing fields, partly defined degrees, wrong component types, and values out of
+    their range."""
     avatar.splats.__dict__.update(random_splats(1, 50, 30, degree).__dict__)
     path = tmp_path / "a.glb"
     assert export_avatar(path, avatar, "gltf", [(0, avatar.neutral)]) == [path]
     document, attributes = parsed(path)
     assert document["asset"]["version"] == "2.0"
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
-    assert document["scenes"][document["scene"]] == {"nodes": [0]}  # viewers show nothing where no scene is named
+    # viewers show nothing where no scene is named
+    assert document["scenes"][document["scene"]] == {"nodes": [0]}
     primitive = document["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0
     extension = primitive["extensions"]["KHR_gaussian_splatting"]
@@ -67,7 +75,9 @@ def test_keeps_the_specification(avatar, tmp_path, degree):
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
-    coefficients = {f"SH_DEGREE_{n}_COEF_{i}": "VEC3" for n in range(degree + 1) for i in range(2 * n + 1)}
+    coefficients = {
+        f"SH_DEGREE_{n}_COEF_{i}": "VEC3" for n in range(degree + 1) for i in range(2 * n + 1)
+    }
     expected = {PREFIX + name: kind for name, kind in (SHAPES | coefficients).items()}
     assert set(attributes) == {"POSITION", "COLOR_0", *expected}
     for name, kind in expected.items():
@@ -76,7 +86,9 @@ def test_keeps_the_specification(avatar, tmp_path, degree):
     position = document["accessors"][primitive["attributes"]["POSITION"]]
     np.testing.assert_array_equal(position["min"], attributes["POSITION"].min(axis=0))
     np.testing.assert_array_equal(position["max"], attributes["POSITION"].max(axis=0))
-    np.testing.assert_allclose(np.linalg.norm(attributes[PREFIX + "ROTATION"], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(attributes[PREFIX + "ROTATION"], axis=1), 1, atol=1e-6
+    )
     assert attributes[PREFIX + "SCALE"].min() >= 0
     assert 0 <= attributes[PREFIX + "OPACITY"].min() <= attributes[PREFIX + "OPACITY"].max() <= 1
 
@@ -101,7 +113,8 @@ def test_renders_equal(avatar, tmp_path):
 
 
 def test_points_where_the_extension_is_unknown(avatar, tmp_path):
-    """Catches a file that an ordinary reader of glTF refuses, and fallback colors that are not linear."""
+    """Catches a file that an ordinary reader of glTF refuses, and fallback colors that are not
+    linear."""
     export_avatar(tmp_path / "a.glb", avatar, "gltf", [(0, avatar.neutral)])
     (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     expected = to_world(avatar.splats, avatar.frames(avatar.neutral))
@@ -109,7 +122,8 @@ def test_points_where_the_extension_is_unknown(avatar, tmp_path):
     color = np.clip(0.5 + SH_C0 * expected.sh[:, 0], 0, 1)
     display = np.asarray(cloud.colors)[:, :3] / 255
     encoded = np.where(display <= 0.0031308, 12.92 * display, 1.055 * display ** (1 / 2.4) - 0.055)
-    np.testing.assert_allclose(encoded, color, atol=0.03)  # 8 bits of linear light are coarse in the dark
+    # 8 bits of linear light are coarse in the dark
+    np.testing.assert_allclose(encoded, color, atol=0.03)
 
 
 LOAD = """
@@ -154,8 +168,12 @@ def test_three_reads_it(avatar, tmp_path):
     axes = quaternion_to_matrix(world.unit_rotations()) * world.scales()[:, None]
     covariance = axes @ axes.transpose(0, 2, 1)
     rows, columns = np.triu_indices(3)
-    np.testing.assert_allclose(np.reshape(found["covariance"], (-1, 6)), covariance[:, rows, columns], atol=1e-7)
-    np.testing.assert_allclose(np.reshape(found["color"], (-1, 4))[:, 3], world.opacities() * 255, atol=0.51)
+    np.testing.assert_allclose(
+        np.reshape(found["covariance"], (-1, 6)), covariance[:, rows, columns], atol=1e-7
+    )
+    np.testing.assert_allclose(
+        np.reshape(found["color"], (-1, 4))[:, 3], world.opacities() * 255, atol=0.51
+    )
     assert "sphericalHarmonics3" in found
 
 

@@ -15,7 +15,8 @@ NAMES = {
     "i4": ("int", "int32"), "u4": ("uint", "uint32"), "f4": ("float", "float32"), "f8": ("double", "float64"),
 }  # fmt: skip
 CODES = {name: code for code, names in NAMES.items() for name in names}
-"""Scalar types of PLY by both of their names: Turk's description of the format, and those of newer writers."""
+"""Scalar types of PLY by both of their names: Turk's description of the format, and those of newer
+writers."""
 ARRAYS = ("xyz", "rotation", "log_scale", "opacity", "sh")
 
 
@@ -24,22 +25,44 @@ def world_splats(count: int = 20, sh_degree: int = 3) -> Splats:
     return replace(splats, unbound=np.zeros(count, bool))
 
 
-def by_hand(kind: str, properties: dict[str, str], rows: list[dict[str, float]], before: str = "") -> bytes:
-    """A PLY file put together without the code under test; `before` is header text of an earlier element."""
-    lines = ["ply", f"format {kind} 1.0", "comment made by hand, Zoë"] + ([before] if before else [])
-    lines += [f"element vertex {len(rows)}", *(f"property {t} {name}" for name, t in properties.items()), "end_header"]
+def by_hand(
+    kind: str, properties: dict[str, str], rows: list[dict[str, float]], before: str = ""
+) -> bytes:
+    """A PLY file put together without the code under test; `before` is header text of an earlier
+    element."""
+    lines = ["ply", f"format {kind} 1.0", "comment made by hand, Zoë"] + (
+        [before] if before else []
+    )
+    lines += [
+        f"element vertex {len(rows)}",
+        *(f"property {t} {name}" for name, t in properties.items()),
+        "end_header",
+    ]
     if kind == "ascii":
-        body = "".join(" ".join(repr(float(row[name])) for name in properties) + "\n" for row in rows).encode()
+        body = "".join(
+            " ".join(repr(float(row[name])) for name in properties) + "\n" for row in rows
+        ).encode()
     else:
         order = "<" if "little" in kind else ">"
         body = b"".join(
-            np.array(row[name], order + CODES[t]).tobytes() for row in rows for name, t in properties.items()
+            np.array(row[name], order + CODES[t]).tobytes()
+            for row in rows
+            for name, t in properties.items()
         )
     return "\n".join([*lines, ""]).encode() + body
 
 
 def layout(rest: int) -> list[str]:
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity"]
+    names = [
+        "x",
+        "y",
+        "z",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        *(f"f_rest_{i}" for i in range(rest)),
+        "opacity",
+    ]
     return names + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
 
 
@@ -86,7 +109,9 @@ def test_file_is_the_standard_layout(tmp_path):
     splats = world_splats(3)
     write_ply(tmp_path / "a.ply", splats)
     head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
-    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property float")]
+    names = [
+        line.split()[-1] for line in head.decode().splitlines() if line.startswith("property float")
+    ]
     standard = ["x", "y", "z", "nx", "ny", "nz", *layout(45)[3:]]
     assert names == standard
     assert head.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n")
@@ -95,7 +120,9 @@ def test_file_is_the_standard_layout(tmp_path):
     for channel in range(3):
         np.testing.assert_array_equal(column[f"f_dc_{channel}"], splats.sh[:, 0, channel])
         for k in range(15):
-            np.testing.assert_array_equal(column[f"f_rest_{channel * 15 + k}"], splats.sh[:, 1 + k, channel])
+            np.testing.assert_array_equal(
+                column[f"f_rest_{channel * 15 + k}"], splats.sh[:, 1 + k, channel]
+            )
     np.testing.assert_array_equal(column["opacity"], splats.opacity)
     np.testing.assert_array_equal(column["rot_0"], splats.rotation[:, 0])
     np.testing.assert_array_equal(column["scale_2"], splats.log_scale[:, 2])
@@ -113,11 +140,15 @@ def test_trimesh_reads_the_positions(tmp_path):
 @pytest.mark.parametrize("rest", [0, 9, 24, 45])
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_foreign_files_of_every_degree_and_kind(tmp_path, kind, rest):
-    """Catches a wrong split of f_rest into channels, byte order, and dependence on the properties' order."""
+    """Catches a wrong split of f_rest into channels, byte order, and dependence on the properties'
+    order."""
     names = layout(rest)
     rows = numbered_rows(names)
     shuffled = np.random.default_rng(0).permutation([*names, "binding_0", "red"]).tolist()
-    kinds = {name: {"red": "uchar", "binding_0": "int", "x": "double"}.get(name, "float") for name in shuffled}
+    kinds = {
+        name: {"red": "uchar", "binding_0": "int", "x": "double"}.get(name, "float")
+        for name in shuffled
+    }
     content = by_hand(kind, kinds, [row | {"binding_0": 7, "red": 255} for row in rows])
     (tmp_path / "a.ply").write_bytes(content)
     splats = read_ply(tmp_path / "a.ply")
@@ -135,10 +166,13 @@ def test_foreign_files_of_every_degree_and_kind(tmp_path, kind, rest):
 
 @pytest.mark.parametrize("type_", CODES)
 def test_numbers_of_every_type(tmp_path, type_):
-    """Catches a type by one of its names that is unknown, or taken for another: what follows it is then shifted."""
+    """Catches a type by one of its names that is unknown, or taken for another: what follows it is
+    then shifted."""
     names = layout(0)
     kinds = {"more": type_, **dict.fromkeys(names, "float"), "x": type_}
-    content = by_hand("binary_big_endian", kinds, [row | {"more": 1} for row in numbered_rows(names)])
+    content = by_hand(
+        "binary_big_endian", kinds, [row | {"more": 1} for row in numbered_rows(names)]
+    )
     (tmp_path / "a.ply").write_bytes(content)
     assert read_ply(tmp_path / "a.ply").xyz.tolist() == [[0, 1, 2], [100, 101, 102]]
 
@@ -147,7 +181,9 @@ def test_elements_before_and_after_the_vertices_are_skipped(tmp_path):
     """Catches reading vertices from the start of the data where another element comes first."""
     names = layout(0)
     before = "element camera 2\nproperty float a\nproperty uchar b"
-    content = by_hand("binary_little_endian", dict.fromkeys(names, "float"), numbered_rows(names), before)
+    content = by_hand(
+        "binary_little_endian", dict.fromkeys(names, "float"), numbered_rows(names), before
+    )
     head, mark, body = content.partition(b"end_header\n")
     head += b"element face 1\nproperty list uchar int vertex_indices\n"
     (tmp_path / "a.ply").write_bytes(head + mark + b"\xff" * 10 + body + b"\x03" + bytes(12))
@@ -198,7 +234,10 @@ def ascii_head(body: str) -> bytes:
         (head("element vertex 1\n" + GOOD.replace("opacity", "density")) + bytes(56), "'opacity'"),
         (head("element vertex 1\n" + GOOD.replace("scale_2", "s2")) + bytes(56), "'scale_2'"),
         (head("element vertex 1\n" + GOOD + "property float f_rest_0\n") + bytes(60), "f_rest"),
-        (head("element vertex 1\n" + GOOD) + b"\x00\x00\xc0\x7f" + bytes(52), "'x' holds a value that is not finite"),
+        (
+            head("element vertex 1\n" + GOOD) + b"\x00\x00\xc0\x7f" + bytes(52),
+            "'x' holds a value that is not finite",
+        ),
         (ascii_head("element vertex 1\n" + GOOD) + b"1 2 three\n" * 9, "numbers"),
         (ascii_head("element vertex 2\n" + GOOD) + b"1 1\n" * 14, "shape"),
         (ascii_head("element vertex 90000000\n" + GOOD) + b"1 " * 14, "truncated"),

@@ -1,4 +1,5 @@
-"""SPZ: read by gsply where it is installed, by a reader written from the specification, rendered as it was."""
+"""SPZ: read by gsply where it is installed, by a reader written from the specification, rendered as
+it was."""
 
 import gzip
 import struct
@@ -17,7 +18,8 @@ from stga_addon.export.spz import write_spz
 
 
 def read(path: Path) -> tuple[Splats, int]:
-    """Splats and flags of a file of version 3, one splat after the other, by Niantic's description of the format."""
+    """Splats and flags of a file of version 3, one splat after the other, by Niantic's description
+    of the format."""
     data = gzip.decompress(path.read_bytes())
     magic, version, count, degree, bits, flags, reserved = struct.unpack("<4sIIBBBB", data[:16])
     assert (magic, version, reserved) == (b"NGSP", 3, 0)
@@ -29,7 +31,8 @@ def read(path: Path) -> tuple[Splats, int]:
         offset += count * width
     position, alpha, color, scale, rotation, sh = parts
     xyz = [
-        [int.from_bytes(p[i : i + 3].tobytes(), "little", signed=True) / 2**bits for i in (0, 3, 6)] for p in position
+        [int.from_bytes(p[i : i + 3].tobytes(), "little", signed=True) / 2**bits for i in (0, 3, 6)]
+        for p in position
     ]
     opacity = np.clip(alpha[:, 0] / 255, 1e-6, 1 - 1e-6)
     base = (color / 255 - 0.5) / 0.15
@@ -47,7 +50,8 @@ def read(path: Path) -> tuple[Splats, int]:
 
 
 def quaternion(row: np.ndarray) -> list[float]:
-    """wxyz of four bytes: two bits name the largest of x, y, z, w; the others have a sign and nine bits."""
+    """wxyz of four bytes: two bits name the largest of x, y, z, w; the others have a sign and nine
+    bits."""
     packed = int.from_bytes(row.tobytes(), "little")
     largest, fields = packed >> 30, [packed >> shift & 1023 for shift in (20, 10, 0)]
     small = [(-1 if field >> 9 else 1) * (field & 511) / 511 / 2**0.5 for field in fields]

@@ -1,4 +1,5 @@
-"""USD: read back by USD itself, checked by its validators and by what they do not look at, rendered equal."""
+"""USD: read back by USD itself, checked by its validators and by what they do not look at, rendered
+equal."""
 
 import sys
 from collections.abc import Iterator
@@ -61,12 +62,17 @@ def splats_at(stage: Any, time: float) -> Splats:
 @pytest.mark.parametrize("color", ["constant", "strain"])
 @pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
 def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
-    """Catches wrong quaternion order, activations, coefficient order, frames off by one, and strain left out."""
+    """Catches wrong quaternion order, activations, coefficient order, frames off by one, and strain
+    left out."""
     path = tmp_path / f"a{suffix}"
     stage_of = avatar if color == "constant" else strained(avatar)
     assert export_avatar(path, stage_of, "usd", moved(avatar), fps=FPS) == [path]
     stage = opened(path)
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (3, 7, FPS)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (
+        3,
+        7,
+        FPS,
+    )
     pictures = []
     for frame, mesh in moved(avatar):
         expected = to_world(stage_of.splats, stage_of.frames(mesh))
@@ -80,8 +86,11 @@ def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
 
 
 def test_valid(avatar, tmp_path):
-    """Catches what USD's validators find, and what they do not: units, axis, hints, an extent that is too small."""
-    validation = pytest.importorskip("pxr.UsdValidation", reason="the package usd-core is not installed")
+    """Catches what USD's validators find, and what they do not: units, axis, hints, an extent that
+    is too small."""
+    validation = pytest.importorskip(
+        "pxr.UsdValidation", reason="the package usd-core is not installed"
+    )
     from pxr import UsdGeom
 
     path = tmp_path / "a.usdz"
@@ -89,11 +98,15 @@ def test_valid(avatar, tmp_path):
     stage = opened(path)
     validators = validation.ValidationRegistry().GetOrLoadAllValidators()
     assert validators
-    assert [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)] == []
+    assert [
+        error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)
+    ] == []
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
     assert str(stage.GetDefaultPrim().GetPath()) == "/Avatar"
     prim = stage.GetPrimAtPath("/Avatar/Splats")
-    values = {name: prim.GetAttribute(name).Get() for name in ("projectionModeHint", "sortingModeHint")}
+    values = {
+        name: prim.GetAttribute(name).Get() for name in ("projectionModeHint", "sortingModeHint")
+    }
     assert values == {"projectionModeHint": "perspective", "sortingModeHint": "zDepth"}
     for frame, mesh in moved(avatar):
         world = to_world(avatar.splats, avatar.frames(mesh))
@@ -113,7 +126,9 @@ def test_size_is_known_before(avatar, tmp_path, color):
     avatar = replace(avatar, splats=avatar.splats.rows(many))
     avatar = avatar if color == "constant" else strained(avatar)
     export_avatar(tmp_path / "a.usdc", avatar, "usd", moved(avatar, (0, 1, 2, 3)))
-    assert FORMATS["usd"].size(avatar, 4) == pytest.approx((tmp_path / "a.usdc").stat().st_size, rel=0.02)
+    assert FORMATS["usd"].size(avatar, 4) == pytest.approx(
+        (tmp_path / "a.usdc").stat().st_size, rel=0.02
+    )
 
 
 def test_nothing_is_left_of_an_export_that_ends_early(avatar, tmp_path):
@@ -131,7 +146,8 @@ def test_nothing_is_left_of_an_export_that_ends_early(avatar, tmp_path):
 
 
 def test_mistakes_are_sentences(avatar, tmp_path, monkeypatch):
-    """Catches a traceback where USD is not installed, or for a name that USD takes for another format."""
+    """Catches a traceback where USD is not installed, or for a name that USD takes for another
+    format."""
     with pytest.raises(StgaError, match=r"a\.abc: expected a name that ends in \.usdc or \.usdz"):
         export_avatar(tmp_path / "a.abc", avatar, "usd", moved(avatar))
     for name in [name for name in sys.modules if name.partition(".")[0] == "pxr"]:

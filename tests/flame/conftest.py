@@ -1,4 +1,5 @@
-"""A tiny head in FLAME's format, made of random numbers: no structure that a wrong index could hide behind."""
+"""A tiny head in FLAME's format, made of random numbers: no structure that a wrong index could hide
+behind."""
 
 from typing import Any
 

@@ -37,24 +37,33 @@ def open_flame(shared_data: Path) -> FlameModel:
 
 
 def jaw_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V,) how much each vertex follows the jaw: 1 at chin and lower lip, 0 above the lips, as smooth as possible."""
+    """(V,) how much each vertex follows the jaw: 1 at chin and lower lip, 0 above the lips, as
+    smooth as possible."""
     x, y, z = vertices.T
     inner = np.isin(np.arange(len(vertices)), open_edges(faces))
     fixed = (y > -0.036) | (z < 0) | (y < -0.11)
-    moved = ((y < -0.05) & (z > 0.045) & (np.abs(x) < 0.025) & (y > -0.09)) | (inner & (z > 0.03) & (y < -0.053))
+    moved = ((y < -0.05) & (z > 0.045) & (np.abs(x) < 0.025) & (y > -0.09)) | (
+        inner & (z > 0.03) & (y < -0.053)
+    )
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.concatenate([edges, edges[:, ::-1]])
     adjacency = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2).tocsr()
     laplacian = diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
     free = ~(fixed | moved)
     weights = np.where(moved & ~fixed, 1.0, 0.0)
-    weights[free] = spsolve(laplacian[free][:, free].tocsc(), -(laplacian[free][:, ~free] @ weights[~free]))
+    weights[free] = spsolve(
+        laplacian[free][:, free].tocsc(), -(laplacian[free][:, ~free] @ weights[~free])
+    )
     return np.clip(weights, 0, 1)
 
 
 def open_edges(faces: np.ndarray) -> np.ndarray:
     """Vertices (n,) of the edges (directed) that one triangle has alone."""
-    edges = [tuple(edge) for face in faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)]
+    edges = [
+        tuple(edge)
+        for face in faces.tolist()
+        for edge in zip(face, face[1:] + face[:1], strict=True)
+    ]
     known = set(edges)
     return np.unique([edge for edge in edges if edge[::-1] not in known])
 
@@ -67,16 +76,24 @@ def jaw_opened(model: FlameModel, degrees: float, shape: np.ndarray | None = Non
 
 
 def crossings(vertices: np.ndarray, skin: np.ndarray, teeth: np.ndarray) -> int:
-    """How many pairs of an edge of one and a triangle of the other, of two sets of triangles, meet."""
+    """How many pairs of an edge of one and a triangle of the other, of two sets of triangles,
+    meet."""
     return _pierced(vertices, teeth, skin) + _pierced(vertices, skin, teeth)
 
 
 def _pierced(vertices: np.ndarray, edged: np.ndarray, pierced: np.ndarray) -> int:
-    edges = np.unique(np.sort(np.concatenate([edged[:, [0, 1]], edged[:, [1, 2]], edged[:, [2, 0]]]), axis=1), axis=0)
+    edges = np.unique(
+        np.sort(np.concatenate([edged[:, [0, 1]], edged[:, [1, 2]], edged[:, [2, 0]]]), axis=1),
+        axis=0,
+    )
     ends, corners = vertices[edges], vertices[pierced]
     ends, corners = _near(ends, corners), _near(corners, ends)
     start, direction = ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None]
-    origin, u, v = corners[None, :, 0], (corners[:, 1] - corners[:, 0])[None], (corners[:, 2] - corners[:, 0])[None]
+    origin, u, v = (
+        corners[None, :, 0],
+        (corners[:, 1] - corners[:, 0])[None],
+        (corners[:, 2] - corners[:, 0])[None],
+    )
     across = np.cross(direction, v)
     determinant = (across * u).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -101,11 +118,15 @@ def covered_from_front(vertices: np.ndarray, skin: np.ndarray, points: np.ndarra
     a, b, c = corners[None, :, 0], corners[None, :, 1], corners[None, :, 2]
 
     def twice_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
+            r[..., 0] - p[..., 0]
+        )
 
     at = points[:, None]
     parts = np.stack([twice_area(at, b, c), twice_area(at, c, a), twice_area(at, a, b)], axis=-1)
     inside = (parts > 0).all(-1) | (parts < 0).all(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (parts * np.stack([a[..., 2], b[..., 2], c[..., 2]], axis=-1)).sum(-1) / parts.sum(-1)
+        depth = (parts * np.stack([a[..., 2], b[..., 2], c[..., 2]], axis=-1)).sum(-1) / parts.sum(
+            -1
+        )
     return (inside & (depth > at[..., 2])).any(1)

@@ -1,6 +1,8 @@
-"""A small head of a made-up person in FLAME's format, with a jaw, pose correctives and regions; and model files.
+"""A small head of a made-up person in FLAME's format, with a jaw, pose correctives and regions; and
+model files.
 
-small_head.npz: v_template of the average person, in 2,100 vertices and 4,000 triangles, the model's other arrays, and
+small_head.npz: v_template of the average person, in 2,100 vertices and 4,000 triangles, the model's
+other arrays, and
 colors (V, 3), linear RGB.
 """
 
@@ -24,7 +26,9 @@ def small_head(person: int) -> FlameModel:
     """The model whose template is a person's, one for each number."""
     model = read_flame(FILE)
     own = 0.6 * np.random.default_rng(person).normal(size=model.n_identity)
-    return replace(model, v_template=model.v_template + model.shapedirs[:, :, : model.n_identity] @ own)
+    return replace(
+        model, v_template=model.v_template + model.shapedirs[:, :, : model.n_identity] @ own
+    )
 
 
 def small_head_colors() -> np.ndarray:
@@ -32,8 +36,11 @@ def small_head_colors() -> np.ndarray:
     return read_npz(FILE)["colors"].astype(np.float64)
 
 
-def subdivided(model: FlameModel, *values: np.ndarray) -> tuple[FlameModel, *tuple[np.ndarray, ...]]:
-    """The same surface with a vertex in the middle of each edge; and values (V, …) of its vertices."""
+def subdivided(
+    model: FlameModel, *values: np.ndarray
+) -> tuple[FlameModel, *tuple[np.ndarray, ...]]:
+    """The same surface with a vertex in the middle of each edge; and values (V, …) of its
+    vertices."""
     edges = np.sort(model.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
     ends, middle = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
     a, b, c = model.faces.T
@@ -56,7 +63,8 @@ def subdivided(model: FlameModel, *values: np.ndarray) -> tuple[FlameModel, *tup
 
 
 def write_flame(model: FlameModel, path: Path) -> None:
-    """Write a model as .npz with FLAME's keys; `n_identity` and `masks/<region>` are stored beside them."""
+    """Write a model as .npz with FLAME's keys; `n_identity` and `masks/<region>` are stored beside
+    them."""
     parents = model.parents.astype(np.int64) % (1 << 32)  # FLAME spells the root's parent 2**32 - 1
     arrays = {
         "v_template": model.v_template,
@@ -68,4 +76,8 @@ def write_flame(model: FlameModel, path: Path) -> None:
         "f": model.faces.astype(np.uint32),
         "n_identity": np.array(model.n_identity),
     }
-    write_npz(path, arrays | {MASK_PREFIX + name: ids for name, ids in model.masks.items()}, compressed=True)
+    write_npz(
+        path,
+        arrays | {MASK_PREFIX + name: ids for name, ids in model.masks.items()},
+        compressed=True,
+    )

@@ -26,8 +26,15 @@ def head():
 def posed(head, **changed):
     zero = np.zeros(3)
     frame = neutral_frame(head)
-    values = {"rotation": zero, "neck_pose": zero, "eyes_pose": np.zeros(6), "expr": frame.expr} | changed
-    frame = FlameFrame(values["expr"], values["rotation"], values["neck_pose"], zero, zero, values["eyes_pose"])
+    values = {
+        "rotation": zero,
+        "neck_pose": zero,
+        "eyes_pose": np.zeros(6),
+        "expr": frame.expr,
+    } | changed
+    frame = FlameFrame(
+        values["expr"], values["rotation"], values["neck_pose"], zero, zero, values["eyes_pose"]
+    )
     return flame_forward(head, np.zeros(head.n_identity), frame)
 
 
@@ -39,7 +46,8 @@ def expression(head, **weights):
 
 
 def test_size_and_names(head):
-    """Catches a file that outgrows the extension, and shapes that are missing or not in ARKit's words."""
+    """Catches a file that outgrows the extension, and shapes that are missing or not in ARKit's
+    words."""
     assert BUNDLED_HEAD.stat().st_size <= MAX_BYTES
     assert MIN_TRIANGLES <= len(head.faces) <= MAX_TRIANGLES
     assert set(head.expression_names) == set(ARKIT_SHAPES) - {"tongueOut"}
@@ -49,19 +57,26 @@ def test_size_and_names(head):
 
 
 def test_vertices_and_shapes_are_ict_facekits(head, shared_data):
-    """Catches thinning that moves vertices, and shapes of other vertices, another scale, order or side."""
+    """Catches thinning that moves vertices, and shapes of other vertices, another scale, order or
+    side."""
     with np.load(shared_data / "ict_facekit.npz") as source:
-        distance, of = cKDTree(METERS_PER_UNIT * source["neutral"].astype(np.float64)).query(head.v_template)
+        distance, of = cKDTree(METERS_PER_UNIT * source["neutral"].astype(np.float64)).query(
+            head.v_template
+        )
         assert distance.max() < 1e-7
         row = {str(name): number for number, name in enumerate(source["expression_names"])}
-        expressions = [sum(source["expression"][row[part]] for part in ict_names(n)) for n in head.expression_names]
+        expressions = [
+            sum(source["expression"][row[part]] for part in ict_names(n))
+            for n in head.expression_names
+        ]
         wanted = np.concatenate([source["identity"], expressions])[:, of].astype(np.float64)
     missed = np.abs(np.moveaxis(head.shapedirs, 2, 0) - METERS_PER_UNIT * wanted)
     assert np.quantile(missed, 0.999) <= SHAPE_STEP_M / 2 + 1e-9  # some vertices coincide
 
 
 def test_eyeballs_turn_in_their_lids(head):
-    """Catches an eyeball that wobbles about another center, turns the other way, or pulls skin along."""
+    """Catches an eyeball that wobbles about another center, turns the other way, or pulls skin
+    along."""
     straight = posed(head)
     looking = posed(head, eyes_pose=np.array([0, 0.4, 0, 0, 0.4, 0]))
     joints = joint_positions(head, head.v_template)
@@ -73,7 +88,8 @@ def test_eyeballs_turn_in_their_lids(head):
         front = eyeball[straight[eyeball, 2].argmax()]
         assert looking[front, 0] > straight[front, 0] + 0.003  # about +y, towards the person's left
     skin = np.setdiff1d(
-        np.arange(len(straight)), np.concatenate([head.masks[f"{s}_eyeball"] for s in ("left", "right")])
+        np.arange(len(straight)),
+        np.concatenate([head.masks[f"{s}_eyeball"] for s in ("left", "right")]),
     )
     np.testing.assert_array_equal(looking[skin], straight[skin])
 
@@ -85,7 +101,9 @@ def test_neck_turns_the_skull_alone(head):
     assert np.isin(head.masks["teeth"], skull).all()
     assert np.isin(head.masks["nose"], skull).all()
     before, after = (mesh[skull] - mesh[skull].mean(0) for mesh in (straight, turned))
-    np.testing.assert_allclose(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1), atol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1), atol=1e-9
+    )
     torso = np.unique(head.faces[torso_faces(head)])
     assert np.linalg.norm(turned[torso] - straight[torso], axis=1).max() < 0.012
     bottom = torso[straight[torso, 1] < -0.15]
@@ -105,15 +123,22 @@ def test_lips_part_when_the_jaw_opens(head):
 
 
 def test_arkits_weights_are_its_coefficients(head):
-    """Catches a map that is fitted where it is exact, gaze without eyeballs, and weights that do not come back."""
+    """Catches a map that is fitted where it is exact, gaze without eyeballs, and weights that do
+    not come back."""
     sequence = FlameSequence(head, np.zeros(head.n_identity), None, (), {}.__getitem__)
     weights = np.zeros((2, COUNT))
-    weights[0, [COLUMN["jawOpen"], COLUMN["mouthSmileLeft"], COLUMN["eyeLookOutLeft"]]] = 0.7, 0.4, 1.0
+    weights[0, [COLUMN["jawOpen"], COLUMN["mouthSmileLeft"], COLUMN["eyeLookOutLeft"]]] = (
+        0.7,
+        0.4,
+        1.0,
+    )
     weights[1, COLUMN["browInnerUp"]] = 0.9
     found = head_map(sequence, "bundled")
     frames = found.frames(Performance(np.arange(2.0), weights, None, 1.0))
     np.testing.assert_allclose(
-        frames[0].expr, expression(head, jawOpen=0.7, mouthSmileLeft=0.4, eyeLookOutLeft=1.0), atol=1e-12
+        frames[0].expr,
+        expression(head, jawOpen=0.7, mouthSmileLeft=0.4, eyeLookOutLeft=1.0),
+        atol=1e-12,
     )
     assert frames[0].eyes_pose[1] > 0.5  # the left eye looks to the person's left
     assert not np.any([frame.jaw_pose for frame in frames])
@@ -121,13 +146,17 @@ def test_arkits_weights_are_its_coefficients(head):
 
 
 def test_thinning_keeps_shape_and_topology():
-    """Catches collapses that move vertices, tear or fold the surface, eat its border, or ignore detail."""
+    """Catches collapses that move vertices, tear or fold the surface, eat its border, or ignore
+    detail."""
     side = np.arange(25)
     x, y = (grid.ravel() / 24.0 for grid in np.meshgrid(side, side))
     vertices = np.stack([x, y, 0.05 * np.sin(6 * x) * np.sin(6 * y)], axis=1)
     first = (side[:-1, None] + 25 * side[:-1]).ravel()
     triangles = np.concatenate(
-        [np.stack([first, first + 1, first + 25], 1), np.stack([first + 1, first + 26, first + 25], 1)]
+        [
+            np.stack([first, first + 1, first + 25], 1),
+            np.stack([first + 1, first + 26, first + 25], 1),
+        ]
     )
     left = collapsed(vertices, triangles, np.where(x < 0.5, 100.0, 1.0), 300)
     assert 290 <= len(left) <= 301

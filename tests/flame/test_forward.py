@@ -1,4 +1,5 @@
-"""FLAME's forward pass against independent ones: smplx's, numpy against torch, and plain 4x4 matrices by scipy."""
+"""FLAME's forward pass against independent ones: smplx's, numpy against torch, and plain 4x4
+matrices by scipy."""
 
 import pickle
 from dataclasses import replace
@@ -9,7 +10,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from stga_addon.flame.forward import FlameFrame, flame_forward, frame_of, neutral_frame, parameters_gradient
+from stga_addon.flame.forward import (
+    FlameFrame,
+    flame_forward,
+    frame_of,
+    neutral_frame,
+    parameters_gradient,
+)
 from stga_addon.flame.model import FlameModel, read_flame
 from stga_addon.flame.quaternions import to_matrices
 
@@ -18,7 +25,9 @@ from .torch_flame import axis_angle_matrices, flame_tensors
 from .torch_flame import flame_forward as torch_forward
 
 
-def _torch_vertices(model: FlameModel, shape: np.ndarray, frames: list[FlameFrame], offset=None) -> np.ndarray:
+def _torch_vertices(
+    model: FlameModel, shape: np.ndarray, frames: list[FlameFrame], offset=None
+) -> np.ndarray:
     def tensor(values):
         return torch.as_tensor(np.asarray(values), dtype=torch.float64)
 
@@ -57,10 +66,15 @@ def test_float32_torch_within_a_micrometer(tiny_flame: FlameModel) -> None:
 
 
 def test_same_as_four_by_four_matrices_vertex_by_vertex(tiny_flame: FlameModel) -> None:
-    # Catches transposed rotations, wrong joint order and a wrong feature order, with scipy's rotations as witness.
+    # Catches transposed rotations, wrong joint order and a wrong feature order, with scipy's
+    # rotations as witness.
     model, frame, shape = tiny_flame, random_frame(5, 4), np.random.default_rng(6).normal(size=8)
     offset = np.random.default_rng(7).normal(0, 0.01, (40, 3))
-    shaped = model.v_template + np.einsum("vck,k->vc", model.shapedirs, np.r_[shape, frame.expr]) + offset
+    shaped = (
+        model.v_template
+        + np.einsum("vck,k->vc", model.shapedirs, np.r_[shape, frame.expr])
+        + offset
+    )
     joints = model.j_regressor @ shaped
     turns = Rotation.from_rotvec(frame.pose).as_matrix()
     local = np.tile(np.eye(4), (5, 1, 1))
@@ -74,7 +88,8 @@ def test_same_as_four_by_four_matrices_vertex_by_vertex(tiny_flame: FlameModel) 
     for vertex, rest in enumerate(shaped):
         moved = rest + model.posedirs[vertex] @ feature
         skinned = sum(
-            model.weights[vertex, joint] * (world[joint] @ np.r_[moved - joints[joint], 1]) for joint in range(5)
+            model.weights[vertex, joint] * (world[joint] @ np.r_[moved - joints[joint], 1])
+            for joint in range(5)
         )
         expected[vertex] = skinned[:3] + frame.translation
     np.testing.assert_allclose(flame_forward(model, shape, frame, offset), expected, atol=1e-12)
@@ -84,13 +99,20 @@ def test_dynamic_offset_adds_to_the_static_one(tiny_flame: FlameModel) -> None:
     # Catches a dynamic offset that is dropped or replaces the static one.
     offsets = np.random.default_rng(8).normal(0, 0.01, (2, 40, 3))
     frame = replace(random_frame(9, 4), dynamic_offset=offsets[1])
-    expected = flame_forward(tiny_flame, np.zeros(8), replace(frame, dynamic_offset=None), offsets.sum(0))
-    np.testing.assert_allclose(flame_forward(tiny_flame, np.zeros(8), frame, offsets[0]), expected, atol=1e-14)
+    expected = flame_forward(
+        tiny_flame, np.zeros(8), replace(frame, dynamic_offset=None), offsets.sum(0)
+    )
+    np.testing.assert_allclose(
+        flame_forward(tiny_flame, np.zeros(8), frame, offsets[0]), expected, atol=1e-14
+    )
 
 
 def test_gradient_at_zero_angle() -> None:
-    # Catches NaN gradients of the axis-angle map at zero, and a wrong limit: there dR_ij/da_k is minus Levi-Civita.
-    jacobian = torch.autograd.functional.jacobian(axis_angle_matrices, torch.zeros(3, dtype=torch.float64))
+    # Catches NaN gradients of the axis-angle map at zero, and a wrong limit: there dR_ij/da_k is
+    # minus Levi-Civita.
+    jacobian = torch.autograd.functional.jacobian(
+        axis_angle_matrices, torch.zeros(3, dtype=torch.float64)
+    )
     levi_civita = np.zeros((3, 3, 3))
     levi_civita[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1
     levi_civita[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1
@@ -104,14 +126,17 @@ def test_gradient_against_finite_differences(size: float) -> None:
     axis_angle = (size * direction).requires_grad_()
     assert torch.autograd.gradcheck(axis_angle_matrices, (axis_angle,), eps=1e-6, atol=1e-7)
     expected = Rotation.from_rotvec(axis_angle.detach().numpy()).as_matrix()
-    np.testing.assert_allclose(axis_angle_matrices(axis_angle).detach().numpy(), expected, atol=1e-13)
+    np.testing.assert_allclose(
+        axis_angle_matrices(axis_angle).detach().numpy(), expected, atol=1e-13
+    )
 
 
 def test_equals_smplx(tmp_path: Path) -> None:
-    """Catches disagreement with the reference FLAME of smplx: component layout, pose order, joints, correctives.
+    """Catches disagreement with the reference FLAME of smplx: component layout, pose order, joints,
+    correctives.
 
-    smplx_vertices.npy holds the vertices (50, 3) that `smplx.FLAME` of smplx 0.1.28 returned in float64 for the same
-    random model, shape and frame (num_betas=300, num_expression_coeffs=100).
+    smplx_vertices.npy holds the vertices (50, 3) that `smplx.FLAME` of smplx 0.1.28 returned in
+    float64 for the same random model, shape and frame (num_betas=300, num_expression_coeffs=100).
     """
     arrays = random_arrays(seed=11, vertices=50, components=400)
     arrays["shapedirs"] *= 0.2
@@ -124,10 +149,12 @@ def test_equals_smplx(tmp_path: Path) -> None:
     assert np.abs(ours - model.v_template).max() > 0.05  # the pose did something
 
 
-@pytest.mark.parametrize("frame", [random_frame(8, 4), frame_of(np.zeros(22))], ids=["posed", "at zero"])
+@pytest.mark.parametrize(
+    "frame", [random_frame(8, 4), frame_of(np.zeros(22))], ids=["posed", "at zero"]
+)
 def test_the_gradient_is_autograds(tiny_flame: FlameModel, frame: FlameFrame) -> None:
-    """Catches a joint, a corrective or a joint's place that depends on the expression left out of the reverse, and a
-    division by an angle of zero."""
+    """Catches a joint, a corrective or a joint's place that depends on the expression left out of
+    the reverse, and a division by an angle of zero."""
     offset, outer = np.random.default_rng(9).normal(0, 0.01, (2, 40, 3))
     frame = replace(frame, dynamic_offset=offset)
     person = replace(tiny_flame, v_template=tiny_flame.v_template + 0.01)
@@ -138,11 +165,14 @@ def test_the_gradient_is_autograds(tiny_flame: FlameModel, frame: FlameFrame) ->
         pose.reshape(1, 5, 3), translation, torch.tensor(offset),
     )  # fmt: skip
     (expected,) = torch.autograd.grad((vertices * torch.tensor(outer)).sum(), values)
-    np.testing.assert_allclose(parameters_gradient(person, frame, outer), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        parameters_gradient(person, frame, outer), expected, rtol=1e-9, atol=1e-12
+    )
 
 
 def test_matrices_are_those_of_scipy():
-    """Catches a transposed matrix, another order of components, and lengths that scale what is rotated."""
+    """Catches a transposed matrix, another order of components, and lengths that scale what is
+    rotated."""
     quaternions = np.random.default_rng(0).normal(size=(4, 5, 4))
     expected = Rotation.from_quat(np.roll(quaternions, -1, axis=-1).reshape(-1, 4)).as_matrix()
     np.testing.assert_allclose(to_matrices(quaternions).reshape(-1, 3, 3), expected, atol=1e-12)

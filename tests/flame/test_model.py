@@ -1,4 +1,5 @@
-"""Reading FLAME model files: every pickle dialect they come in, and everything that must be refused."""
+"""Reading FLAME model files: every pickle dialect they come in, and everything that must be
+refused."""
 
 import codecs
 import io
@@ -22,7 +23,8 @@ from .conftest import random_arrays
 
 
 class _Python2Pickler(pickle._Pickler):  # type: ignore[name-defined,misc]
-    """Writes bytes and str as Python 2 did: as one kind of string, which a reader must decode as latin1."""
+    """Writes bytes and str as Python 2 did: as one kind of string, which a reader must decode as
+    latin1."""
 
     dispatch: ClassVar = dict(pickle._Pickler.dispatch)  # type: ignore[attr-defined]
 
@@ -34,11 +36,19 @@ class _Python2Pickler(pickle._Pickler):  # type: ignore[name-defined,misc]
     dispatch[bytes] = dispatch[str] = _save_string
 
     def save_global(self, obj: Any, name: str | None = None) -> None:
-        module = {"numpy._core.multiarray": "numpy.core.multiarray", "copyreg": "copy_reg", "builtins": "__builtin__"}
-        self.write(f"c{module.get(obj.__module__, obj.__module__)}\n{name or obj.__qualname__}\n".encode())
+        module = {
+            "numpy._core.multiarray": "numpy.core.multiarray",
+            "copyreg": "copy_reg",
+            "builtins": "__builtin__",
+        }
+        self.write(
+            f"c{module.get(obj.__module__, obj.__module__)}\n{name or obj.__qualname__}\n".encode()
+        )
         self.memoize(obj)
 
-    dispatch[type] = dispatch[types.FunctionType] = dispatch[types.BuiltinFunctionType] = save_global
+    dispatch[type] = dispatch[types.FunctionType] = dispatch[types.BuiltinFunctionType] = (
+        save_global
+    )
 
 
 def _python2_pickle(value: Any) -> bytes:
@@ -51,7 +61,11 @@ def _python2_pickle(value: Any) -> bytes:
 def chumpy(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
     """Classes that pickle under chumpy's names; the library itself imports on no current Python."""
     made = {}
-    for module, name in (("chumpy.ch", "Ch"), ("chumpy.reordering", "Select"), ("chumpy.ch_ops", "add")):
+    for module, name in (
+        ("chumpy.ch", "Ch"),
+        ("chumpy.reordering", "Select"),
+        ("chumpy.ch_ops", "add"),
+    ):
         made[name] = type(name, (), {"__module__": module})
         monkeypatch.setitem(sys.modules, module, types.ModuleType(module))
         setattr(sys.modules[module], name, made[name])
@@ -77,10 +91,15 @@ def _assert_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
     assert (model.n_identity, model.n_expression) == (9, 3)
 
 
-@pytest.mark.parametrize("layout", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.coo_matrix])
-def test_python2_pickle_with_chumpy_and_sparse(tmp_path: Path, chumpy: dict[str, type], layout: Any) -> None:
-    # Catches anything wrong in the dialect of the published files: latin1 strings, chumpy leaves, sparse regressor,
-    # Fortran order, big-endian data, and keys that are no arrays (which must not be looked at).
+@pytest.mark.parametrize(
+    "layout", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.coo_matrix]
+)
+def test_python2_pickle_with_chumpy_and_sparse(
+    tmp_path: Path, chumpy: dict[str, type], layout: Any
+) -> None:
+    # Catches anything wrong in the dialect of the published files: latin1 strings, chumpy leaves,
+    # sparse regressor, Fortran order, big-endian data, and keys that are no arrays (which must not
+    # be looked at).
     arrays = random_arrays()
     stored: dict[str, Any] = dict(arrays)
     stored["v_template"] = _with(chumpy["Ch"], x=arrays["v_template"], _dirty_vars={"x"})
@@ -107,7 +126,9 @@ def test_python2_pickle_with_chumpy_and_sparse(tmp_path: Path, chumpy: dict[str,
 def test_every_pickle_protocol(tmp_path: Path, protocol: int) -> None:
     # Catches a protocol whose way of storing arrays (text, codecs, buffers) is not understood.
     arrays = random_arrays()
-    stored = dict(arrays, J_regressor=scipy.sparse.csc_matrix(arrays["J_regressor"]), n_identity=np.int64(9))
+    stored = dict(
+        arrays, J_regressor=scipy.sparse.csc_matrix(arrays["J_regressor"]), n_identity=np.int64(9)
+    )
     path = tmp_path / "model.pkl"
     path.write_bytes(pickle.dumps(stored, protocol=protocol))
     _assert_model(path, arrays)
@@ -143,7 +164,11 @@ def test_mask_file_beside_the_model(tmp_path: Path) -> None:
     arrays = random_arrays()
     path = tmp_path / "model.pkl"
     path.write_bytes(pickle.dumps(arrays))
-    regions = {"left_eye_region": arrays["f"][0], "left_eyeball": arrays["f"][1], "right_eyeball": arrays["f"][2]}
+    regions = {
+        "left_eye_region": arrays["f"][0],
+        "left_eyeball": arrays["f"][1],
+        "right_eyeball": arrays["f"][2],
+    }
     (tmp_path / "FLAME_masks.pkl").write_bytes(_python2_pickle(regions))
     keys = key_regions(read_flame(path))
     assert keys["left_eye"][[0, 1]].all()
@@ -181,12 +206,19 @@ class _Attack:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 @pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_other_classes_are_refused_by_name(tmp_path: Path, attack: _Attack, name: str, protocol: int) -> None:
-    # Catches a pickle that gets anything executed: the witness file must not appear, and the class must be named.
+def test_other_classes_are_refused_by_name(
+    tmp_path: Path, attack: _Attack, name: str, protocol: int
+) -> None:
+    # Catches a pickle that gets anything executed: the witness file must not appear, and the class
+    # must be named.
     witness = tmp_path / "witness"
-    attack.arguments = tuple(a.format(witness) if isinstance(a, str) else a for a in attack.arguments)
+    attack.arguments = tuple(
+        a.format(witness) if isinstance(a, str) else a for a in attack.arguments
+    )
     path = tmp_path / "model.pkl"
-    path.write_bytes(pickle.dumps(dict(random_arrays(), extra=attack), protocol=protocol, fix_imports=False))
+    path.write_bytes(
+        pickle.dumps(dict(random_arrays(), extra=attack), protocol=protocol, fix_imports=False)
+    )
     with pytest.raises(StgaError, match=f"model.pkl.*{name.replace('.', '[.]')}"):
         read_flame(path)
     assert not witness.exists()
@@ -199,8 +231,14 @@ def test_other_classes_are_refused_by_name(tmp_path: Path, attack: _Attack, name
         (b"hello there", "not a readable pickle"),
         (pickle.dumps([1, 2]), "expected a dictionary"),
         (b"\x80\x02Nr\xff\xff\xff\x7f.", "memo slot"),  # would make the C unpickler allocate 16 GB
-        (b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(J\xff\xff\xff\x7ft", "not a readable"),
-        (b"\x80\x02ccopy_reg\n_reconstructor\n(c__builtin__\nset\nc__builtin__\nobject\nNtR.", "not a readable"),
+        (
+            b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(J\xff\xff\xff\x7ft",
+            "not a readable",
+        ),
+        (
+            b"\x80\x02ccopy_reg\n_reconstructor\n(c__builtin__\nset\nc__builtin__\nobject\nNtR.",
+            "not a readable",
+        ),
         (b"\x80\x02P1\n.", "not a readable pickle"),
     ],
 )
@@ -218,7 +256,11 @@ def test_broken_pickles(tmp_path: Path, data: bytes, message: str) -> None:
         ("v_template", None, "has no v_template"),
         ("kintree_table", None, "has no kintree_table"),
         ("v_template", np.zeros((40, 2)), r"v_template has shape \(40, 2\), expected \(any, 3\)"),
-        ("shapedirs", np.zeros((39, 3, 12)), r"shapedirs has shape \(39, 3, 12\), expected \(40, 3, any\)"),
+        (
+            "shapedirs",
+            np.zeros((39, 3, 12)),
+            r"shapedirs has shape \(39, 3, 12\), expected \(40, 3, any\)",
+        ),
         ("posedirs", np.zeros((40, 3, 27)), r"posedirs .*expected \(40, 3, 36\)"),
         ("J_regressor", np.zeros((4, 40)), r"J_regressor .*expected \(5, 40\)"),
         ("weights", np.full((40, 5), np.nan), "weights holds values that are not finite"),
@@ -232,7 +274,8 @@ def test_broken_pickles(tmp_path: Path, data: bytes, message: str) -> None:
     ],
 )
 def test_malformed_models(tmp_path: Path, key: str, value: np.ndarray | None, message: str) -> None:
-    # Catches a wrong field that is accepted, or reported without its file and name; in both file formats.
+    # Catches a wrong field that is accepted, or reported without its file and name; in both file
+    # formats.
     arrays = random_arrays()
     arrays.pop(key, None)
     if value is not None:
@@ -253,15 +296,24 @@ def test_missing_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["_codecs\nencode", "copy_reg\n_reconstructor", "numpy.core.multiarray\n_reconstruct", "__builtin__\nset"]
+    "name",
+    [
+        "_codecs\nencode",
+        "copy_reg\n_reconstructor",
+        "numpy.core.multiarray\n_reconstruct",
+        "__builtin__\nset",
+    ],
 )
 @pytest.mark.parametrize("state", [b"}S'left'\nI1\ns", b"N}S'_call'\nI1\ns\x86"])
 def test_functions_cannot_be_changed(tmp_path: Path, name: str, state: bytes) -> None:
-    """Catches a pickle that sets attributes of a function by BUILD, which would outlive its reading."""
+    """Catches a pickle that sets attributes of a function by BUILD, which would outlive its
+    reading."""
     path = tmp_path / "model.pkl"
     path.write_bytes(b"\x80\x02c" + name.encode() + b"\n" + state + b"b.")
     with pytest.raises(StgaError, match="sets attributes of a function"):
         read_pickled_arrays(path)
-    for method in (vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild", "array_shell")):
+    for method in (
+        vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild", "array_shell")
+    ):
         assert vars(method) == {}
     assert not hasattr(codecs.encode, "left")

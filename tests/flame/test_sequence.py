@@ -67,7 +67,9 @@ def test_missing_optional_and_shorter_vectors(tmp_path: Path, tiny_flame: FlameM
     # Catches a loader that insists on what real exports leave out.
     arrays = _arrays(2, tiny_flame)
     sparse = {name: arrays[name] for name in ("rotation", "translation")}
-    path = _write(tmp_path / "a.npz", {**sparse, "expr": arrays["expr"][0, :2], "shape": arrays["shape"][:3]})
+    path = _write(
+        tmp_path / "a.npz", {**sparse, "expr": arrays["expr"][0, :2], "shape": arrays["shape"][:3]}
+    )
     frame = read_frame(path, tiny_flame)
     np.testing.assert_array_equal(frame.expr, [*arrays["expr"][0, :2], 0, 0])
     assert not frame.jaw_pose.any()
@@ -82,7 +84,9 @@ def test_offsets_without_and_with_teeth(tmp_path: Path, tiny_flame: FlameModel, 
     # Catches offsets of a mesh with 120 teeth vertices more or fewer being refused or shifted.
     model = replace(tiny_flame, v_template=np.zeros((280 if rows == 160 else 160, 3)))
     given = np.random.default_rng(3).normal(size=(1, rows, 3))
-    _, offset = read_identity(_write(tmp_path / "a.npz", {"shape": np.zeros(8), "static_offset": given}), model)
+    _, offset = read_identity(
+        _write(tmp_path / "a.npz", {"shape": np.zeros(8), "static_offset": given}), model
+    )
     assert offset is not None
     np.testing.assert_array_equal(offset[:160], given[0, :160])
     assert not offset[160:].any()
@@ -99,7 +103,11 @@ def test_offsets_without_and_with_teeth(tmp_path: Path, tiny_flame: FlameModel, 
         ("expr", np.zeros((2, 4)), r"expr has shape \(2, 4\)"),
         ("rotation", np.array(0.0), "rotation has shape"),
         ("eyes_pose", np.full((1, 6), np.inf), "eyes_pose holds values that are not finite"),
-        ("static_offset", np.zeros((1, 39, 3)), r"static_offset has shape \(1, 39, 3\), expected \(40, 3\)"),
+        (
+            "static_offset",
+            np.zeros((1, 39, 3)),
+            r"static_offset has shape \(1, 39, 3\), expected \(40, 3\)",
+        ),
         ("static_offset", np.zeros((2, 40, 3)), "static_offset has shape"),
         ("shape", np.array(["a"] * 8), "shape holds"),
     ],
@@ -120,7 +128,9 @@ def test_malformed_frames(
 def _sequence(model: FlameModel) -> FlameSequence:
     rng = np.random.default_rng(6)
     frames = {3: random_frame(30, 4), 7: random_frame(70, 4)}
-    return FlameSequence(model, rng.normal(size=8), rng.normal(0, 0.01, (40, 3)), (3, 7), frames.__getitem__)
+    return FlameSequence(
+        model, rng.normal(size=8), rng.normal(0, 0.01, (40, 3)), (3, 7), frames.__getitem__
+    )
 
 
 def test_meshes_of_a_sequence(tiny_flame: FlameModel) -> None:
@@ -129,7 +139,9 @@ def test_meshes_of_a_sequence(tiny_flame: FlameModel) -> None:
     frame, zero = sequence.frame(7), np.zeros(3)
 
     def mesh(**changed: Any) -> np.ndarray:
-        return flame_forward(tiny_flame, sequence.shape, replace(frame, **changed), sequence.static_offset)
+        return flame_forward(
+            tiny_flame, sequence.shape, replace(frame, **changed), sequence.static_offset
+        )
 
     still = {"rotation": zero, "translation": zero, "neck_pose": zero}
     np.testing.assert_array_equal(sequence_mesh(sequence, 7), mesh())
@@ -137,27 +149,42 @@ def test_meshes_of_a_sequence(tiny_flame: FlameModel) -> None:
     calm = {**still, "jaw_pose": zero, "eyes_pose": np.zeros(6)}
     np.testing.assert_array_equal(expression_mesh(sequence, 7, "all"), mesh(**calm))
     np.testing.assert_array_equal(neutral_mesh(sequence), mesh(**calm, expr=np.zeros(4)))
-    rest = tiny_flame.v_template + tiny_flame.shapedirs[:, :, :8] @ sequence.shape + sequence.static_offset
+    rest = (
+        tiny_flame.v_template
+        + tiny_flame.shapedirs[:, :, :8] @ sequence.shape
+        + sequence.static_offset
+    )
     np.testing.assert_allclose(neutral_mesh(sequence), rest, atol=1e-14)
     with pytest.raises(StgaError, match="zero_pose"):
         expression_mesh(sequence, 7, "neck")
 
 
 def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
-    # Catches frames of a motion read from the wrong row, for VHAP's (shape (I,)) and GaussianAvatars' files alike.
+    # Catches frames of a motion read from the wrong row, for VHAP's (shape (I,)) and
+    # GaussianAvatars' files alike.
     frames = [_arrays(seed, tiny_flame) for seed in (10, 11, 12)]
-    moving = {name: np.concatenate([f[name] for f in frames]) for name in frames[0] if frames[0][name].shape[0] == 1}
+    moving = {
+        name: np.concatenate([f[name] for f in frames])
+        for name in frames[0]
+        if frames[0][name].shape[0] == 1
+    }
     offset = frames[0]["static_offset"]
-    moving.update(shape=frames[0]["shape"], static_offset=offset[0], dynamic_offset=np.zeros((3, 40, 3)))
+    moving.update(
+        shape=frames[0]["shape"], static_offset=offset[0], dynamic_offset=np.zeros((3, 40, 3))
+    )
     moving["dynamic_offset"][2] = 0.01
     motion = read_motion(_write(tmp_path / "flame_param.npz", moving), tiny_flame)
     assert motion.timesteps == (0, 1, 2)
     for timestep, arrays in enumerate(frames):
         single = read_frame(_write(tmp_path / f"{timestep}.npz", {**arrays}), tiny_flame)
         added = np.full((40, 3), 0.01) if timestep == 2 else None
-        expected = flame_forward(tiny_flame, frames[0]["shape"], replace(single, dynamic_offset=added), offset[0])
+        expected = flame_forward(
+            tiny_flame, frames[0]["shape"], replace(single, dynamic_offset=added), offset[0]
+        )
         np.testing.assert_allclose(sequence_mesh(motion, timestep), expected, atol=1e-7)
-    named = read_motion(_write(tmp_path / "named.npz", {**moving, "timesteps": np.array([2, 3, 7])}), tiny_flame)
+    named = read_motion(
+        _write(tmp_path / "named.npz", {**moving, "timesteps": np.array([2, 3, 7])}), tiny_flame
+    )
     assert named.timesteps == (2, 3, 7)
     np.testing.assert_array_equal(sequence_mesh(named, 7), sequence_mesh(motion, 2))
 
@@ -170,13 +197,21 @@ def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
         ("rotation", np.full((3, 3), np.nan), "rotation holds values that are not finite"),
         ("eyes_pose", np.zeros((3, 5)), "eyes_pose has shape"),
         ("shape", np.full(8, np.inf), "shape holds values that are not finite"),
-        ("pose", np.zeros((3, 9)), r"pose has shape \(3, 9\), expected \(timesteps, 6\) or \(timesteps, 15\)"),
+        (
+            "pose",
+            np.zeros((3, 9)),
+            r"pose has shape \(3, 9\), expected \(timesteps, 6\) or \(timesteps, 15\)",
+        ),
         ("pose", np.zeros((0, 6)), "pose has shape"),
         ("pose", np.zeros(6), "pose has shape"),
         ("timesteps", np.array([0, 1]), "timesteps: expected 3 whole numbers"),
         ("timesteps", np.array([0, 2, 2]), "timesteps: expected 3 whole numbers"),
         ("timesteps", np.array([0.0, 1.0, 2.0]), "timesteps: expected 3 whole numbers"),
-        ("timesteps", np.array([0, 1, 2**63 + 1], np.uint64), "timesteps: expected 3 whole numbers"),
+        (
+            "timesteps",
+            np.array([0, 1, 2**63 + 1], np.uint64),
+            "timesteps: expected 3 whole numbers",
+        ),
         ("timesteps", np.array([0, 1, 2**40]), "timesteps: expected 3 whole numbers"),
     ],
 )
@@ -196,16 +231,23 @@ def test_malformed_motions(
 
 
 def test_plain_expression_and_pose_files(tmp_path: Path, tiny_flame: FlameModel) -> None:
-    # Catches another tracker's names or packing read into the wrong joint, and an identity that is insisted on.
+    # Catches another tracker's names or packing read into the wrong joint, and an identity that is
+    # insisted on.
     rng = np.random.default_rng(20)
     expr, pose = rng.normal(size=(3, 4)), rng.normal(0, 0.4, (3, 15))
-    short = read_motion(_write(tmp_path / "a.npz", {"exp": expr[:, :2], "pose": pose[:, :6]}), tiny_flame)
+    short = read_motion(
+        _write(tmp_path / "a.npz", {"exp": expr[:, :2], "pose": pose[:, :6]}), tiny_flame
+    )
     frame = short.frame(1)
     np.testing.assert_array_equal(frame.expr, [*expr[1, :2], 0, 0])
     np.testing.assert_array_equal(frame.rotation, pose[1, :3])
     np.testing.assert_array_equal(frame.jaw_pose, pose[1, 3:6])
-    assert not np.concatenate([frame.neck_pose, frame.eyes_pose, frame.translation, short.shape]).any()
-    joints = read_motion(_write(tmp_path / "b.npz", {"pose": pose, "betas": np.ones((3, 8))}), tiny_flame)
+    assert not np.concatenate(
+        [frame.neck_pose, frame.eyes_pose, frame.translation, short.shape]
+    ).any()
+    joints = read_motion(
+        _write(tmp_path / "b.npz", {"pose": pose, "betas": np.ones((3, 8))}), tiny_flame
+    )
     np.testing.assert_array_equal(joints.frame(2).pose, pose[2].reshape(5, 3))
     np.testing.assert_array_equal(joints.shape, np.ones(8))
     assert not joints.frame(2).expr.any()
@@ -230,13 +272,17 @@ def _assert_same(frame: FlameFrame, other: FlameFrame) -> None:
     for name in ("expr", "translation"):
         np.testing.assert_allclose(getattr(frame, name), getattr(other, name), atol=1e-12)
     for name in ROTATIONS:
-        np.testing.assert_allclose(_matrices(getattr(frame, name)), _matrices(getattr(other, name)), atol=1e-12)
+        np.testing.assert_allclose(
+            _matrices(getattr(frame, name)), _matrices(getattr(other, name)), atol=1e-12
+        )
 
 
 def test_quaternions_against_scipy() -> None:
     # Catches a wrong order, sign or half angle, and division by zero at small angles.
     rng = np.random.default_rng(0)
-    vectors = np.concatenate([rng.normal(0, 1.2, (50, 3)), rng.normal(0, 1e-9, (5, 3)), np.zeros((1, 3))])
+    vectors = np.concatenate(
+        [rng.normal(0, 1.2, (50, 3)), rng.normal(0, 1e-9, (5, 3)), np.zeros((1, 3))]
+    )
     made = from_axis_angle(vectors)
     expected = Rotation.from_rotvec(vectors).as_quat()[:, [3, 0, 1, 2]]
     np.testing.assert_allclose(np.abs((made * expected).sum(1)), 1, atol=1e-14)
@@ -246,7 +292,8 @@ def test_quaternions_against_scipy() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_slerp_against_scipy(share: float) -> None:
-    # Catches interpolation the long way round, at uneven speed, or that is undefined between equal rotations.
+    # Catches interpolation the long way round, at uneven speed, or that is undefined between equal
+    # rotations.
     rng = np.random.default_rng(1)
     for a, b in [*rng.normal(0, 1.5, (30, 2, 3)), np.zeros((2, 3)), np.full((2, 3), 0.4)]:
         made = slerp(from_axis_angle(a), -from_axis_angle(b), np.array(share))
@@ -256,14 +303,17 @@ def test_slerp_against_scipy(share: float) -> None:
 
 def test_continuous_changes_signs_only() -> None:
     # Catches a step that runs through zero when its ends are interpolated one number at a time.
-    turning = from_axis_angle(np.outer((0.6 * np.arange(20) + np.pi) % (2 * np.pi) - np.pi, [0, 1, 0]))
+    turning = from_axis_angle(
+        np.outer((0.6 * np.arange(20) + np.pi) % (2 * np.pi) - np.pi, [0, 1, 0])
+    )
     made = continuous(turning)
     np.testing.assert_array_equal(np.abs(made), np.abs(turning))
     assert ((made[1:] * made[:-1]).sum(1) > 0).all()
 
 
 def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame: FlameModel) -> None:
-    # Catches frames shifted by gaps in the timesteps, and keyframes that are resampled although nothing asked for it.
+    # Catches frames shifted by gaps in the timesteps, and keyframes that are resampled although
+    # nothing asked for it.
     motion = _motion(tiny_flame)
     frames = retimed(motion)
     assert len(frames) == 6  # timesteps 2 to 7
@@ -273,13 +323,18 @@ def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame: Flame
     np.testing.assert_allclose(between.expr, 0.75 * start.expr + 0.25 * end.expr, atol=1e-12)
     expected = Slerp([3, 7], Rotation.from_rotvec([start.jaw_pose, end.jaw_pose]))(4).as_matrix()
     np.testing.assert_allclose(_matrices(between.jaw_pose)[0], expected, atol=1e-12)
-    right = Slerp([3, 7], Rotation.from_rotvec([start.eyes_pose[3:], end.eyes_pose[3:]]))(4).as_matrix()
+    right = Slerp([3, 7], Rotation.from_rotvec([start.eyes_pose[3:], end.eyes_pose[3:]]))(
+        4
+    ).as_matrix()
     np.testing.assert_allclose(_matrices(between.eyes_pose)[1], right, atol=1e-12)
 
 
-@pytest.mark.parametrize(("step", "count"), [(0.5, 11), (2.0, 3), (2.5, 3), (0.1, 51), (60 / 24, 3)])
+@pytest.mark.parametrize(
+    ("step", "count"), [(0.5, 11), (2.0, 3), (2.5, 3), (0.1, 51), (60 / 24, 3)]
+)
 def test_speeds(tiny_flame: FlameModel, step: float, count: int) -> None:
-    # Catches a last frame lost to rounding (0.1 is not a tenth), and steps counted in frames of the wrong side.
+    # Catches a last frame lost to rounding (0.1 is not a tenth), and steps counted in frames of the
+    # wrong side.
     motion = _motion(tiny_flame)
     frames = retimed(motion, step)
     assert len(frames) == count
@@ -295,18 +350,25 @@ def test_one_timestep_is_one_frame(tiny_flame: FlameModel) -> None:
 
 
 def test_strength(tiny_flame: FlameModel) -> None:
-    # Catches a head that drifts to the origin, or faces elsewhere, when only its movement should shrink.
+    # Catches a head that drifts to the origin, or faces elsewhere, when only its movement should
+    # shrink.
     frames = retimed(_motion(tiny_flame))
     for whole, same in zip(frames, strengthened(frames, 1.0), strict=True):
         _assert_same(whole, same)
     still = strengthened(frames, 0.0)[3]
-    zero: dict[str, Any] = {name: np.zeros_like(getattr(still, name)) for name in ("expr", *ROTATIONS[1:])}
+    zero: dict[str, Any] = {
+        name: np.zeros_like(getattr(still, name)) for name in ("expr", *ROTATIONS[1:])
+    }
     _assert_same(still, replace(frames[0], **zero))
     half = strengthened(frames, 0.5)[3]
     np.testing.assert_allclose(half.expr, frames[3].expr / 2)
     np.testing.assert_allclose(half.jaw_pose, frames[3].jaw_pose / 2, atol=1e-12)
-    np.testing.assert_allclose(half.translation, (frames[0].translation + frames[3].translation) / 2)
-    middle = Slerp([0, 1], Rotation.from_rotvec([frames[0].rotation, frames[3].rotation]))(0.5).as_matrix()
+    np.testing.assert_allclose(
+        half.translation, (frames[0].translation + frames[3].translation) / 2
+    )
+    middle = Slerp([0, 1], Rotation.from_rotvec([frames[0].rotation, frames[3].rotation]))(
+        0.5
+    ).as_matrix()
     np.testing.assert_allclose(_matrices(half.rotation)[0], middle, atol=1e-12)
 
 
@@ -315,12 +377,20 @@ def test_driven_by_the_neutral_mesh_alone(tiny_flame: FlameModel) -> None:
     rng = np.random.default_rng(3)
     shape, offset = rng.normal(size=8), rng.normal(0, 0.01, (40, 3))
     motion = replace(_motion(tiny_flame), shape=rng.normal(size=8), static_offset=np.ones((40, 3)))
-    motion = replace(motion, frame=lambda t: replace(random_frame(t, 4), dynamic_offset=np.ones((40, 3))))
+    motion = replace(
+        motion, frame=lambda t: replace(random_frame(t, 4), dynamic_offset=np.ones((40, 3)))
+    )
     neutral = flame_forward(tiny_flame, shape, neutral_frame(tiny_flame), offset)
     expected = flame_forward(tiny_flame, shape, random_frame(7, 4), offset)
-    np.testing.assert_allclose(sequence_mesh(transferred_motion(motion, neutral), 7), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        sequence_mesh(transferred_motion(motion, neutral), 7), expected, atol=1e-12
+    )
 
 
 def test_parts_are_all_the_fields() -> None:
     # Catches a field of a frame that no part switches.
-    assert {name for fields in PARTS.values() for name in fields} == {"expr", "translation", *ROTATIONS}
+    assert {name for fields in PARTS.values() for name in fields} == {
+        "expr",
+        "translation",
+        *ROTATIONS,
+    }

@@ -11,7 +11,14 @@ from stga_addon.errors import StgaError
 from stga_addon.flame.model import FlameModel, key_regions
 from stga_addon.flame.teeth import lip_pairs, teeth_faces, with_teeth
 
-from .mouths import JOINT_POSITIONS_M, covered_from_front, crossings, jaw_opened, open_edges, open_flame
+from .mouths import (
+    JOINT_POSITIONS_M,
+    covered_from_front,
+    crossings,
+    jaw_opened,
+    open_edges,
+    open_flame,
+)
 
 # The added vertices stand in this order, in rows of 15.
 UR, LR, UE, LE, URB, UEB, LRB, LEB = range(8)
@@ -44,7 +51,8 @@ def _strip_normals(model: FlameModel) -> dict[str, np.ndarray]:
 
 
 def test_counts_and_untouched_head(flame_open: FlameModel, toothed: FlameModel) -> None:
-    """Catches vertices that are inserted rather than appended: tracked offsets would land elsewhere."""
+    """Catches vertices that are inserted rather than appended: tracked offsets would land
+    elsewhere."""
     assert (len(toothed.v_template), len(toothed.faces)) == (5143, 10144)
     for name in ("v_template", "shapedirs", "posedirs", "weights"):
         np.testing.assert_array_equal(getattr(toothed, name)[:5023], getattr(flame_open, name))
@@ -54,8 +62,8 @@ def test_counts_and_untouched_head(flame_open: FlameModel, toothed: FlameModel) 
 
 
 def test_index_layout() -> None:
-    """Catches triangles in another order, or that start at another corner: splats bound to them by index would turn
-    or move to another tooth. Left and right are each other's mirror image."""
+    """Catches triangles in another order, or that start at another corner: splats bound to them by
+    index would turn or move to another tooth. Left and right are each other's mirror image."""
     strips = teeth_faces(0).reshape(6, 14, 2, 3)
     for rows, strip in zip(STRIP_ROWS.values(), strips, strict=True):
         assert set((strip // 15).ravel()) == set(rows)
@@ -69,9 +77,14 @@ def test_index_layout() -> None:
 
 
 def test_each_row_is_an_open_strip(toothed: FlameModel) -> None:
-    """Catches doubled or flipped triangles: within a row of teeth every inner edge is run through once each way."""
+    """Catches doubled or flipped triangles: within a row of teeth every inner edge is run through
+    once each way."""
     for half in (toothed.faces[9976 : 9976 + 84], toothed.faces[9976 + 84 :]):
-        edges = [tuple(edge) for face in half.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)]
+        edges = [
+            tuple(edge)
+            for face in half.tolist()
+            for edge in zip(face, face[1:] + face[:1], strict=True)
+        ]
         assert len(set(edges)) == len(edges)
         boundary = [edge for edge in edges if edge[::-1] not in set(edges)]
         # Root of front and back open (14 each), three strips' open ends at both sides (3 each).
@@ -92,7 +105,9 @@ def test_sides_face_outwards(toothed: FlameModel) -> None:
 def test_sound_triangles(toothed: FlameModel) -> None:
     """Catches slivers, whose frames and strain are noise."""
     corners = toothed.v_template[toothed.faces[9976:]]
-    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    double_area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     assert double_area.min() / 2 > 1.5e-6
     assert (double_area / longest**2).min() > 0.15
@@ -134,14 +149,17 @@ def test_teeth_stay_behind_the_lips(toothed: FlameModel, jaw_deg: float) -> None
 
 
 def test_jaw_moves_the_lower_row_only(toothed: FlameModel) -> None:
-    """Catches an upper row that follows the jaw, and a lower one that bends or turns about another point."""
+    """Catches an upper row that follows the jaw, and a lower one that bends or turns about another
+    point."""
     closed, opened = toothed.v_template[5023:], jaw_opened(toothed, 20)[5023:]
     lower = np.isin(np.repeat(np.arange(8), 15), (LR, LE, LRB, LEB))
     np.testing.assert_allclose(opened[~lower], closed[~lower], atol=1e-12)
     c, s = np.cos(np.radians(20)), np.sin(np.radians(20))
     turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     np.testing.assert_allclose(
-        opened[lower], (closed[lower] - JOINT_POSITIONS_M[2]) @ turn.T + JOINT_POSITIONS_M[2], atol=1e-9
+        opened[lower],
+        (closed[lower] - JOINT_POSITIONS_M[2]) @ turn.T + JOINT_POSITIONS_M[2],
+        atol=1e-9,
     )
 
 
@@ -157,7 +175,8 @@ def test_what_moves_the_teeth(flame_open: FlameModel, toothed: FlameModel) -> No
 
 
 def test_identity_carries_the_teeth(flame_open: FlameModel) -> None:
-    """Catches teeth that stay, or grow otherwise, where the head is moved, wider, longer or has a bent mouth."""
+    """Catches teeth that stay, or grow otherwise, where the head is moved, wider, longer or has a
+    bent mouth."""
     template = flame_open.v_template
     shapes = np.zeros((len(template), 3, 4))
     shapes[:, :, 0] = [0.001, 0.002, 0.003]
@@ -173,8 +192,8 @@ def test_identity_carries_the_teeth(flame_open: FlameModel) -> None:
 
 
 def test_teeth_and_lips_come_from_the_mesh(flame_open: FlameModel, toothed: FlameModel) -> None:
-    """Catches lists of vertices of one published mesh, and lengths in meters: another numbering and size of the same
-    mesh has the same teeth."""
+    """Catches lists of vertices of one published mesh, and lengths in meters: another numbering and
+    size of the same mesh has the same teeth."""
     order = np.random.default_rng(1).permutation(5023)
     number = np.argsort(order)
     other = with_teeth(
@@ -191,7 +210,8 @@ def test_teeth_and_lips_come_from_the_mesh(flame_open: FlameModel, toothed: Flam
 
 
 def test_lips_face_each_other(flame_open: FlameModel, toothed: FlameModel) -> None:
-    """Catches vertices that are not on the lips, in another order, or paired with the wrong ones."""
+    """Catches vertices that are not on the lips, in another order, or paired with the wrong
+    ones."""
     upper, lower = (flame_open.v_template[ids] for ids in lip_pairs(toothed))
     np.testing.assert_array_equal(lip_pairs(toothed), lip_pairs(flame_open))
     assert (np.diff(upper[:, 0]) < 0).all()
@@ -220,10 +240,18 @@ def test_other_topologies_are_refused(tiny_flame: FlameModel) -> None:
 
 def test_a_closed_mouth_is_refused(flame_open: FlameModel) -> None:
     """Catches teeth at the neck, which is open too."""
-    ring = np.intersect1d(open_edges(flame_open.faces), np.flatnonzero(flame_open.v_template[:, 2] > 0.03))
-    directed = np.concatenate([flame_open.faces[:, [0, 1]], flame_open.faces[:, [1, 2]], flame_open.faces[:, [2, 0]]])
+    ring = np.intersect1d(
+        open_edges(flame_open.faces), np.flatnonzero(flame_open.v_template[:, 2] > 0.03)
+    )
+    directed = np.concatenate(
+        [flame_open.faces[:, [0, 1]], flame_open.faces[:, [1, 2]], flame_open.faces[:, [2, 0]]]
+    )
     known = {tuple(edge) for edge in directed.tolist()}
-    lid = [(b, a, int(ring[0])) for a, b in known if a in ring and b in ring and (b, a) not in known]
-    faces = np.concatenate([flame_open.faces, np.array([face for face in lid if len(set(face)) == 3], np.int32)])
+    lid = [
+        (b, a, int(ring[0])) for a, b in known if a in ring and b in ring and (b, a) not in known
+    ]
+    faces = np.concatenate(
+        [flame_open.faces, np.array([face for face in lid if len(set(face)) == 3], np.int32)]
+    )
     with pytest.raises(StgaError, match="closed mouth"):
         with_teeth(replace(flame_open, faces=faces))

@@ -1,4 +1,5 @@
-"""FLAME's forward pass in torch, batched over frames and differentiable: an independent witness of `flame.forward`."""
+"""FLAME's forward pass in torch, batched over frames and differentiable: an independent witness of
+`flame.forward`."""
 
 from dataclasses import dataclass
 
@@ -27,7 +28,8 @@ def flame_tensors(model: FlameModel, dtype: torch.dtype = torch.float32) -> Flam
 
 
 def axis_angle_matrices(axis_angle: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3) in radians; the gradient at zero is finite."""
+    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3) in radians; the gradient at zero
+    is finite."""
     squared = (axis_angle**2).sum(-1)
     small = squared < 1e-6
     # The slope of sqrt is infinite at zero, and `where` would multiply it by zero, which is NaN.
@@ -53,7 +55,8 @@ def flame_forward(
 ) -> torch.Tensor:
     """Vertices (T, V, 3) in meters of T frames.
 
-    shape (I,) or (T, I); expr (T, E); pose (T, 5, 3) axis-angle of root, neck, jaw, left eye, right eye;
+    shape (I,) or (T, I); expr (T, E); pose (T, 5, 3) axis-angle of root, neck, jaw, left eye, right
+    eye;
     translation (T, 3); offset (V, 3) or (T, V, 3): static plus dynamic offset, or None.
     """
     frames = len(expr)

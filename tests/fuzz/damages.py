@@ -1,4 +1,5 @@
-"""Damages of one file of a case: bytes, values of JSON, arrays, pictures, and what is in the file's place."""
+"""Damages of one file of a case: bytes, values of JSON, arrays, pictures, and what is in the file's
+place."""
 
 import copy
 import json
@@ -16,7 +17,22 @@ from PIL import Image
 from .arguments import TEXTS
 
 JSON_VALUES: list[Any] = [
-    *(None, True, False, 0, 1, -1, 2.5, 10**30, -(10**400), 1e308, 1e-320, float("nan"), float("inf"), -float("inf")),
+    *(
+        None,
+        True,
+        False,
+        0,
+        1,
+        -1,
+        2.5,
+        10**30,
+        -(10**400),
+        1e308,
+        1e-320,
+        float("nan"),
+        float("inf"),
+        -float("inf"),
+    ),
     *(
         "1",
         "nan",
@@ -31,7 +47,17 @@ JSON_VALUES: list[Any] = [
         "images",
         "images/00000_00.png",
     ),
-    *([], {}, [[]], [None], [0] * 1000, {"": {}}, [[0, 0, 0, 0]] * 4, [1e300] * 3, {"a": [1, {"b": None}]}),
+    *(
+        [],
+        {},
+        [[]],
+        [None],
+        [0] * 1000,
+        {"": {}},
+        [[0, 0, 0, 0]] * 4,
+        [1e300] * 3,
+        {"a": [1, {"b": None}]},
+    ),
 ]
 ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
     lambda a: a[:-1] if a.ndim else a.reshape(1), lambda a: a[None], lambda a: a.astype(np.float16),
@@ -42,17 +68,43 @@ ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
     lambda a: a.astype(complex) if a.dtype.kind in "if" else a, lambda a: a.astype(bool), lambda a: a.T,
     lambda a: np.concatenate([a, a]) if a.ndim else a,
 ]  # fmt: skip
-BYTES = [b"\xff" * 8, b"\0" * 8, b"-1", b"1e999", b"NaN", b"[", b"]", b'"', b"{}", b"\n", b".", b"\x80", b"99999999999"]
+BYTES = [
+    b"\xff" * 8,
+    b"\0" * 8,
+    b"-1",
+    b"1e999",
+    b"NaN",
+    b"[",
+    b"]",
+    b'"',
+    b"{}",
+    b"\n",
+    b".",
+    b"\x80",
+    b"99999999999",
+]
 
 
 def damage(rng: random.Random, case: Path, arguments: list[str]) -> str:
-    """Change one file of the case, mostly one that the arguments name; returns what was done to it."""
+    """Change one file of the case, mostly one that the arguments name; returns what was done to
+    it."""
     files = sorted(path for path in case.rglob("*") if path.is_file() and not path.is_symlink())
-    named = [path for path in files if any(str(path).startswith(a) for a in arguments if a.startswith(f"{case}/"))]
+    named = [
+        path
+        for path in files
+        if any(str(path).startswith(a) for a in arguments if a.startswith(f"{case}/"))
+    ]
     small = [path for path in named if path.suffix in (".json", ".npz", ".ply", ".jsonl", ".obj")]
     path = rng.choice(rng.choice([small, small, named, files]) or files)
-    special = {".json": mutate_json, ".jsonl": mutate_json, ".npz": mutate_npz, ".png": mutate_picture}
-    kind = rng.choice([special.get(path.suffix, mutate_bytes)] * 6 + [mutate_bytes] * 2 + [replace_file])
+    special = {
+        ".json": mutate_json,
+        ".jsonl": mutate_json,
+        ".npz": mutate_npz,
+        ".png": mutate_picture,
+    }
+    kind = rng.choice(
+        [special.get(path.suffix, mutate_bytes)] * 6 + [mutate_bytes] * 2 + [replace_file]
+    )
     return f"{path.relative_to(case)}: {kind.__name__} {kind(rng, path)}"
 
 
@@ -69,7 +121,9 @@ def mutate_json(rng: random.Random, path: Path) -> str:
     """Replace, delete, add or copy one value, at any depth."""
     try:
         text = path.read_text(encoding="utf-8")
-        document = [json.loads(line) for line in (text.splitlines() if path.suffix == ".jsonl" else [text])]
+        document = [
+            json.loads(line) for line in (text.splitlines() if path.suffix == ".jsonl" else [text])
+        ]
     except (ValueError, RecursionError):  # an earlier damage
         return mutate_bytes(rng, path)
     node: Any = document
@@ -80,7 +134,11 @@ def mutate_json(rng: random.Random, path: Path) -> str:
             return "nothing"
         key = rng.choice(keys)
         trail.append(key)
-        if not isinstance(node[key], (dict, list)) or not node[key] or rng.random() < 0.15 * (len(trail) > 1):
+        if (
+            not isinstance(node[key], (dict, list))
+            or not node[key]
+            or rng.random() < 0.15 * (len(trail) > 1)
+        ):
             break
         node = node[key]
     kind = rng.choice(["replace"] * 6 + ["delete", "copy", "scale"])
@@ -114,7 +172,11 @@ def mutate_npz(rng: random.Random, path: Path) -> str:
         arrays[rng.choice(["x", "../x", "0", f"{name}/"])] = arrays.pop(name)
     elif chance < 0.4 and arrays[name].size and arrays[name].dtype.kind in "if":
         flat = arrays[name] = arrays[name].copy()
-        worst = [np.nan, np.inf, -1e30, 1e6] if flat.dtype.kind == "f" else [-1, np.iinfo(flat.dtype).max]
+        worst = (
+            [np.nan, np.inf, -1e30, 1e6]
+            if flat.dtype.kind == "f"
+            else [-1, np.iinfo(flat.dtype).max]
+        )
         flat.reshape(-1)[rng.randrange(flat.size)] = rng.choice(worst)
     else:
         with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -142,7 +204,9 @@ def mutate_picture(rng: random.Random, path: Path) -> str:
 def replace_file(rng: random.Random, path: Path) -> str:
     """Nothing, an empty file, a folder, a link to itself, a pipe or another file in its place."""
     kind = rng.choice(["missing", "empty", "folder", "link", "pipe", "other"])
-    content = rng.choice(sorted(other for other in path.parent.iterdir() if other.is_file())).read_bytes()
+    content = rng.choice(
+        sorted(other for other in path.parent.iterdir() if other.is_file())
+    ).read_bytes()
     path.unlink()
     if kind == "empty":
         path.touch()

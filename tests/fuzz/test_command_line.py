@@ -1,6 +1,8 @@
-"""The whole command line on generated arguments and damaged inputs: exit code 0, 2 or 130, one bounded sentence.
+"""The whole command line on generated arguments and damaged inputs: exit code 0, 2 or 130, one
+bounded sentence.
 
-STGA_FUZZ_CASES sets the number of cases and STGA_FUZZ_FIRST the first one; case n is the same in every run.
+STGA_FUZZ_CASES sets the number of cases and STGA_FUZZ_FIRST the first one; case n is the same in
+every run.
 """
 
 import io
@@ -44,8 +46,8 @@ pytest.importorskip("torch")
 CASES = int(os.environ.get("STGA_FUZZ_CASES", 100))
 """Of every run of the tests; `make fuzz` tries 20,000."""
 PARTS = min(10, 1 + CASES // 200)
-"""Tests that the cases are spread over, so that several processes share them; each makes the files anew, which takes
-longer than a hundred cases."""
+"""Tests that the cases are spread over, so that several processes share them; each makes the files
+anew, which takes longer than a hundred cases."""
 FIRST_CASE = int(os.environ.get("STGA_FUZZ_FIRST", 0))
 MAX_CASE_S = 60
 MAX_OUTPUT_CHARACTERS = 2000
@@ -54,7 +56,8 @@ REPORTED_FAILURES = 20
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """FOLDER/template, from which FOLDER/case is copied anew for every case; paths in its files point into the case."""
+    """FOLDER/template, from which FOLDER/case is copied anew for every case; paths in its files
+    point into the case."""
     folder = tmp_path_factory.mktemp("fuzz")
     case = folder / "case"
     capture = factory.write_mesh_capture(case / "mesh", (0, 1), range(2))
@@ -65,7 +68,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert call(["train", *options, *strategy, "--out", case / name])[0] == 0
     shutil.copytree(case / "run", case / "unfinished")
     (case / "unfinished/avatar.npz").unlink()
-    splats = ["--iterations", 2, "--device", "cpu", "--effect", "hull-points=off", "--out", case / "splats"]
+    splats = [
+        "--iterations",
+        2,
+        "--device",
+        "cpu",
+        "--effect",
+        "hull-points=off",
+        "--out",
+        case / "splats",
+    ]
     assert call(["train", capture, *splats])[0] == 0
     factory.write_mesh_capture(case / "take", (0, 1), range(2))
     record(case / "footage", HeadModel(small_head(0), "flame"))
@@ -85,7 +97,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     (case / "head/head.json").write_text(json.dumps(head))
     (case / "take.blend").write_bytes(b"BLENDER")
-    write_performance(case / "take.csv", Performance(np.arange(3) / 30, np.full((3, 52), 0.3), None, 30.0))
+    write_performance(
+        case / "take.csv", Performance(np.arange(3) / 30, np.full((3, 52), 0.3), None, 30.0)
+    )
     np.savez(case / "motion.npz", expr=np.zeros((2, 2)), pose=np.zeros((2, 15)), shape=np.zeros(4))
     case.rename(folder / "template")
     (folder / "start").mkdir()
@@ -94,11 +108,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def requests_about(case: Path) -> dict[str, ask.Request]:
     """A request of each kind, by its name, about the files of the case."""
-    capture, run, footage, once = case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"}
+    capture, run, footage, once = (
+        case / "mesh",
+        case / "splats",
+        case / "footage",
+        {"iterations": 1, "device": "cpu"},
+    )
     settings = read_run(case / "run").settings
     key = np.zeros(small_head(0).n_expression + 18)
     avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
-    tracking = ask.Track(footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points")
+    tracking = ask.Track(
+        footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points"
+    )
     capture_of_avatar = case / "made/capture"
     requests: tuple[ask.Request, ...] = (
         ask.Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}),
@@ -108,13 +129,16 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
         ask.SelectForTake(run, case / "take"),
         tracking,
         ask.MakeAvatar(
-            replace(tracking, out=capture_of_avatar), ask.Train(case / "made/run", capture_of_avatar, settings)
+            replace(tracking, out=capture_of_avatar),
+            ask.Train(case / "made/run", capture_of_avatar, settings),
         ),
         ask.SolveAgain(footage / "out", footage / "head.npz", {1: key}),
         ask.RenderRecording(case / "none.bin", case / "asked.mp4", 1, 25.0),
         ask.Analyze(capture),
         ask.Evaluate(run),
-        ask.Render(avatar, case / "asked", cameras=capture / "transforms_val.json", capture=capture),
+        ask.Render(
+            avatar, case / "asked", cameras=capture / "transforms_val.json", capture=capture
+        ),
         ask.Export(avatar, case / "asked.stga", "web", capture, played=played),
         ask.ConvertMotion(case / "take.csv", case / "asked.npz", footage / "head.npz"),
         ask.Select(capture),
@@ -150,7 +174,8 @@ def call(arguments: list[Any]) -> tuple[Any, str, str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
-    """Catches tracebacks, other exit codes, long messages, numeric warnings, hangs and files left half-written."""
+    """Catches tracebacks, other exit codes, long messages, numeric warnings, hangs and files left
+    half-written."""
     case, scratch = folder / "case", folder / "scratch"
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(folder / "start")  # relative names of outputs end up in FOLDER
@@ -176,7 +201,8 @@ def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch, part: int) 
 
 
 def find_problem(arguments: list[str], folders: list[Path]) -> str | None:
-    """What is wrong with a call, as one text for all calls with the same cause; None where it behaves."""
+    """What is wrong with a call, as one text for all calls with the same cause; None where it
+    behaves."""
 
     def stop(*_: Any) -> None:
         raise TimeoutError(f"no answer in {MAX_CASE_S} s")
@@ -190,7 +216,11 @@ def find_problem(arguments: list[str], folders: list[Path]) -> str | None:
     except BaseException as unexpected:
         if isinstance(unexpected, KeyboardInterrupt):
             raise
-        place = [line for line in traceback.extract_tb(unexpected.__traceback__) if "stga_addon" in line.filename][-1]
+        place = [
+            line
+            for line in traceback.extract_tb(unexpected.__traceback__)
+            if "stga_addon" in line.filename
+        ][-1]
         where = f"{Path(place.filename).name}:{place.lineno} {place.name}"
         return f"{type(unexpected).__name__} in {where}: {ascii(str(unexpected))[:150]}"
     finally:
@@ -205,8 +235,14 @@ def find_problem(arguments: list[str], folders: list[Path]) -> str | None:
         return "exit code 2 without a message"
     numeric = [warning for warning in warned if issubclass(warning.category, RuntimeWarning)]
     if numeric:
-        return f"warning in {Path(numeric[0].filename).name}:{numeric[0].lineno}: {numeric[0].message}"
-    left = [path.name for path in itertools.chain.from_iterable(map(files_in, folders)) if is_temporary(path, folders)]
+        return (
+            f"warning in {Path(numeric[0].filename).name}:{numeric[0].lineno}: {numeric[0].message}"
+        )
+    left = [
+        path.name
+        for path in itertools.chain.from_iterable(map(files_in, folders))
+        if is_temporary(path, folders)
+    ]
     return f"left behind: {left[0]}" if left else None
 
 

@@ -48,7 +48,10 @@ from stga_addon.tracking.footage.image_frames import ImageFrames
 from stga_addon.tracking.footage.metashape import read_metashape
 from stga_addon.tracking.footage.model import FootageCamera
 from stga_addon.tracking.footage.nerfstudio import read_nerfstudio
-from stga_addon.tracking.footage.realitycapture import read_realitycapture_csv, read_realitycapture_xmp
+from stga_addon.tracking.footage.realitycapture import (
+    read_realitycapture_csv,
+    read_realitycapture_xmp,
+)
 from stga_addon.tracking.footage.shots import Shot
 from stga_addon.tracking.footage.sources import Sources, sequence_names
 from stga_addon.tracking.footage.undistort import undistortion
@@ -77,12 +80,24 @@ class Target:
 def small_avatar() -> Avatar:
     neutral, faces = random_mesh(1, 20)
     splats = random_splats(2, 6, len(faces))
-    return Avatar(splats, "stga", neutral.astype(np.float32), faces, regions={"nose": np.ones(len(faces), bool)})
+    return Avatar(
+        splats,
+        "stga",
+        neutral.astype(np.float32),
+        faces,
+        regions={"nose": np.ones(len(faces), bool)},
+    )
 
 
 def ascii_splats(path: Path) -> None:
     rows = splat_columns(random_splats(4, 3, 1))
-    head = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {n}" for n in PROPERTIES), "end_header"]
+    head = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 3",
+        *(f"property float {n}" for n in PROPERTIES),
+        "end_header",
+    ]
     path.write_text("\n".join([*head, *(" ".join(f"{v:g}" for v in row) for row in rows), ""]))
 
 
@@ -135,7 +150,9 @@ def seen(path: Path) -> None:
 def metrics(path: Path) -> None:
     for n in range(3):
         times = {"seconds": float(n), "splats": 80, "evaluation_s": 0.1, "wall_s": 1.0}
-        metrics_log.append_metrics(path.parent, {"iteration": n, **times, "psnr": 20.5, "ssim": 0.9})
+        metrics_log.append_metrics(
+            path.parent, {"iteration": n, **times, "psnr": 20.5, "ssim": 0.9}
+        )
 
 
 RIG = scenes.rig(2)
@@ -178,7 +195,12 @@ def write_colmap_binary(folder: Path) -> None:
         values = camera.fl_x, camera.fl_y, camera.cx, camera.cy, 0.1, 0.0, 0.0, 0.0
         cameras.append(struct.pack("<IiQQ8d", number, 4, camera.width, camera.height, *values))
         pose = *scenes.quaternion(camera.world_to_camera[:3, :3]), *camera.world_to_camera[:3, 3]
-        images.append(struct.pack("<I7dI", number, *pose, number) + name.encode() + b"\0" + struct.pack("<Q", 0))
+        images.append(
+            struct.pack("<I7dI", number, *pose, number)
+            + name.encode()
+            + b"\0"
+            + struct.pack("<Q", 0)
+        )
     (folder / "cameras.bin").write_bytes(b"".join(cameras))
     (folder / "images.bin").write_bytes(b"".join(images))
 
@@ -219,11 +241,18 @@ def linear_head(path: Path) -> None:
 
 
 CALIBRATIONS = {
-    **{f"colmap {file}": colmap_target(file) for file in ("cameras.txt", "images.txt", "cameras.bin", "images.bin")},
-    "metashape": Target("cameras.xml", metashape, lambda path: undistorted(read_metashape(path)[0])),
+    **{
+        f"colmap {file}": colmap_target(file)
+        for file in ("cameras.txt", "images.txt", "cameras.bin", "images.bin")
+    },
+    "metashape": Target(
+        "cameras.xml", metashape, lambda path: undistorted(read_metashape(path)[0])
+    ),
     "realitycapture csv": Target(
         "cameras.csv",
-        lambda path: path.write_text(f"{test_realitycapture.HEADER}\n" + "".join(map(ROW.format, NAMES))),
+        lambda path: path.write_text(
+            f"{test_realitycapture.HEADER}\n" + "".join(map(ROW.format, NAMES))
+        ),
         lambda path: undistorted(read_realitycapture_csv(path, lambda label: (40, 30))),
     ),
     "realitycapture xmp": Target(
@@ -231,7 +260,9 @@ CALIBRATIONS = {
         lambda path: test_realitycapture.write_xmp(path, RIG[0]),
         lambda path: undistorted(read_realitycapture_xmp([path], lambda label: (40, 30))[0]),
     ),
-    "nerfstudio": Target("transforms.json", nerfstudio, lambda path: undistorted(read_nerfstudio(path))),
+    "nerfstudio": Target(
+        "transforms.json", nerfstudio, lambda path: undistorted(read_nerfstudio(path))
+    ),
 }
 
 TARGETS = {
@@ -239,26 +270,44 @@ TARGETS = {
     "landmarks": Target("cam0.npz", landmarks, lambda path: read_camera(path, LANDMARK_CAMERA)),
     "places": Target("head_model.npz", places, lambda path: read_places(path, 4)),
     "head model npz": Target("head.npz", linear_head, read_head_model),
-    "head model glb": Target("head.glb", lambda path: path.write_bytes(test_head_model.simple()), read_head_model),
+    "head model glb": Target(
+        "head.glb", lambda path: path.write_bytes(test_head_model.simple()), read_head_model
+    ),
     "avatar": Target("a.npz", lambda path: write_avatar(path, small_avatar()), read_avatar),
     "splats": Target("a.ply", lambda path: write_ply(path, random_splats(1, 4, 1)), read_ply),
     "splats as text": Target("a.ply", ascii_splats, read_ply),
-    "flame npz": Target("a.npz", lambda path: np.savez(path, **random_arrays(vertices=6)), read_flame),
+    "flame npz": Target(
+        "a.npz", lambda path: np.savez(path, **random_arrays(vertices=6)), read_flame
+    ),
     "flame pickle 2": Target("a.pkl", flame_pickle(2), read_flame),
     "flame pickle 5": Target("a.pkl", flame_pickle(5), read_flame),
     "flame masks": Target("a.pkl", flame_masks, read_pickled_arrays),
-    "flame frame": Target("a.npz", flame_frame, lambda path: (read_frame(path, MODEL), read_identity(path, MODEL))),
+    "flame frame": Target(
+        "a.npz", flame_frame, lambda path: (read_frame(path, MODEL), read_identity(path, MODEL))
+    ),
     "flame motion": Target("a.npz", flame_motion, lambda path: read_motion(path, MODEL)),
     "transforms": Target("transforms.json", transforms, read_transforms),
     "regions": Target(
-        "r.json", lambda path: path.write_text('{"nose": [0, 1, 2], "lips": []}'), lambda p: read_regions(p, FACES, 12)
+        "r.json",
+        lambda path: path.write_text('{"nose": [0, 1, 2], "lips": []}'),
+        lambda p: read_regions(p, FACES, 12),
     ),
     "soup": Target("a.json", soup, read_soup),
-    "face ids": Target("a.npy", lambda path: np.save(path, np.arange(4)), lambda path: read_face_ids(path, 5)),
-    **{f"mesh {kind}": Target(f"a.{kind}", mesh, read_mesh) for kind in ("obj", "ply", "glb", "stl")},
-    **{f"image {kind}": Target(f"a.{kind}", picture, seen) for kind in ("png", "jpg", "webp", "tiff", "bmp")},
+    "face ids": Target(
+        "a.npy", lambda path: np.save(path, np.arange(4)), lambda path: read_face_ids(path, 5)
+    ),
+    **{
+        f"mesh {kind}": Target(f"a.{kind}", mesh, read_mesh)
+        for kind in ("obj", "ply", "glb", "stl")
+    },
+    **{
+        f"image {kind}": Target(f"a.{kind}", picture, seen)
+        for kind in ("png", "jpg", "webp", "tiff", "bmp")
+    },
     "run": Target(
-        "run.json", lambda p: run_folder.write_run(p.parent, make_run()), lambda p: run_folder.read_run(p.parent)
+        "run.json",
+        lambda p: run_folder.write_run(p.parent, make_run()),
+        lambda p: run_folder.read_run(p.parent),
     ),
     "checkpoint": Target(
         "checkpoint.npz",
@@ -267,13 +316,25 @@ TARGETS = {
     ),
     "selection": Target(
         "selection.npz",
-        lambda path: checkpoints.write_selection(path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}, "a"),
+        lambda path: checkpoints.write_selection(
+            path.parent, {0: np.ones(5, bool), 7: np.zeros(5, bool)}, "a"
+        ),
         lambda path: checkpoints.read_selection(path.parent, 5),
     ),
     "metrics": Target("metrics.jsonl", metrics, lambda path: metrics_log.read_metrics(path.parent)),
 }
 
-INTERESTING = [b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\0" * 8, b"-1", b"1e999", b"99999999999", b"NaN", b"[", b"]"]
+INTERESTING = [
+    b"\xff\xff\xff\xff",
+    b"\x7f\xff\xff\xff",
+    b"\0" * 8,
+    b"-1",
+    b"1e999",
+    b"99999999999",
+    b"NaN",
+    b"[",
+    b"]",
+]
 INTERESTING += [b'"', b"\xff\xfe", b"../", b"null", b"{}", b"true", b"\n", b"."]
 
 
@@ -284,16 +345,26 @@ def damaged(draw: Callable[[st.SearchStrategy[Any]], Any], content: bytes) -> by
         length = draw(st.sampled_from([0, 1, 2, 4, 8, 40]))
         kind = draw(st.integers(0, 3))
         if kind == 0:
-            content = content[:at] + draw(st.binary(min_size=1, max_size=4)) + content[at + length :]
+            content = (
+                content[:at] + draw(st.binary(min_size=1, max_size=4)) + content[at + length :]
+            )
         elif kind == 1:
             content = content[:at] + draw(st.sampled_from(INTERESTING)) + content[at + length :]
         elif kind == 2:
             content = (
-                content[:at] + content[at : at + length] * draw(st.sampled_from([0, 2, 50])) + content[at + length :]
+                content[:at]
+                + content[at : at + length] * draw(st.sampled_from([0, 2, 50]))
+                + content[at + length :]
             )
         elif at < len(content):
-            content = content[:at] + bytes([content[at] ^ (1 << draw(st.integers(0, 7)))]) + content[at + 1 :]
-    return content[: draw(st.integers(0, len(content)))] if draw(st.integers(0, 9)) == 0 else content
+            content = (
+                content[:at]
+                + bytes([content[at] ^ (1 << draw(st.integers(0, 7)))])
+                + content[at + 1 :]
+            )
+    return (
+        content[: draw(st.integers(0, len(content)))] if draw(st.integers(0, 9)) == 0 else content
+    )
 
 
 def rewrap(draw: Callable[[st.SearchStrategy[Any]], Any], path: Path) -> bytes:
@@ -336,7 +407,8 @@ def fuzz(target: Target, whole: bytes, path: Path, broken: Path, number: int) ->
         tracemalloc.start()
         try:
             with suppress(StgaError), warnings.catch_warnings():
-                warnings.simplefilter("error", RuntimeWarning)  # NumPy's, for numbers that are not checked
+                # NumPy's, for numbers that are not checked
+                warnings.simplefilter("error", RuntimeWarning)
                 target.read(broken)
             peak = tracemalloc.get_traced_memory()[1]
         finally:

@@ -1,7 +1,9 @@
-"""Runs inside a Blender with a window, started by test_display.py: shows splats in every shading mode.
+"""Runs inside a Blender with a window, started by test_display.py: shows splats in every shading
+mode.
 
-`blender --python display_script.py -- FOLDER`: reads FOLDER/avatar.npz, and packages that Blender lacks from
-FOLDER/packages; writes pictures of the viewport, their views (views.npz) and what else was seen (result.json).
+`blender --python display_script.py -- FOLDER`: reads FOLDER/avatar.npz, and packages that Blender
+lacks from FOLDER/packages; writes pictures of the viewport, their views (views.npz) and what else
+was seen (result.json).
 """
 
 import contextlib
@@ -66,7 +68,9 @@ def set_up() -> Any:
     head.hide_set(True)
     _, area, _ = viewport()
     space = area.spaces.active
-    space.overlay.show_overlays = space.show_gizmo = space.show_region_ui = space.show_region_toolbar = False
+    space.overlay.show_overlays = space.show_gizmo = space.show_region_ui = (
+        space.show_region_toolbar
+    ) = False
     space.show_region_header = space.show_region_tool_header = False
     space.shading.background_type = "VIEWPORT"
     space.shading.background_color = (0.2, 0.3, 0.4)
@@ -92,9 +96,15 @@ def picture(name: str) -> None:
     subprocess.run(["import", "-window", "root", str(FOLDER / f"{name}.png")], check=True)
     window, area, region = viewport()
     camera = region_view(area.spaces.active.region_3d, region.width, region.height)[0].camera
-    views[name] = np.array([camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy])
+    views[name] = np.array(
+        [camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy]
+    )
     views[f"{name} pose"] = camera.world_to_camera
-    seen["pictures"][name] = {"x": region.x, "y": window.height - region.y - region.height, "ms": took}
+    seen["pictures"][name] = {
+        "x": region.x,
+        "y": window.height - region.y - region.height,
+        "ms": took,
+    }
     seen["problem"] = display.problem
 
 
@@ -130,7 +140,9 @@ def pictures(shown: Any) -> None:
     picture("hidden")
     shown.hide_set(False)
     quad = bpy.data.meshes.new("quad")
-    quad.from_pydata([(-1, -1, 0.02), (1, -1, 0.02), (1, 1, 0.02), (-1, 1, 0.02)], [], [(0, 1, 2, 3)])
+    quad.from_pydata(
+        [(-1, -1, 0.02), (1, -1, 0.02), (1, 1, 0.02), (-1, 1, 0.02)], [], [(0, 1, 2, 3)]
+    )
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("quad", quad))
     picture("quad")
     parts_of_the_view(area)
@@ -150,7 +162,9 @@ def bones_in_front(shown: Any) -> None:
     in_viewport(bpy.ops.object.mode_set, mode="OBJECT")
     overlay = viewport()[1].spaces.active.overlay
     overlay.show_overlays = True
-    overlay.show_floor = overlay.show_axis_x = overlay.show_axis_y = overlay.show_cursor = overlay.show_text = False
+    overlay.show_floor = overlay.show_axis_x = overlay.show_axis_y = overlay.show_cursor = (
+        overlay.show_text
+    ) = False
     picture("bone and splats")
     shown.hide_set(True)
     picture("bone")
@@ -160,7 +174,8 @@ def bones_in_front(shown: Any) -> None:
 
 
 def shadows() -> None:
-    """The shadow maps of a sun and a lamp as the display draws them, and these lights in the avatar's space."""
+    """The shadow maps of a sun and a lamp as the display draws them, and these lights in the
+    avatar's space."""
     lamps = []
     for kind, place, energy in (("SUN", (0.4, -0.6, 1.0), 2.0), ("POINT", (0.3, 0.2, 0.4), 5.0)):
         data = bpy.data.lights.new(kind, kind)
@@ -173,7 +188,9 @@ def shadows() -> None:
     redraw()
     drawn = display._renderer
     (relit,) = (layer.relit for layer in drawn._layers)
-    seen["lights"] = {light.kind: [*light.position, *light.direction] for light in relit.lighting.lights}
+    seen["lights"] = {
+        light.kind: [*light.position, *light.direction] for light in relit.lighting.lights
+    }
     np.save(FOLDER / "shadows.npy", _pixels(drawn._relit[0].textures["shadows"], 1)[..., 0])
     settings.mode = "recorded"
     for lamp in lamps:
@@ -216,7 +233,8 @@ def freed(held: list[Any]) -> bool:
 
 
 def pictures_per_redraw() -> int:
-    """How often one redraw of the only viewport draws: more than once where a handler was left behind."""
+    """How often one redraw of the only viewport draws: more than once where a handler was left
+    behind."""
     count, draw = 0, SplatRenderer.draw
 
     def counted(*arguments: Any) -> None:
@@ -231,7 +249,8 @@ def pictures_per_redraw() -> int:
 
 
 def memory(shown: Any) -> None:
-    """Textures while the display is off, and while its only object is gone; then undo brings that back."""
+    """Textures while the display is off, and while its only object is gone; then undo brings that
+    back."""
     seen["drawn"] = [pictures_per_redraw()]
     held = textures()
     seen["freed"] = {"while drawn": freed(held)}
@@ -264,7 +283,9 @@ def failure() -> None:
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         redraw(4)
-    seen["reports"] = output.getvalue().count("out of memory; points") + output.getvalue().count("MemoryError: out")
+    seen["reports"] = output.getvalue().count("out of memory; points") + output.getvalue().count(
+        "MemoryError: out"
+    )
     seen["failed"] = display.failed, not display._handlers, display.problem
 
 
@@ -295,14 +316,17 @@ def after_load() -> None:
 
 
 def start_render() -> None:
-    """F12 in AgX, in its own thread, as an artist starts it: the view transform is measured by the main thread."""
+    """F12 in AgX, in its own thread, as an artist starts it: the view transform is measured by the
+    main thread."""
     scene = bpy.context.scene
     scene.render.engine, scene.view_settings.view_transform = engine.ENGINE, "AgX"
     scene.render.resolution_x = scene.render.resolution_y = 64
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(scene.camera)
     bpy.context.preferences.view.render_display_type = "NONE"
-    bpy.app.handlers.render_complete.append(lambda *_: seen.update(rendered=inverse_view(scene) is not None))
+    bpy.app.handlers.render_complete.append(
+        lambda *_: seen.update(rendered=inverse_view(scene) is not None)
+    )
     in_viewport(bpy.ops.render.render, "INVOKE_DEFAULT")
 
 

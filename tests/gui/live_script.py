@@ -1,7 +1,9 @@
-"""Runs inside a Blender with a window, started by test_live.py: drives a head live, as a phone would.
+"""Runs inside a Blender with a window, started by test_live.py: drives a head live, as a phone
+would.
 
-`blender --python live_script.py -- FOLDER PICTURES`: reads FOLDER/flame.npz, own.npz and avatar.npz, writes
-FOLDER/result.json, screenshots, and with PICTURES above 0 as many pictures of the viewport.
+`blender --python live_script.py -- FOLDER PICTURES`: reads FOLDER/flame.npz, own.npz and
+avatar.npz, writes FOLDER/result.json, screenshots, and with PICTURES above 0 as many pictures of
+the viewport.
 """
 
 import json
@@ -42,7 +44,9 @@ def packet(number: int, t: float) -> bytes:
     )
     row = [float(values.get(name, 0.0)) for name in names] + [*map(float, head)] + [0.0] * 6
     text = b"".join(struct.pack(">i", len(part)) + part for part in (b"DEVICE", b"phone"))
-    return b"\x06" + text + struct.pack(">ifii", number, 0.0, RATE, 1) + struct.pack(">B61f", 61, *row)
+    return (
+        b"\x06" + text + struct.pack(">ifii", number, 0.0, RATE, 1) + struct.pack(">B61f", 61, *row)
+    )
 
 
 def send() -> None:
@@ -70,7 +74,9 @@ def set_up() -> None:
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
     with bpy.context.temp_override(window=window, area=area, region=region):
-        bpy.ops.stga.import_motion(filepath=str(FOLDER / "own.npz"), flame=str(FOLDER / "flame.npz"))
+        bpy.ops.stga.import_motion(
+            filepath=str(FOLDER / "own.npz"), flame=str(FOLDER / "flame.npz")
+        )
         bpy.ops.stga.show_avatar(filepath=str(FOLDER / "avatar.npz"))
     space = area.spaces.active
     space.overlay.show_overlays = space.show_gizmo = space.show_region_toolbar = False
@@ -84,7 +90,10 @@ def set_up() -> None:
 def only_drive_panel() -> None:
     """Leave the sidebar's tab with the Drive panel open, for pictures."""
     ui = sys.modules[f"{extension}.ui.panel"]
-    kept = [sys.modules[f"{extension}.ui.motion"].MotionPanel, sys.modules[f"{extension}.ui.drive"].DrivePanel]
+    kept = [
+        sys.modules[f"{extension}.ui.motion"].MotionPanel,
+        sys.modules[f"{extension}.ui.drive"].DrivePanel,
+    ]
     for panel in reversed(ui.CLASSES):
         bpy.utils.unregister_class(panel)
     for panel in kept:
@@ -94,7 +103,9 @@ def only_drive_panel() -> None:
 
 def count_draws() -> None:
     drawn: list[float] = []
-    handle = bpy.types.SpaceView3D.draw_handler_add(lambda: drawn.append(time.monotonic()), (), "WINDOW", "POST_PIXEL")
+    handle = bpy.types.SpaceView3D.draw_handler_add(
+        lambda: drawn.append(time.monotonic()), (), "WINDOW", "POST_PIXEL"
+    )
     seen["_drawn"], seen["_handle"] = drawn, handle
 
 
@@ -129,10 +140,17 @@ def steps() -> Any:
     else:
         yield SECONDS
     took = time.monotonic() - begin
-    seen["poses per second"], seen["draws per second"] = posed / took, len(seen.pop("_drawn")) / took
+    seen["poses per second"], seen["draws per second"] = (
+        posed / took,
+        len(seen.pop("_drawn")) / took,
+    )
     bpy.types.SpaceView3D.draw_handler_remove(seen.pop("_handle"), "WINDOW")
     health = running.stream.health(time.monotonic())
-    seen["rate"], seen["lost"], seen["slowest tick ms"] = health.rate, health.lost, 1e3 * running.slowest_tick_s
+    seen["rate"], seen["lost"], seen["slowest tick ms"] = (
+        health.rate,
+        health.lost,
+        1e3 * running.slowest_tick_s,
+    )
     screenshot("driven")
     x, y = region.x + region.width // 2, window.height - region.y - region.height // 2
     subprocess.run(["xdotool", "mousemove", str(x), str(y)], check=True)
@@ -144,7 +162,9 @@ def steps() -> Any:
 
 def finish() -> None:
     seen["quit"] = True
-    (FOLDER / "result.json").write_text(json.dumps({name: value for name, value in seen.items() if name[0] != "_"}))
+    (FOLDER / "result.json").write_text(
+        json.dumps({name: value for name, value in seen.items() if name[0] != "_"})
+    )
     bpy.ops.wm.quit_blender()
 
 

@@ -1,6 +1,8 @@
-"""Runs inside a Blender with a window and the complete edition, started by test_newcomer.py: the first ten minutes.
+"""Runs inside a Blender with a window and the complete edition, started by test_newcomer.py: the
+first ten minutes.
 
-`blender --python newcomer_script.py -- FOLDER`: writes FOLDER/result.json with times, and a picture of each step.
+`blender --python newcomer_script.py -- FOLDER`: writes FOLDER/result.json with times, and a picture
+of each step.
 """
 
 import json
@@ -46,7 +48,9 @@ def picture(name: str) -> None:
 
 
 def sidebar() -> bool:
-    return bool(open_sidebar("STGA", [window.screen for window in bpy.context.window_manager.windows]))
+    return bool(
+        open_sidebar("STGA", [window.screen for window in bpy.context.window_manager.windows])
+    )
 
 
 def write() -> None:
@@ -130,7 +134,9 @@ def turntable() -> Iterator[Callable[[], bool]]:
 def page() -> Iterator[Callable[[], bool]]:
     clock = Clock()
     with viewport():
-        bpy.ops.stga.export_avatar("EXEC_DEFAULT", filepath=str(FOLDER / "avatar.html"), format="web")
+        bpy.ops.stga.export_avatar(
+            "EXEC_DEFAULT", filepath=str(FOLDER / "avatar.html"), format="web"
+        )
     yield (FOLDER / "avatar.html").exists
     clock.note("page_s")
 

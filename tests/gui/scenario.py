@@ -1,7 +1,8 @@
-"""Runs inside a Blender with a window, started by test_scenario.py: trains as a user would, and kills the worker.
+"""Runs inside a Blender with a window, started by test_scenario.py: trains as a user would, and
+kills the worker.
 
-`blender [FILE] --python scenario.py -- PART RESULT CAPTURE BLEND PYTHON`: PART is the name of a function below, RESULT
-the JSON file that says what was seen.
+`blender [FILE] --python scenario.py -- PART RESULT CAPTURE BLEND PYTHON`: PART is the name of a
+function below, RESULT the JSON file that says what was seen.
 """
 
 import json
@@ -20,7 +21,8 @@ from mathutils import Vector
 PART, RESULT, CAPTURE, BLEND, PYTHON = sys.argv[sys.argv.index("--") + 1 :]
 STEP_S, PATIENCE_S = 0.1, 180.0
 WORKER_PATIENCE_S = 1200.0
-"""While a worker is alive: compiling kernels for the first time takes a minute, and far longer on a busy machine."""
+"""While a worker is alive: compiling kernels for the first time takes a minute, and far longer on a
+busy machine."""
 seen: dict[str, Any] = {}
 
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
@@ -30,7 +32,8 @@ lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
 
 
 def timed(name: str, action: Callable[..., Any]) -> Callable[..., Any]:
-    """The action, noting how long each call holds Blender up: by the clock, and in processor time."""
+    """The action, noting how long each call holds Blender up: by the clock, and in processor
+    time."""
     noted = seen.setdefault("held up ms", {}).setdefault(name, [])
 
     def measured(*arguments: Any, **named: Any) -> Any:
@@ -80,7 +83,8 @@ def job_folder() -> Path:
 
 
 def first() -> Iterator[Callable[[], bool]]:
-    """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the worker at work."""
+    """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the
+    worker at work."""
     bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
     bpy.ops.stga.test_python()
@@ -134,7 +138,8 @@ def first() -> Iterator[Callable[[], bool]]:
 
 
 def second() -> Iterator[Callable[[], bool]]:
-    """Find the worker that went on while Blender was closed; then a short run that ends by itself."""
+    """Find the worker that went on while Blender was closed; then a short run that ends by
+    itself."""
     seen["found"] = lock_owner(job_folder() / "worker.lock")
     yield is_training
     bpy.ops.stga.cancel(request="training")
@@ -152,7 +157,8 @@ def second() -> Iterator[Callable[[], bool]]:
 
 
 def videos() -> Iterator[Callable[[], bool]]:
-    """One video that is cancelled while it is recorded, one while it is rendered, and one that is finished."""
+    """One video that is cancelled while it is recorded, one while it is rendered, and one that is
+    finished."""
     folder, scene = Path(BLEND).parent, bpy.context.scene
     scene.frame_set(1)
     for name in ("recording", "rendering", "finished"):
@@ -160,7 +166,12 @@ def videos() -> Iterator[Callable[[], bool]]:
             bpy.ops.stga.render_video(filepath=str(folder / name), seconds=0.5)
         video = request("video").folder
         if name != "recording":
-            yield lambda: request("video").is_running and request("video").snapshot.status.message != "Recording"
+            yield (
+                lambda: (
+                    request("video").is_running
+                    and request("video").snapshot.status.message != "Recording"
+                )
+            )
         if name != "finished":
             bpy.ops.stga.cancel(request="video")
         yield lambda: not request("video").is_running
@@ -178,14 +189,20 @@ def in_window() -> Any:
 
 
 def looks_at_head() -> bool:
-    """Whether every viewport shows the head, and little else: Blender's own cube is two meters high."""
+    """Whether every viewport shows the head, and little else: Blender's own cube is two meters
+    high."""
     head = chosen().head
     corners = [head.matrix_world @ Vector(corner) for corner in head.bound_box]
     center, size = sum(corners, Vector()) / len(corners), (corners[6] - corners[0]).length
-    areas = [area for area in bpy.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D"]
+    areas = [
+        area
+        for area in bpy.context.window_manager.windows[0].screen.areas
+        if area.type == "VIEW_3D"
+    ]
     views = [area.spaces.active.region_3d for area in areas]
     return all(
-        (view.view_location - center).length < 0.1 * size and 0.2 * size < view.view_distance < 5 * size
+        (view.view_location - center).length < 0.1 * size
+        and 0.2 * size < view.view_distance < 5 * size
         for view in views
     )
 
@@ -206,7 +223,9 @@ class Player:
         try:
             if self.until():
                 self.until, self.since = next(self.part), time.monotonic()
-            elif time.monotonic() - self.since > (WORKER_PATIENCE_S if has_worker() else PATIENCE_S):
+            elif time.monotonic() - self.since > (
+                WORKER_PATIENCE_S if has_worker() else PATIENCE_S
+            ):
                 raise TimeoutError(f"waited in vain: {state()}, {figures()}, {sorted(seen)}")
             return STEP_S
         except StopIteration:
@@ -219,6 +238,11 @@ class Player:
 
 
 bpy.app.timers.unregister(monitor.tick) if bpy.app.timers.is_registered(monitor.tick) else None
-monitor.tick, monitor._push_undo = timed("tick", monitor.tick), timed("undo step", monitor._push_undo)
+monitor.tick, monitor._push_undo = (
+    timed("tick", monitor.tick),
+    timed("undo step", monitor._push_undo),
+)
 monitor._start_timer()
-bpy.app.timers.register(Player({"first": first, "second": second}[PART]()), first_interval=1.0, persistent=True)
+bpy.app.timers.register(
+    Player({"first": first, "second": second}[PART]()), first_interval=1.0, persistent=True
+)

@@ -1,4 +1,5 @@
-"""The GPU display in a Blender with a window, as on screen, against the CPU rasterizer: see test_scenario.py."""
+"""The GPU display in a Blender with a window, as on screen, against the CPU rasterizer: see
+test_scenario.py."""
 
 import json
 import os
@@ -30,7 +31,9 @@ from stga_addon.raster.posed_splats import PosedSplats
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
-pytestmark = pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window")
+pytestmark = pytest.mark.skipif(
+    not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window"
+)
 MIN_PSNR_DB = 42.0
 BORDER_PX = 40
 """Of the viewport, where Blender draws rounded corners and arrows."""
@@ -44,12 +47,18 @@ PROBE = "import bpy, gpu, os; print('BACKEND', gpu.platform.backend_type_get(), 
 def has_vulkan() -> bool:
     """Whether Blender starts with Vulkan and does not fall back to OpenGL."""
     command = [*BLENDER, "--factory-startup", "--gpu-backend", "vulkan", "--python-expr", PROBE]
-    return "BACKEND VULKAN" in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300).stdout
+    return (
+        "BACKEND VULKAN"
+        in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300).stdout
+    )
 
 
 @pytest.fixture(scope="module", params=["opengl", "vulkan"])
-def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The folder with the pictures, and what display_script.py saw, by each of Blender's GPU backends."""
+def shown(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, Any]]:
+    """The folder with the pictures, and what display_script.py saw, by each of Blender's GPU
+    backends."""
     backend = request.param
     if backend == "vulkan" and not has_vulkan():
         pytest.skip("Blender does not start with Vulkan here: too old, or no driver")
@@ -57,12 +66,24 @@ def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     of = avatar(3)
     transfer, occlusion = transfer_of(of.neutral, of.faces, 64)
     world, skin = uniform(np.ones(3)).astype(np.float32), np.zeros(len(of.neutral), np.float32)
-    light = AvatarLight(world, transfer, occlusion, (transfer @ world).astype(np.float32), skin, 0.0)
+    light = AvatarLight(
+        world, transfer, occlusion, (transfer @ world).astype(np.float32), skin, 0.0
+    )
     write_avatar(folder / "avatar.npz", replace(of, light=light))
     shutil.copytree(Path(filelock.__file__).parent, folder / "packages/filelock")
     script = Path(__file__).with_name("display_script.py")
-    arguments = ["--factory-startup", "--gpu-backend", backend, "--python", str(script), "--", str(folder)]
-    done = subprocess.run([*BLENDER, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=900)
+    arguments = [
+        "--factory-startup",
+        "--gpu-backend",
+        backend,
+        "--python",
+        str(script),
+        "--",
+        str(folder),
+    ]
+    done = subprocess.run(
+        [*BLENDER, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=900
+    )
     assert (folder / "result.json").exists(), done.stdout[-3000:] + done.stderr[-3000:]
     result = json.loads((folder / "result.json").read_text())
     print({name: result[name] for name in ("version", "device", "pictures")})
@@ -72,13 +93,16 @@ def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarray, Camera]:
-    """(3, H, W) sRGB of the viewport in the screenshot, less its border, and the camera of that part."""
+    """(3, H, W) sRGB of the viewport in the screenshot, less its border, and the camera of that
+    part."""
     with np.load(folder / "views.npz") as views:
         width, height, *lens = views[name].tolist()
         camera = Camera(int(width), int(height), *lens, views[f"{name} pose"])
     x, y = (int(result["pictures"][name][axis]) for axis in "xy")
     with Image.open(folder / f"{name}.png") as screenshot:
-        pixels = np.asarray(screenshot.convert("RGB"), np.float32)[y : y + camera.height, x : x + camera.width]
+        pixels = np.asarray(screenshot.convert("RGB"), np.float32)[
+            y : y + camera.height, x : x + camera.width
+        ]
     width, height, m = camera.width - 2 * BORDER_PX, camera.height - 2 * BORDER_PX, BORDER_PX
     middle = replace(camera, width=width, height=height, cx=camera.cx - m, cy=camera.cy - m)
     return pixels[m:-m, m:-m].transpose(2, 0, 1) / 255, middle
@@ -86,16 +110,26 @@ def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarr
 
 @pytest.mark.parametrize(
     ("name", "behind"),
-    [("solid", BEHIND), ("wireframe", BEHIND), ("orthographic", BEHIND), ("filmic", BEHIND), ("engine", BLACK)],
+    [
+        ("solid", BEHIND),
+        ("wireframe", BEHIND),
+        ("orthographic", BEHIND),
+        ("filmic", BEHIND),
+        ("engine", BLACK),
+    ],
 )
-def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name: str, behind: np.ndarray) -> None:
+def test_viewport_equals_the_rasterizer(
+    shown: tuple[Path, dict[str, Any]], name: str, behind: np.ndarray
+) -> None:
     """Catches colors that a view transform, a blend or an offset of the viewport changes."""
     folder, result = shown
     found, camera = on_screen(folder, result, name)
     with np.load(folder / "views.npz") as views:
         pose = views["pose"]
     expected = avatar(3)
-    layer = PosedSplats(expected.splats, expected.frames(expected.neutral), pose, expected.antialiased)
+    layer = PosedSplats(
+        expected.splats, expected.frames(expected.neutral), pose, expected.antialiased
+    )
     image = compose([layer], camera)
     picture = np.clip(image.rgb + (1 - image.alpha) * behind[:, None, None], 0, 1)
     print(f"{name}: {psnr_db(found, picture):.1f} dB")
@@ -105,7 +139,8 @@ def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name
 
 @pytest.mark.parametrize("name", ["material agx", "engine filmic", "engine filmic points"])
 def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: str) -> None:
-    """Catches splats that AgX or Filmic changes, in a mode that goes through the scene's view transform."""
+    """Catches splats that AgX or Filmic changes, in a mode that goes through the scene's view
+    transform."""
     folder, result = shown
     found, plain = (on_screen(folder, result, which)[0] for which in (name, "solid"))
     same_view = {which: on_screen(folder, result, which)[1] for which in (name, "solid")}
@@ -116,7 +151,8 @@ def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: 
 
 
 def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches a head that throws no shadow on itself, because surfaces hide what is nearer to a sun or a lamp."""
+    """Catches a head that throws no shadow on itself, because surfaces hide what is nearer to a sun
+    or a lamp."""
     folder, result = shown
     atlas, of = np.load(folder / "shadows.npy"), avatar(3)
     assert set(result["lights"]) == {"sun", "point"}
@@ -126,19 +162,24 @@ def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_rendering_in_a_window(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches a render thread and a main thread that wait for each other, and a view transform not measured there."""
-    assert shown[1].get("rendered"), "not in a minute" if "rendered" not in shown[1] else "without the view transform"
+    """Catches a render thread and a main thread that wait for each other, and a view transform not
+    measured there."""
+    assert shown[1].get("rendered"), (
+        "not in a minute" if "rendered" not in shown[1] else "without the view transform"
+    )
 
 
 def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches splats that cover bones which are to be drawn in front, and holes in the splats around such bones."""
+    """Catches splats that cover bones which are to be drawn in front, and holes in the splats
+    around such bones."""
     folder, result = shown
     names = ("bone and splats", "bone", "hidden", "solid")
     both, bone, nothing, splats = (on_screen(folder, result, name)[0] for name in names)
     is_bone = np.abs(bone - nothing).max(0) > 0.1
     is_covered = is_bone & (np.ptp(splats, axis=0) > 0.25)
     assert is_covered.sum() > 300
-    darker = linear_to_srgb(np.maximum(srgb_to_linear(bone) - srgb_to_linear(nothing), 0))  # by the background's light
+    # by the background's light
+    darker = linear_to_srgb(np.maximum(srgb_to_linear(bone) - srgb_to_linear(nothing), 0))
     assert np.median(np.abs(both - darker).max(0)[is_covered]) < 0.05
     away = ~is_bone
     assert np.median(np.abs(both - splats).max(0)[away & (np.ptp(splats, axis=0) > 0.25)]) < 2 / 255
@@ -146,7 +187,8 @@ def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches splats where they are hidden or clipped, splats that ignore depth, and modes and views without splats."""
+    """Catches splats where they are hidden or clipped, splats that ignore depth, and modes and
+    views without splats."""
     folder, result = shown
     assert result["problem"] == ""
     pictures = {name: on_screen(folder, result, name)[0] for name in result["pictures"]}
@@ -164,12 +206,15 @@ def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
         whole = np.ptp(np.asarray(screenshot.convert("RGB"), np.float32) / 255, axis=2) > 0.5
     height, width = whole.shape[0] * 9 // 10, whole.shape[1] * 8 // 10
     assert all(
-        whole[y : y + height // 2, x : x + width // 2].sum() > 100 for y in (0, height // 2) for x in (0, width // 2)
+        whole[y : y + height // 2, x : x + width // 2].sum() > 100
+        for y in (0, height // 2)
+        for x in (0, width // 2)
     )
 
 
 def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches an error in every redraw, and a handler or textures that outlive the add-on or the file."""
+    """Catches an error in every redraw, and a handler or textures that outlive the add-on or the
+    file."""
     _, result = shown
     failed, removed, problem = result["failed"]
     assert failed
@@ -179,12 +224,15 @@ def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
     assert result["fallback"] == result["points"]
     assert result["unregistered"] == [True, True]
     assert result["after load"] == [True, True, ""]
-    assert result["drawn"] == [1, 1, 1, 1], "at first, after undo, after the add-on was off, and in the next file"
+    assert result["drawn"] == [1, 1, 1, 1], (
+        "at first, after undo, after the add-on was off, and in the next file"
+    )
     assert result["drawn without"] == 0
 
 
 def test_textures_are_freed(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches GPU memory held while nothing is displayed as trained, and splats that undo does not bring back."""
+    """Catches GPU memory held while nothing is displayed as trained, and splats that undo does not
+    bring back."""
     folder, result = shown
     assert result["freed"] == {
         "while drawn": False, "off": True, "removed": True, "disabled": True, "loaded": True,

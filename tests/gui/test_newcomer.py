@@ -1,4 +1,5 @@
-"""A newcomer's first ten minutes with the complete edition, in a window without a network: see test_scenario.py.
+"""A newcomer's first ten minutes with the complete edition, in a window without a network: see
+test_scenario.py.
 
 STGA_GUI_FOLDER: where the pictures of the steps are left.
 """
@@ -14,18 +15,31 @@ from blender.test_real_blender import blender, complete_zip
 from stga_addon.development.demo.capture import unpack_capture
 
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
-pytestmark = pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window")
+pytestmark = pytest.mark.skipif(
+    not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window"
+)
 SCRIPT = Path(__file__).with_name("newcomer_script.py")
 
 
 def test_ten_minutes(tmp_path: Path) -> None:
-    """Catches a step of the first ten minutes that needs more than its click, and what only a window has."""
+    """Catches a step of the first ten minutes that needs more than its click, and what only a
+    window has."""
     unpack_capture(tmp_path / "demo")
     archive, home = complete_zip(BLENDER, tmp_path / "dist", tmp_path / "demo"), tmp_path / "home"
     home.mkdir()
     pictures = Path(os.environ.get("STGA_GUI_FOLDER", tmp_path))
     pictures.mkdir(exist_ok=True)
-    blender(BLENDER, home, "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
+    blender(
+        BLENDER,
+        home,
+        "--command",
+        "extension",
+        "install-file",
+        "--repo",
+        "user_default",
+        "--enable",
+        archive,
+    )
     blender(BLENDER, home, "--python", SCRIPT, "--", pictures, background=False)
     seen = json.loads((pictures / "result.json").read_text())
     print(seen)

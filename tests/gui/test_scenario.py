@@ -1,4 +1,5 @@
-"""The Train step in a Blender with a window: `make test-gui`, with the command that starts it in STGA_BLENDER."""
+"""The Train step in a Blender with a window: `make test-gui`, with the command that starts it in
+STGA_BLENDER."""
 
 import json
 import os
@@ -17,7 +18,9 @@ from stga_addon.worker.status import request_cancel
 
 ROOT = Path(__file__).resolve().parents[2]
 BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
-pytestmark = pytest.mark.skipif(not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window")
+pytestmark = pytest.mark.skipif(
+    not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window"
+)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +28,16 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder with an empty Blender profile in which the built zip is installed."""
     folder = tmp_path_factory.mktemp("gui")
     archive = build_zip(folder)
-    blender(folder, "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive)
+    blender(
+        folder,
+        "--command",
+        "extension",
+        "install-file",
+        "--repo",
+        "user_default",
+        "--enable",
+        archive,
+    )
     yield folder
     for job in folder.glob("*/job"):  # whatever failed: no worker stays behind
         request_cancel(job)
@@ -34,7 +46,9 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def blender(home: Path, *arguments: object) -> None:
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home / "profile")}
     command = [*BLENDER, *map(str, arguments)]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=3600)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=3600
+    )
     (home / "output.txt").open("a").write(done.stdout + done.stderr)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
@@ -43,17 +57,31 @@ def play(home: Path, part: str, capture: Path, *file: object) -> dict[str, Any]:
     """What a part of scenario.py saw."""
     result = home / f"{part}.json"
     script = Path(__file__).with_name("scenario.py")
-    blender(home, *file, "--python", script, "--", part, result, capture, home / "head.blend", sys.executable)
+    blender(
+        home,
+        *file,
+        "--python",
+        script,
+        "--",
+        part,
+        result,
+        capture,
+        home / "head.blend",
+        sys.executable,
+    )
     seen: dict[str, Any] = json.loads(result.read_text())
     assert "traceback" not in seen, seen["traceback"]
     for name, times in seen["held up ms"].items():
         wall, cpu = (max(column) for column in zip(*times, strict=True)) if times else (0, 0)
-        print(f"{part}, {name}: {len(times)}, each at most {wall:.1f} ms by the clock, {cpu:.1f} ms of processor time")
+        print(
+            f"{part}, {name}: {len(times)}, each at most {wall:.1f} ms by the clock, {cpu:.1f} ms of processor time"
+        )
     return seen
 
 
 def test_training_in_a_window(home: Path) -> None:
-    """Catches what only a window has: timers, their end, undo, reopening, and workers that outlive Blender."""
+    """Catches what only a window has: timers, their end, undo, reopening, and workers that outlive
+    Blender."""
     capture = Path(os.environ.get("STGA_GUI_CAPTURE") or write_mesh_capture(home / "capture"))
     seen = play(home, "first", capture)
     assert seen["tested"].startswith(f"Python {sys.version.split()[0]}, torch ")
@@ -75,6 +103,10 @@ def test_training_in_a_window(home: Path) -> None:
     assert then["finished"]["avatar"] == str(home / "short/avatar.npz")
     assert then["finished"]["splats"] > 0
     assert then["dismissed"]
-    assert (then["recording written"], then["rendering written"], then["finished written"]) == (False, False, True)
+    assert (then["recording written"], then["rendering written"], then["finished written"]) == (
+        False,
+        False,
+        True,
+    )
     assert (then["video rendering"], then["video finished"]) == ("cancelled", "finished")
     assert then["frame after videos"] == 1

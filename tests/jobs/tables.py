@@ -21,15 +21,23 @@ from stga_addon.training.settings import make_settings
 
 HEAD = Path("/captures/anna")
 PLAYED = Played(
-    {-2: np.zeros((5, 3)), 12: np.ones((5, 3))}, {"expr": np.ones((2, 4))}, {-2: np.arange(4) < 2, 12: np.ones(4, bool)}
+    {-2: np.zeros((5, 3)), 12: np.ones((5, 3))},
+    {"expr": np.ones((2, 4))},
+    {-2: np.arange(4) < 2, 12: np.ones(4, bool)},
 )
 REQUESTS: tuple[Request, ...] = (
     Train(
-        Path("r"), HEAD, make_settings(iterations=3, preset="draft"), device="gpu:Name", selection={0: np.ones(4, bool)}
+        Path("r"),
+        HEAD,
+        make_settings(iterations=3, preset="draft"),
+        device="gpu:Name",
+        selection={0: np.ones(4, bool)},
     ),
     Resume(Path("r"), HEAD, Path("flame.pkl"), "opencv", selection={7: np.zeros(4, bool)}),
     Refine(Path("r_2"), Path("r"), "mouth", frames=(3, 5), growth=0.5, seconds=20.0),
-    Refine(Path("r_2"), Path("r"), weights=np.arange(4, dtype=np.float32) / 4, iterations=3, seed=2),
+    Refine(
+        Path("r_2"), Path("r"), weights=np.arange(4, dtype=np.float32) / 4, iterations=3, seed=2
+    ),
     Extend(Path("r_2"), Path("r"), (Path("/smile"), Path("/frown")), iterations=3),
     Select(HEAD, Path("flame.pkl"), threshold=0.01, zero_pose="all"),
     SelectForTake(Path("r"), Path("/smile")),
@@ -51,16 +59,36 @@ REQUESTS: tuple[Request, ...] = (
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
     Render(Path("r"), Path("v.mp4"), True, turntable=90.0, camera=2, seconds=3.0, played=PLAYED),
-    Render(Path("a.npz"), Path("p"), cameras=Path("t.json"), motion=Path("m.npz"), background=(0.0, 1.0, 0.5)),
+    Render(
+        Path("a.npz"),
+        Path("p"),
+        cameras=Path("t.json"),
+        motion=Path("m.npz"),
+        background=(0.0, 1.0, 0.5),
+    ),
     Benchmark(Path("b"), HEAD, 30.0, seed=2, only=("draft", "final")),
     RenderBlend(Path("/shots/head.blend"), Path("p"), (3, 12), "CYCLES"),
-    Export(Path("r"), Path("a.html"), "web", HEAD, played=PLAYED, frames=(3, 12), fps=30.0, motion_only=True),
+    Export(
+        Path("r"),
+        Path("a.html"),
+        "web",
+        HEAD,
+        played=PLAYED,
+        frames=(3, 12),
+        fps=30.0,
+        motion_only=True,
+    ),
     TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
     Evaluate(Path("r"), "test", capture=HEAD),
     Relight(Path("r"), card=(0.5, 0.4, 0.5), capture=HEAD),
     Render(Path("r"), Path("v.mp4"), True, light=Path("sunset.hdr"), light_turn=360.0),
-    ConvertMotion(Path("take.csv"), Path("m.npz"), HEAD, options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None)),
+    ConvertMotion(
+        Path("take.csv"),
+        Path("m.npz"),
+        HEAD,
+        options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None),
+    ),
 )
 RESULTS: tuple[Result, ...] = (
     Written(Path("a.npz"), ("PSNR 30 dB", "avatar: a.npz")),

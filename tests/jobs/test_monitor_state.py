@@ -56,7 +56,9 @@ def after(*events: Event, state: RequestState = TRAINING) -> tuple[RequestState,
     return state, list(effects)
 
 
-def status(state: WorkerState, preview: int = 0, folder: Path = JOB, error: str = "", **wanted: bool) -> StatusRead:
+def status(
+    state: WorkerState, preview: int = 0, folder: Path = JOB, error: str = "", **wanted: bool
+) -> StatusRead:
     """A status that was read; preview: stamp of the preview file, 0: there is none."""
     files = RunFiles(preview=(preview, 1) if preview else None)
     return StatusRead(folder, WorkerSnapshot(state, WorkerStatus(error=error)), files, **wanted)
@@ -71,14 +73,21 @@ def loads(effects: list[Effect]) -> list[Path]:
 
 @pytest.mark.parametrize("kind", Kind)
 def test_a_running_request_of_any_kind(kind):
-    """Catches a kind whose progress is not seen, that no timer follows, or a second request beside a running one."""
-    state, effects = after(START, state=RequestState(kind, Path("old"), JOB, error="old", stopped=True))
+    """Catches a kind whose progress is not seen, that no timer follows, or a second request beside
+    a running one."""
+    state, effects = after(
+        START, state=RequestState(kind, Path("old"), JOB, error="old", stopped=True)
+    )
     assert state == RequestState(kind, RUN, JOB)
     assert Redraw() in effects
     assert (Store(RUN, False) in effects) == (kind in (Kind.TRAINING, Kind.TRACKING, Kind.AVATAR))
     for worker in (WorkerState.STARTING, WorkerState.WORKING, WorkerState.CANCELLING):
         state, effects = after(status(worker), state=state)
-        assert (state.is_running, state.interval_s, state.can_be_dismissed) == (True, CHECK_INTERVAL_S, False)
+        assert (state.is_running, state.interval_s, state.can_be_dismissed) == (
+            True,
+            CHECK_INTERVAL_S,
+            False,
+        )
         assert effects == [Redraw()]
     assert after(status(WorkerState.CANCELLING), state=state) == (state, [])
 
@@ -86,8 +95,11 @@ def test_a_running_request_of_any_kind(kind):
 @pytest.mark.parametrize("kind", Kind)
 @pytest.mark.parametrize("end", ENDS)
 def test_any_end_of_any_kind_stops_the_timer(kind, end):
-    """Catches a timer that runs for ever, a result shown twice, and a failure or a cancelled request that is shown."""
-    state, _ = after(START, status(WorkerState.WORKING), status(end, error="why"), state=RequestState(kind))
+    """Catches a timer that runs for ever, a result shown twice, and a failure or a cancelled
+    request that is shown."""
+    state, _ = after(
+        START, status(WorkerState.WORKING), status(end, error="why"), state=RequestState(kind)
+    )
     shown = {Kind.TRAINING: ENDS[:2], Kind.VIDEO: (), Kind.AVATAR: ()}.get(kind, ENDS[:1])
     assert (state.loading is not None) == (end in shown)
     if state.loading is not None:
@@ -103,8 +115,8 @@ def test_any_end_of_any_kind_stops_the_timer(kind, end):
 
 @pytest.mark.parametrize("kind", Kind)
 def test_cancel(kind):
-    """Catches a cancel that throws work away, or that waits for what nobody needs; nothing is cancelled where nothing
-    is."""
+    """Catches a cancel that throws work away, or that waits for what nobody needs; nothing is
+    cancelled where nothing is."""
     idle, effects = after(CancelAsked(), state=RequestState(kind))
     assert not {StopWorker(JOB), KillWorker(JOB), RemoveFiles(JOB)} & set(effects)
     running, _ = after(START, status(WorkerState.WORKING), state=RequestState(kind))
@@ -128,7 +140,9 @@ def test_dismiss(kind):
 @pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
 def test_a_result_that_cannot_be_shown(kind):
     """Catches a failure that nobody sees, and one that is tried again for ever."""
-    state, effects = after(START, status(WorkerState.FINISHED), Failed("no head"), state=RequestState(kind))
+    state, effects = after(
+        START, status(WorkerState.FINISHED), Failed("no head"), state=RequestState(kind)
+    )
     assert (state.error, state.interval_s, state.is_running) == ("no head", None, False)
     assert PushUndo() not in effects
     done = Store(RUN, True) if kind == Kind.TRACKING else RemoveFiles(JOB)
@@ -137,7 +151,8 @@ def test_a_result_that_cannot_be_shown(kind):
 
 @pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
 def test_a_result_waits_until_the_scene_is_free(kind):
-    """Catches a mesh that is changed in Edit Mode, and a cancel that cannot stop what waits for its end."""
+    """Catches a mesh that is changed in Edit Mode, and a cancel that cannot stop what waits for its
+    end."""
     state, effects = after(START, status(WorkerState.FINISHED), state=RequestState(kind))
     for _ in range(3):
         assert not any(isinstance(effect, Show) for effect in effects)
@@ -149,18 +164,26 @@ def test_a_result_waits_until_the_scene_is_free(kind):
 def test_the_option_of_the_command_line_is_not_named():
     """Catches a panel that tells its user of an option which it has not."""
     analysis = RequestState(Kind.ANALYSIS)
-    state, _ = after(START, status(WorkerState.FAILED, error="--effect jaw=on: is impossible"), state=analysis)
+    state, _ = after(
+        START, status(WorkerState.FAILED, error="--effect jaw=on: is impossible"), state=analysis
+    )
     assert state.error == "jaw=on: is impossible"
 
 
 def test_an_undo_step_for_a_selection():
     """Catches a selection that undo cannot take back."""
-    _, effects = after(START, status(WorkerState.FINISHED), Shown(undoable=True), state=RequestState(Kind.SELECTION))
+    _, effects = after(
+        START,
+        status(WorkerState.FINISHED),
+        Shown(undoable=True),
+        state=RequestState(Kind.SELECTION),
+    )
     assert effects == [PushUndo(), RemoveFiles(JOB), Redraw()]
 
 
 def test_the_next_video_replaces_the_last_one():
-    """Catches a temporary folder for each video, and a recording that is removed when its worker starts."""
+    """Catches a temporary folder for each video, and a recording that is removed when its worker
+    starts."""
     first, _ = after(START, status(WorkerState.FINISHED), state=RequestState(Kind.VIDEO))
     _, effects = after(Started(RUN, Path("next")), state=first)
     assert RemoveFiles(JOB) in effects
@@ -172,14 +195,19 @@ def test_every_request_of_blender_has_a_kind():
     """Catches a field that a request does not have."""
     for request, job in JOBS.items():
         assert (job.kind is None) == (job.subject == "")
-        assert job.kind is None or job.subject in request.__dataclass_fields__ or hasattr(request, job.subject)
+        assert (
+            job.kind is None
+            or job.subject in request.__dataclass_fields__
+            or hasattr(request, job.subject)
+        )
 
 
 # Trainings
 
 
 def test_start_is_stored_and_monitored():
-    """Catches a training that the .blend file forgets, or that keeps the state of the one before."""
+    """Catches a training that the .blend file forgets, or that keeps the state of the one
+    before."""
     assert after(START)[1] == [Store(RUN, False), ReadCurve(RUN), Redraw()]
 
 
@@ -199,7 +227,8 @@ def test_each_preview_is_loaded_once():
 
 
 def test_no_preview_unless_wanted():
-    """Catches splats that keep changing although live preview is off, and a preview that is lost by turning it on."""
+    """Catches splats that keep changing although live preview is off, and a preview that is lost by
+    turning it on."""
     state, effects = after(START, status(WorkerState.WORKING, preview=1, live_preview=False))
     assert not loads(effects)
     assert loads(after(status(WorkerState.WORKING, preview=1), state=state)[1]) == [PREVIEW]
@@ -207,7 +236,8 @@ def test_no_preview_unless_wanted():
 
 @pytest.mark.parametrize("end", [WorkerState.FINISHED, WorkerState.CANCELLED])
 def test_result_is_shown_once(end):
-    """Catches a result that is not shown, or shown again at every check, or that undo cannot take back."""
+    """Catches a result that is not shown, or shown again at every check, or that undo cannot take
+    back."""
     state, effects = after(START, status(end))
     assert StoreAvatar(AVATAR) in effects
     assert loads(effects) == [AVATAR]
@@ -229,7 +259,10 @@ def test_result_that_is_not_wanted_is_only_stored():
 def test_result_waits_for_the_preview_that_is_being_built():
     """Catches two avatars that are built at the same time."""
     state, effects = after(
-        START, status(WorkerState.WORKING, preview=1), SliceBuilt(), status(WorkerState.FINISHED, preview=1)
+        START,
+        status(WorkerState.WORKING, preview=1),
+        SliceBuilt(),
+        status(WorkerState.FINISHED, preview=1),
     )
     assert not loads(effects)
     assert state.interval_s == SLICE_INTERVAL_S
@@ -244,7 +277,11 @@ def test_avatar_that_cannot_be_shown_is_reported():
     assert (state.error, state.result_shown, state.interval_s) == ("no head", True, None)
     assert effects == [Store(RUN, True), Redraw()]
     state, _ = after(START, status(WorkerState.WORKING, preview=1), Failed("no head"))
-    assert (state.error, state.result_shown, state.interval_s) == ("no head", False, CHECK_INTERVAL_S)
+    assert (state.error, state.result_shown, state.interval_s) == (
+        "no head",
+        False,
+        CHECK_INTERVAL_S,
+    )
 
 
 @pytest.mark.parametrize("end", [WorkerState.FAILED, WorkerState.LOST, WorkerState.NONE])
@@ -256,7 +293,8 @@ def test_failure_shows_no_avatar(end):
 
 
 def test_undo_does_not_lose_the_request():
-    """Catches a training that nobody can cancel because an undo step took the scene back to before it began."""
+    """Catches a training that nobody can cancel because an undo step took the scene back to before
+    it began."""
     state, _ = after(START, status(WorkerState.WORKING))
     assert after(SceneRead(None, False), state=state) == (state, [Store(RUN, False)])
     assert after(SceneRead(RUN, False), state=state) == (state, [])
@@ -278,16 +316,20 @@ def test_undo_does_not_bring_back_what_was_dismissed():
 
 
 def test_loaded_file_continues():
-    """Catches a worker that is not found again after reopening, and a result that is shown again then."""
+    """Catches a worker that is not found again after reopening, and a result that is shown again
+    then."""
     loaded = RequestState(Kind.TRAINING, RUN, JOB)
     assert after(status(WorkerState.WORKING), state=loaded)[0].interval_s == CHECK_INTERVAL_S
     assert loads(after(status(WorkerState.FINISHED), state=loaded)[1]) == [AVATAR]
-    assert not loads(after(status(WorkerState.FINISHED), state=replace(loaded, result_shown=True))[1])
+    assert not loads(
+        after(status(WorkerState.FINISHED), state=replace(loaded, result_shown=True))[1]
+    )
     assert TRAINING.interval_s is None
 
 
 def test_moved_run_folder():
-    """Catches a result read from the old place, and splats that the scene no longer recognizes as this run's."""
+    """Catches a result read from the old place, and splats that the scene no longer recognizes as
+    this run's."""
     moved = Path("elsewhere/run")
     state, effects = after(START, status(WorkerState.FINISHED, folder=moved / "job"))
     assert loads(effects) == [moved / "avatar.npz"]
@@ -306,8 +348,11 @@ def test_curve_is_read_when_it_grows():
 
 
 def test_unexpected_error_stops_until_the_next_start_or_check():
-    """Catches a timer that ends silently, one that repeats the same traceback, and one that never recovers."""
-    state, effects = after(START, status(WorkerState.WORKING, preview=1), Failed("a bug", stops=True))
+    """Catches a timer that ends silently, one that repeats the same traceback, and one that never
+    recovers."""
+    state, effects = after(
+        START, status(WorkerState.WORKING, preview=1), Failed("a bug", stops=True)
+    )
     assert (state.error, state.interval_s, effects) == ("a bug", None, [Redraw()])
     for restart in (START, status(WorkerState.WORKING)):
         restarted, _ = after(restart, status(WorkerState.WORKING), state=state)
@@ -316,7 +361,9 @@ def test_unexpected_error_stops_until_the_next_start_or_check():
 
 def test_training_that_ends_while_a_preview_is_shown():
     """Catches checks that end with the worker, so that its last avatar never reaches the scene."""
-    state, _ = after(START, status(WorkerState.WORKING, preview=1), status(WorkerState.CANCELLED, preview=1))
+    state, _ = after(
+        START, status(WorkerState.WORKING, preview=1), status(WorkerState.CANCELLED, preview=1)
+    )
     state, _ = after(Shown(), state=state)
     assert state.interval_s == CHECK_INTERVAL_S
     state, effects = after(status(WorkerState.CANCELLED, preview=1), state=state)
@@ -336,8 +383,8 @@ def made(state: WorkerState, **files: int) -> StatusRead:
 
 
 def test_head_previews_and_avatar_appear_once_each():
-    """Catches a head that is imported anew at every look or never, a preview that has no head to be shown on, and an
-    avatar of another folder."""
+    """Catches a head that is imported anew at every look or never, a preview that has no head to be
+    shown on, and an avatar of another folder."""
     making = RequestState(Kind.AVATAR)
     state, _ = after(START, made(WorkerState.WORKING), state=making)
     assert state.loading is None
@@ -351,13 +398,21 @@ def test_head_previews_and_avatar_appear_once_each():
     assert loads(effects) == [RUN / "run" / "avatar.npz"]
     assert StoreAvatar(RUN / "run" / "avatar.npz") in effects
     state, effects = after(Shown(), state=state)
-    assert (PushUndo() in effects, Store(RUN, True) in effects, state.interval_s) == (True, True, None)
-    assert after(made(WorkerState.FINISHED, capture=1, preview=1, avatar=1), state=state)[0].loading is None
+    assert (PushUndo() in effects, Store(RUN, True) in effects, state.interval_s) == (
+        True,
+        True,
+        None,
+    )
+    assert (
+        after(made(WorkerState.FINISHED, capture=1, preview=1, avatar=1), state=state)[0].loading
+        is None
+    )
 
 
 @pytest.mark.parametrize("end", [WorkerState.CANCELLED, WorkerState.FAILED])
 def test_what_was_never_made_is_not_shown(end):
-    """Catches an error about a missing avatar after the tracking was cancelled, and a head imported from an old one."""
+    """Catches an error about a missing avatar after the tracking was cancelled, and a head imported
+    from an old one."""
     state, effects = after(START, made(end, capture=1), state=RequestState(Kind.AVATAR))
     assert (state.loading, loads(effects), state.interval_s) == (None, [], None)
 

@@ -30,22 +30,31 @@ def test_check_is_described():
     old = {**FOUND, "python": "3.9.1"}
     with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
         describe_check("p", old)
-    bare = {**FOUND, "failures": {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}}
-    with pytest.raises(StgaError, match=r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"):
+    bare = {
+        **FOUND,
+        "failures": {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"},
+    }
+    with pytest.raises(
+        StgaError, match=r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"
+    ):
         describe_check("p", bare)
 
 
 def test_bare_interpreter_is_checked(tmp_path):
     """Catches a check that itself needs a package: this interpreter has none."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True
+    )
     python = next(path for path in (tmp_path / "venv").glob("*/python*") if path.stem == "python")
-    with pytest.raises(StgaError, match=r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"):
+    with pytest.raises(
+        StgaError, match=r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"
+    ):
         check(python)
 
 
 def test_other_programs_are_refused(tmp_path):
-    """Catches a traceback where the path is missing or that of another program, and a program that is waited for
-    for ever."""
+    """Catches a traceback where the path is missing or that of another program, and a program that
+    is waited for for ever."""
     with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
         check(tmp_path / "python")
     with pytest.raises(StgaError, match=r"is not a Python that runs this add-on \(exit status 1\)"):
@@ -58,7 +67,8 @@ def test_other_programs_are_refused(tmp_path):
 
 @pytest.mark.slow
 def test_this_interpreter_passes():
-    """Catches a check that misses installed packages, or the GPUs that training is given by name."""
+    """Catches a check that misses installed packages, or the GPUs that training is given by
+    name."""
     pytest.importorskip("torch")
     pytest.importorskip("wgpu")
     from stga_addon.raster.gpu.adapters import adapters
@@ -69,10 +79,13 @@ def test_this_interpreter_passes():
 
 
 def test_order_of_choices(monkeypatch):
-    """Catches a farm's variable or the preferences overruled, and a missing Python without what to do."""
+    """Catches a farm's variable or the preferences overruled, and a missing Python without what to
+    do."""
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(training_python, "missing_packages", lambda: ["torch"])
-    with pytest.raises(StgaError, match=rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"):
+    with pytest.raises(
+        StgaError, match=rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"
+    ):
         find_training_python()
     assert find_training_python("/preferred/python") == "/preferred/python"
     monkeypatch.setattr(training_python, "missing_packages", list)

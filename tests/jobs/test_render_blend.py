@@ -1,4 +1,5 @@
-"""Rendering a .blend file's frames with a program in place of Blender; `tests/batch/test_blender.py` has a real one."""
+"""Rendering a .blend file's frames with a program in place of Blender;
+`tests/batch/test_blender.py` has a real one."""
 
 import os
 import signal
@@ -64,7 +65,9 @@ def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> 
     shares: list[float] = []
     perform(shot, lambda progress: bool(shares.append(progress.share)), lambda line: None)
     assert pictures(shot.output) == WHOLE
-    assert calls(tmp_path) == [[*span, "STGA_SPLATS", sys.executable] for span in (("8", "9"), ("11", "12"))]
+    assert calls(tmp_path) == [
+        [*span, "STGA_SPLATS", sys.executable] for span in (("8", "9"), ("11", "12"))
+    ]
     assert shares == [0.2, 0.4, 0.6, 0.8, 1.0]
     perform(shot, ignore, lambda line: None)
     assert len(calls(tmp_path)) == 2
@@ -75,27 +78,38 @@ def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_
     program = tmp_path / "Blender Foundation" / "blender"
     program.parent.mkdir()
     program.touch()
-    for text, command in ((str(program), [str(program)]), ("xvfb-run -a blender", ["xvfb-run", "-a", "blender"])):
+    for text, command in (
+        (str(program), [str(program)]),
+        ("xvfb-run -a blender", ["xvfb-run", "-a", "blender"]),
+    ):
         monkeypatch.setenv("STGA_BLENDER", text)
         assert blender_command() == command
     monkeypatch.delenv("STGA_BLENDER")
     assert blender_command() == ["blender"]
 
 
-def test_what_went_wrong_is_a_sentence(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a film that counts as finished although frames are missing, and a Blender that is not there."""
+def test_what_went_wrong_is_a_sentence(
+    shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a film that counts as finished although frames are missing, and a Blender that is not
+    there."""
     monkeypatch.setenv("FAILS", "10")
     with pytest.raises(
-        StgaError, match=r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"
+        StgaError,
+        match=r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory",
     ):
         perform(shot, ignore, lambda line: None)
     assert sorted(pictures(shot.output)) == ["000008.png", "000009.png"]
     monkeypatch.setenv("STGA_BLENDER", str(tmp_path / "nowhere"))
-    with pytest.raises(StgaError, match=r"nowhere: Blender cannot be started .*; expected it on PATH"):
+    with pytest.raises(
+        StgaError, match=r"nowhere: Blender cannot be started .*; expected it on PATH"
+    ):
         perform(shot, ignore, lambda line: None)
 
 
-def test_cancelling_ends_blender(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cancelling_ends_blender(
+    shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a Blender that goes on after Ctrl-C, and pictures of which only a part is written."""
     monkeypatch.setenv("PAUSE", "0.3")
 
@@ -110,12 +124,19 @@ def test_cancelling_ends_blender(shot: RenderBlend, tmp_path: Path, monkeypatch:
         os.kill(process, 0)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux ends a process with the one that started it")
-def test_blender_ends_with_a_killed_worker(shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches two Blenders that render the same frames after a worker was killed, and half a picture among the rest."""
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="Linux ends a process with the one that started it"
+)
+def test_blender_ends_with_a_killed_worker(
+    shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches two Blenders that render the same frames after a worker was killed, and half a
+    picture among the rest."""
     monkeypatch.setenv("PAUSE", "0.5")
     write_request(tmp_path / "job", shot)
-    worker = subprocess.Popen([sys.executable, "-m", *worker_arguments(tmp_path / "job", resume=True)])
+    worker = subprocess.Popen(
+        [sys.executable, "-m", *worker_arguments(tmp_path / "job", resume=True)]
+    )
     deadline = time.monotonic() + 60
     while not pictures(shot.output) and time.monotonic() < deadline:
         time.sleep(0.05)

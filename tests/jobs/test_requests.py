@@ -1,4 +1,5 @@
-"""Requests: what is written down, what is refused, and that a worker does what the same process would."""
+"""Requests: what is written down, what is refused, and that a worker does what the same process
+would."""
 
 import json
 import math
@@ -71,7 +72,9 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, Mapping):
         return dict(a).keys() == dict(b).keys() and all(same(a[key], b[key]) for key in a)
     if hasattr(a, "__dataclass_fields__"):
-        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+        return type(a) is type(b) and all(
+            same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a)
+        )
     return type(a) is type(b) and bool(a == b)
 
 
@@ -81,7 +84,9 @@ def capture(tmp_path: Path) -> Path:
 
 
 def training(run: Path, capture: Path, **changes: Any) -> Train:
-    settings = make_settings("selective", **{"iterations": 12, "hull_points": False, "seed": 3, **changes})
+    settings = make_settings(
+        "selective", **{"iterations": 12, "hull_points": False, "seed": 3, **changes}
+    )
     return Train(run, capture, settings, principal_point="opencv", selection=painted())
 
 
@@ -97,7 +102,8 @@ def asked(request: Train | Resume | Refine) -> Path:
 
 
 def test_every_request_is_tried() -> None:
-    """Catches a request, or a result, that is added without being in the tables here or without work."""
+    """Catches a request, or a result, that is added without being in the tables here or without
+    work."""
     assert {type(request) for request in REQUESTS} == set(get_args(Request)) == set(JOBS)
     assert {type(result) for result in RESULTS} == set(get_args(Result))
 
@@ -127,7 +133,8 @@ def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> Non
 
 
 def test_refusals(tmp_path: Path, capture: Path) -> None:
-    """Catches a run that is overwritten, and one resumed that is not there: both before a worker is started."""
+    """Catches a run that is overwritten, and one resumed that is not there: both before a worker is
+    started."""
     run = tmp_path / "run"
     with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
         check_request(Resume(run))
@@ -146,14 +153,17 @@ def test_refusals(tmp_path: Path, capture: Path) -> None:
 
 
 def test_the_worker_refuses_another_run(tmp_path: Path, capture: Path) -> None:
-    """Catches a run continued with another principal point: reading the capture is left to the worker."""
+    """Catches a run continued with another principal point: reading the capture is left to the
+    worker."""
     pytest.importorskip("torch")
     run = tmp_path / "run"
     write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
     folder = asked(Resume(run, principal_point="opencv"))
     with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
         perform_in_folder(folder)
-    assert inspect_worker(folder).status.error.startswith(f"{run}: was trained with principal point")
+    assert inspect_worker(folder).status.error.startswith(
+        f"{run}: was trained with principal point"
+    )
     assert not (run / "avatar.npz").exists()
 
 
@@ -166,7 +176,8 @@ DAMAGES: dict[str, Any] = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_requests(tmp_path: Path, name: str) -> None:
-    """Catches a traceback, or a guess, where a request was damaged or comes from another version."""
+    """Catches a traceback, or a guess, where a request was damaged or comes from another
+    version."""
     write_request(tmp_path, REQUESTS[0])
     edit(tmp_path / REQUEST, lambda values: values.update({name: DAMAGES[name]}))
     with pytest.raises(StgaError, match=r"request\.json: ") as caught:
@@ -174,7 +185,9 @@ def test_damaged_requests(tmp_path: Path, name: str) -> None:
     assert name in str(caught.value) or "not a request that this version reads" in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["[]", "3", '{"format": "stga-request", "version": 1}', "[" * 100_000])
+@pytest.mark.parametrize(
+    "text", ["[]", "3", '{"format": "stga-request", "version": 1}', "[" * 100_000]
+)
 def test_what_is_no_request(tmp_path: Path, text: str) -> None:
     """Catches a traceback for JSON of another form."""
     (tmp_path / REQUEST).write_text(text)
@@ -203,15 +216,28 @@ def test_a_missing_array(tmp_path: Path) -> None:
 def test_figures_in_short_lines() -> None:
     """Catches a panel that shows what is not known yet, or numbers that nobody can read."""
     assert describe_figures({}) == []
-    figures = {"iteration": 900, "per_second": 12.34, "left_s": 125.0, "splats": 61234.0, "psnr": 30.0}
-    assert describe_figures(figures) == ["12.3 it/s   2.1 min left", "PSNR 30.00 dB", "61\u202f234 splats"]
+    figures = {
+        "iteration": 900,
+        "per_second": 12.34,
+        "left_s": 125.0,
+        "splats": 61234.0,
+        "psnr": 30.0,
+    }
+    assert describe_figures(figures) == [
+        "12.3 it/s   2.1 min left",
+        "PSNR 30.00 dB",
+        "61\u202f234 splats",
+    ]
     tracked = {"left_s": 31.0, "error_px": 1.92, "unexplained": 0.043}
-    assert describe_figures(tracked) == ["31 s left", "1.9 px off landmarks   4% of the face unexplained"]
+    assert describe_figures(tracked) == [
+        "31 s left",
+        "1.9 px off landmarks   4% of the face unexplained",
+    ]
 
 
 def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
-    """Catches a time left that is that of an average over slow and fast work, or of work that an interrupted call had
-    done before and that is only read now."""
+    """Catches a time left that is that of an average over slow and fast work, or of work that an
+    interrupted call had done before and that is only read now."""
     now = 0.0
     left = TimeLeft(lambda: now)
     assert math.isnan(left.after(0.0))
@@ -227,9 +253,11 @@ def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
 
 
 @pytest.mark.slow
-def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path: Path, capture: Path) -> None:
-    """Catches a render farm whose pictures or files differ from those that were looked at before: option by option,
-    `stga render` and `stga export` ask for what the requests say."""
+def test_a_worker_renders_and_exports_what_the_command_line_would(
+    tmp_path: Path, capture: Path
+) -> None:
+    """Catches a render farm whose pictures or files differ from those that were looked at before:
+    option by option, `stga render` and `stga export` ask for what the requests say."""
     pytest.importorskip("numba")
     ball = open_capture(capture)
     splats = lattice_splats(ball.neutral, ball.faces, order=0)
@@ -237,15 +265,43 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path: Path
     avatar, cameras = tmp_path / "a.npz", capture / "transforms_val.json"
     write_avatar(avatar, Avatar(splats, "stga", ball.neutral.astype(np.float32), ball.faces))
     given = [str(avatar), "--capture", str(capture)]
-    turned = ["--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1", "--device", "cpu"]
+    turned = [
+        "--turntable",
+        "120",
+        "--seconds",
+        "0.5",
+        "--fps",
+        "8",
+        "--camera",
+        "1",
+        "--device",
+        "cpu",
+    ]
     asked_for: dict[str, tuple[list[str], Request]] = {
         "pictures": (
             ["render", *given, "--cameras", str(cameras), "--background", "black", "--out"],
-            Render(avatar, tmp_path / "pictures", cameras=cameras, capture=capture, background=(0.0, 0.0, 0.0)),
+            Render(
+                avatar,
+                tmp_path / "pictures",
+                cameras=cameras,
+                capture=capture,
+                background=(0.0, 0.0, 0.0),
+            ),
         ),
         "film.mp4": (
             ["render", *given, *turned, "--video"],
-            Render(avatar, tmp_path / "film.mp4", True, None, 120.0, 1, 8.0, 0.5, capture=capture, device="cpu"),
+            Render(
+                avatar,
+                tmp_path / "film.mp4",
+                True,
+                None,
+                120.0,
+                1,
+                8.0,
+                0.5,
+                capture=capture,
+                device="cpu",
+            ),
         ),
         "plys": (
             ["export", *given, "--format", "ply-sequence", "--frames", "1:3", "--out"],
@@ -270,7 +326,9 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path: Path
 
 def contents(path: Path) -> dict[str, bytes]:
     """Name -> bytes of the files of a folder, or of one file."""
-    return {file.name: file.read_bytes() for file in (path.glob("[!.]*") if path.is_dir() else (path,))}
+    return {
+        file.name: file.read_bytes() for file in (path.glob("[!.]*") if path.is_dir() else (path,))
+    }
 
 
 @pytest.mark.slow
@@ -283,7 +341,12 @@ def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Pa
     for name, kept in (("turn", 3), ("turn.mp4", 0)):
         folder = tmp_path / f"{name}_job"
         is_video = name.endswith(".mp4")
-        write_request(folder, Render(avatar, tmp_path / name, is_video, turntable=90.0, capture=capture, device="cpu"))
+        write_request(
+            folder,
+            Render(
+                avatar, tmp_path / name, is_video, turntable=90.0, capture=capture, device="cpu"
+            ),
+        )
 
         def cancel_at_the_second(progress: Progress, folder: Path = folder) -> bool:
             if progress.detail.startswith("Image 2 of"):
@@ -298,7 +361,8 @@ def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Pa
 
 @pytest.mark.slow
 def test_cancel_keeps_the_avatar_and_resume_goes_on(tmp_path: Path, capture: Path) -> None:
-    """Catches a cancel that throws work away, a resumed run that begins anew, and figures that the panel never gets."""
+    """Catches a cancel that throws work away, a resumed run that begins anew, and figures that the
+    panel never gets."""
     pytest.importorskip("torch")
     run = tmp_path / "run"
     folder = asked(training(run, capture, iterations=40))
@@ -341,7 +405,9 @@ def test_a_request_continues_what_it_began(tmp_path: Path, capture: Path) -> Non
         perform_in_folder(folder)
     asked(request)
     iterations = []
-    perform_in_folder(folder, also=lambda progress: iterations.append(iteration_of(progress)), resume=True)
+    perform_in_folder(
+        folder, also=lambda progress: iterations.append(iteration_of(progress)), resume=True
+    )
     assert min(n for n in iterations if n) >= 5
     assert max(iterations) == 40
     tracked = Track(tmp_path, tmp_path / "head.npz", tmp_path / "tracked")
@@ -357,7 +423,9 @@ def iteration_of(progress: Progress) -> float:
 
 
 @pytest.mark.slow
-def test_previews_while_it_trains(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_previews_while_it_trains(
+    tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a preview that never comes, cannot be read, or changes what is trained."""
     pytest.importorskip("torch")
     monkeypatch.setattr(performing, "PREVIEW_INTERVAL_S", 0.0)
@@ -374,11 +442,15 @@ def test_previews_while_it_trains(tmp_path: Path, capture: Path, monkeypatch: py
     monkeypatch.setattr(performing, "PREVIEW_INTERVAL_S", 1e9)
     perform_in_folder(asked(training(quiet, capture)))
     assert not (request_folder(quiet) / PREVIEW).exists()
-    np.testing.assert_array_equal(read_npz(run / "avatar.npz")["xyz"], read_npz(quiet / "avatar.npz")["xyz"])
+    np.testing.assert_array_equal(
+        read_npz(run / "avatar.npz")["xyz"], read_npz(quiet / "avatar.npz")["xyz"]
+    )
 
 
 @pytest.mark.slow
-def test_a_full_disk_costs_only_the_preview(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_costs_only_the_preview(
+    tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a training that ends because its preview could not be written."""
     pytest.importorskip("torch")
 
@@ -394,8 +466,11 @@ def test_a_full_disk_costs_only_the_preview(tmp_path: Path, capture: Path, monke
 
 
 @pytest.mark.slow
-def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path: Path, capture: Path, capsys: Any) -> None:
-    """Catches a worker whose failure only its log shows, and a command that ends well although nothing was trained."""
+def test_mistakes_reach_the_folder_and_the_exit_code(
+    tmp_path: Path, capture: Path, capsys: Any
+) -> None:
+    """Catches a worker whose failure only its log shows, and a command that ends well although
+    nothing was trained."""
     pytest.importorskip("torch")
     assert main(["perform", str(tmp_path / "nothing")]) == 2
     assert "holds no request" in capsys.readouterr().err
@@ -439,12 +514,17 @@ def test_interrupted_work_is_cancelled(tmp_path: Path, capture: Path) -> None:
 def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path) -> None:
     """Catches a traceback about imports where a sentence should say which Python lacks what."""
     folder = asked(training(tmp_path / "run", capture))
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True
+    )
     python = tmp_path / "venv/bin/python"
     process = start_worker(folder, str(python), worker_arguments(folder))
     assert process.wait(60) == 2
     seen = inspect_worker(folder, process)
-    assert seen.status.error == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
+    assert (
+        seen.status.error
+        == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
+    )
 
 
 def test_a_head_that_is_not_there_is_a_sentence(tmp_path: Path) -> None:
@@ -474,14 +554,19 @@ def test_removed_request_leaves_other_files(tmp_path: Path, capture: Path) -> No
 
 @pytest.mark.slow
 def test_a_worker_refines_and_resumes(tmp_path: Path, capture: Path) -> None:
-    """Catches a worker that trains anew, or ignores the painted region, where a run is to be continued."""
+    """Catches a worker that trains anew, or ignores the painted region, where a run is to be
+    continued."""
     pytest.importorskip("torch")
     perform(training(tmp_path / "run", capture))
     weights = np.zeros(len(ball()[1]), np.float32)
     weights[:40] = 1.0
     refined = tmp_path / "run_2"
-    perform_in_folder(asked(Refine(refined, tmp_path / "run", weights=weights, iterations=4, device="cpu")))
-    before, after = (read_avatar(folder / "avatar.npz").splats for folder in (tmp_path / "run", refined))
+    perform_in_folder(
+        asked(Refine(refined, tmp_path / "run", weights=weights, iterations=4, device="cpu"))
+    )
+    before, after = (
+        read_avatar(folder / "avatar.npz").splats for folder in (tmp_path / "run", refined)
+    )
     unchanged = (before.sh == after.sh).all((1, 2))
     assert unchanged[before.face >= 40].all()
     assert not unchanged[before.face < 40].all()

@@ -14,15 +14,21 @@ RADIUS = 0.1
 
 
 def ball_and_plate(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) meters and triangles (F, 3) of a ball of 10 cm, and a plate 6 cm above a part of it."""
+    """Vertices (V, 3) meters and triangles (F, 3) of a ball of 10 cm, and a plate 6 cm above a part
+    of it."""
     ball = trimesh.creation.icosphere(subdivisions, RADIUS)
-    plate = trimesh.creation.box((0.12, 0.01, 0.12), trimesh.transformations.translation_matrix((0.05, 0.16, 0.0)))
+    plate = trimesh.creation.box(
+        (0.12, 0.01, 0.12), trimesh.transformations.translation_matrix((0.05, 0.16, 0.0))
+    )
     both = trimesh.util.concatenate([ball, plate])
     return np.array(both.vertices), np.array(both.faces, np.int32)
 
 
-def blocked(points: np.ndarray, direction: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(N,) bool: whether a ray from each point in a direction meets a triangle (Möller and Trumbore), float64."""
+def blocked(
+    points: np.ndarray, direction: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
+    """(N,) bool: whether a ray from each point in a direction meets a triangle (Möller and
+    Trumbore), float64."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     first, second = b - a, c - a
     across = np.cross(direction, second)
@@ -39,16 +45,20 @@ def blocked(points: np.ndarray, direction: np.ndarray, vertices: np.ndarray, fac
     return found
 
 
-def lit_avatar(albedo: tuple[float, float, float] = (0.5, 0.3, 0.2), radiance: float = 0.5, degree: int = 0) -> Avatar:
-    """The ball and plate as an avatar: a splat in the middle of each triangle, recorded in even light; its colors are
-    those of a surface of this albedo without highlights."""
+def lit_avatar(
+    albedo: tuple[float, float, float] = (0.5, 0.3, 0.2), radiance: float = 0.5, degree: int = 0
+) -> Avatar:
+    """The ball and plate as an avatar: a splat in the middle of each triangle, recorded in even
+    light; its colors are those of a surface of this albedo without highlights."""
     vertices, faces = ball_and_plate()
     transfer, occlusion = transfer_of(vertices, faces, 64)
     light = uniform(np.full(3, radiance))
     arriving = transfer @ light
     arriving = arriving + Bounce(vertices, faces, occlusion).light(arriving)
     skin = np.zeros(len(vertices), np.float32)
-    avatar_light = AvatarLight(light.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), skin, 0.0)
+    avatar_light = AvatarLight(
+        light.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), skin, 0.0
+    )
     count = len(faces)
     color = linear_to_srgb(arriving[faces].mean(1) / np.pi * (np.array(albedo) + HIGHLIGHT_SHARE))
     sh = np.zeros((count, (degree + 1) ** 2, 3), np.float32)

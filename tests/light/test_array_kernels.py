@@ -15,18 +15,37 @@ from .scenes import ball_and_plate
 LIGHTS = (
     Light("sun", np.array([1.0, 2.0, 3.0]), direction=(-0.3, -1, 0.1), angle=0.1),
     Light("point", np.ones(3), (0.3, 0.8, 0.2), radius=0.1, specular=0.5),
-    Light("spot", np.ones(3) * 5, (0.0, 0.9, 0.2), direction=(0.1, -1, 0), cone=0.3, blend=0.5, casts_shadow=False),
-    Light("area", np.ones(3), (0.5, 0.5, 0.2), direction=(-1, -1, 0), size=(0.3, 0.4), shape="ellipse", diffuse=0.7),
+    Light(
+        "spot",
+        np.ones(3) * 5,
+        (0.0, 0.9, 0.2),
+        direction=(0.1, -1, 0),
+        cone=0.3,
+        blend=0.5,
+        casts_shadow=False,
+    ),
+    Light(
+        "area",
+        np.ones(3),
+        (0.5, 0.5, 0.2),
+        direction=(-1, -1, 0),
+        size=(0.3, 0.4),
+        shape="ellipse",
+        diffuse=0.7,
+    ),
 )
 
 
 def test_lights():
-    """Catches a kind of light, highlight, cone or shadow that Blender's Python computes otherwise than training's."""
+    """Catches a kind of light, highlight, cone or shadow that Blender's Python computes otherwise
+    than training's."""
     rng = np.random.default_rng(0)
     points = rng.normal(0, 0.1, (500, 3)).astype(np.float32)
     normals = rng.normal(0, 1, points.shape)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    table = np.concatenate([light_rows(light, np.zeros(3), n - 1) for n, light in enumerate(LIGHTS)])
+    table = np.concatenate(
+        [light_rows(light, np.zeros(3), n - 1) for n, light in enumerate(LIGHTS)]
+    )
     lit = rng.random((3, 500), np.float32)
     roughness = rng.choice(np.float32([0, 0.2, 0.45]), 500)
     rest = np.float32([0.1, 0.2, 0.7]), roughness, np.full(500, 0.04, np.float32), table, lit
@@ -49,7 +68,9 @@ def test_shadow_maps(light):
     assert (np.isfinite(depth[0]) != np.isfinite(depth[1])).mean() < 1e-3
     both = np.isfinite(depth[0]) & np.isfinite(depth[1])
     assert np.abs(depth[0][both] - depth[1][both]).mean() < 1e-6
-    places = np.concatenate([points, [[-1e6, -1e6, 0.1], [300, 128, 0.1], [0.2, 0.1, 5]]]).astype(np.float32)
+    places = np.concatenate([points, [[-1e6, -1e6, 0.1], [300, 128, 0.1], [0.2, 0.1, 5]]]).astype(
+        np.float32
+    )
     bias = np.random.default_rng(0).uniform(0, 0.006, len(places)).astype(np.float32)
     for step in (0.0, 2.0):
         lit = [np.empty(len(places), np.float32) for _ in range(2)]

@@ -38,18 +38,35 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["train", str(root), "--out", str(out), "--iterations", "10", "--schedule", "paper"]) == 0
+    assert (
+        main(["train", str(root), "--out", str(out), "--iterations", "10", "--schedule", "paper"])
+        == 0
+    )
     return out
 
 
 def rendered(run: Path, root: Path, out: Path, *options: str) -> np.ndarray:
-    assert main(["render", str(run), "--cameras", str(root / "transforms_val.json"), "--out", str(out), *options]) == 0
+    assert (
+        main(
+            [
+                "render",
+                str(run),
+                "--cameras",
+                str(root / "transforms_val.json"),
+                "--out",
+                str(out),
+                *options,
+            ]
+        )
+        == 0
+    )
     with Image.open(sorted(out.iterdir())[0]) as image:
         return np.asarray(image).astype(int)
 
 
 def test_a_run_ends_with_its_light(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a training that leaves the avatar without light, and an avatar file that loses it or grows by much."""
+    """Catches a training that leaves the avatar without light, and an avatar file that loses it or
+    grows by much."""
     avatar = read_avatar(run / "avatar.npz")
     assert avatar.light is not None
     assert avatar.light.transfer.shape == (len(avatar.neutral), 9)
@@ -86,19 +103,23 @@ def test_a_gray_card_sets_the_level(run: Path, tmp_path: Path, root: Path) -> No
         assert light is not None
         assert light.source == "gray_card"
         found.append(light.irradiance.mean(0))
-    np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)  # the ball of this capture has no red
+    # the ball of this capture has no red
+    np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)
 
 
 def test_a_running_trainings_avatar_is_kept(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a light that is written into an older avatar than the one which a training saved meanwhile."""
+    """Catches a light that is written into an older avatar than the one which a training saved
+    meanwhile."""
     copy = tmp_path / "run"
     shutil.copytree(run, copy)
     before = (copy / "avatar.npz").read_bytes()
     with locked(copy):  # as a training has it
         assert main(["relight", str(copy)]) == 2
-    assert f"another run is working in this folder (process {os.getpid()})" in capsys.readouterr().err
+    assert (
+        f"another run is working in this folder (process {os.getpid()})" in capsys.readouterr().err
+    )
     assert (copy / "avatar.npz").read_bytes() == before
 
     def estimate(*given: object) -> object:
@@ -114,8 +135,9 @@ def test_a_running_trainings_avatar_is_kept(
 
 
 def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> None:
-    """Catches a light that is estimated from images without the exposure correction that the avatar's colors have: a
-    camera of another gain, offset and white balance changes nothing, against images without any."""
+    """Catches a light that is estimated from images without the exposure correction that the
+    avatar's colors have: a camera of another gain, offset and white balance changes nothing,
+    against images without any."""
     gain, offset = np.array([0.7, 0.8, 0.6]), np.array([12.0, 5.0, 8.0])
     shutil.copytree(root, tmp_path / "capture")
     for path in (tmp_path / "capture/images").glob("*_02.png"):
@@ -131,11 +153,13 @@ def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> N
     add_light(avatar_file, open_capture(tmp_path / "capture"))
     light = read_avatar(avatar_file).light
     assert light is not None
-    np.testing.assert_allclose(light.irradiance, avatar.light.irradiance, rtol=0.05)  # images are rounded to levels
+    # images are rounded to levels
+    np.testing.assert_allclose(light.irradiance, avatar.light.irradiance, rtol=0.05)
 
 
 def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
-    """Catches lights that do not reach the picture, come from the other side, and pixels that change without any."""
+    """Catches lights that do not reach the picture, come from the other side, and pixels that
+    change without any."""
     lights = tmp_path / "lights.toml"
     lights.write_text(LIGHTS)
     plain = rendered(run, root, tmp_path / "plain")
@@ -151,7 +175,9 @@ def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
     assert brighter[: len(brighter) // 2 - 5].sum() < 0 < brighter[len(brighter) // 2 + 5 :].sum()
 
 
-def test_render_refuses(run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_render_refuses(
+    run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches a traceback for an avatar without light, and options without effect."""
     plain = tmp_path / "plain.npz"
     write_avatar(plain, replace(read_avatar(run / "avatar.npz"), light=None))
@@ -159,7 +185,10 @@ def test_render_refuses(run: Path, root: Path, tmp_path: Path, capsys: pytest.Ca
     lights.write_text(LIGHTS)
     cameras = ["--cameras", str(root / "transforms_val.json"), "--out", str(tmp_path / "p")]
     for arguments, message in (
-        ([str(plain), "--capture", str(root), *cameras, "--light", str(lights)], "stga relight RUN"),
+        (
+            [str(plain), "--capture", str(root), *cameras, "--light", str(lights)],
+            "stga relight RUN",
+        ),
         ([str(run), *cameras, "--light-turn", "90"], "--light-turn: has no effect"),
         ([str(run), *cameras, "--light", str(tmp_path / "none.hdr")], "none.hdr"),
     ):

@@ -43,7 +43,9 @@ def write_hdr(path: Path, pixels: np.ndarray, packed: bool) -> Path:
             for start in range(0, len(rest), 100):
                 part = rest[start : start + 100]
                 data += bytes([len(part)]) + part.tobytes()
-    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n-Y %d +X %d\n" % (height, width) + data)
+    path.write_bytes(
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n-Y %d +X %d\n" % (height, width) + data
+    )
     return path
 
 
@@ -65,7 +67,8 @@ def test_hdr_pixels(tmp_path, packed):
 
 
 def test_an_environment_keeps_its_irradiance():
-    """Catches suns that are counted twice, solid angles of poles, and directions other than Blender's."""
+    """Catches suns that are counted twice, solid angles of poles, and directions other than
+    Blender's."""
     image = np.full((64, 128, 3), 0.2)
     vectors, angle = pixel_directions(64, 128)
     assert (angle * 128).sum() == pytest.approx(4 * np.pi)
@@ -79,9 +82,13 @@ def test_an_environment_keeps_its_irradiance():
     assert 0.1 < suns[0].angle < 0.2
     for normal in (toward, np.array([1.0, 0, 0]), np.array([0, 0, -1.0])):
         truth = (image * angle[..., None] * np.maximum(vectors @ normal, 0)[..., None]).sum((0, 1))
-        sh = (basis(normal[None]) * LAMBERT @ world)[0] + suns[0].color * max(-suns[0].direction @ normal, 0)
+        sh = (basis(normal[None]) * LAMBERT @ world)[0] + suns[0].color * max(
+            -suns[0].direction @ normal, 0
+        )
         np.testing.assert_allclose(sh, truth, rtol=0.02, atol=0.05)
-    np.testing.assert_allclose(harmonics_of(image, np.eye(3))[0], world[0] + suns[0].color * 0.28209, rtol=1e-3)
+    np.testing.assert_allclose(
+        harmonics_of(image, np.eye(3))[0], world[0] + suns[0].color * 0.28209, rtol=1e-3
+    )
 
 
 def test_lights_of_a_text_file(tmp_path):

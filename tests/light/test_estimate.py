@@ -31,7 +31,8 @@ def received() -> np.ndarray:
 def recorded(
     received: np.ndarray, light: np.ndarray, turns: Sequence[np.ndarray] = (np.eye(3),)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colors (T, F, 3) of skin with spots of other colors and highlights on some triangles, and transfer (T, F, 9)."""
+    """Colors (T, F, 3) of skin with spots of other colors and highlights on some triangles, and
+    transfer (T, F, 9)."""
     rng = np.random.default_rng(1)
     albedo = SKIN * rng.uniform(0.9, 1.1, (len(received), 1))
     albedo[rng.random(len(received)) < 0.15] *= 0.2
@@ -44,9 +45,12 @@ def recorded(
 
 
 def test_a_soft_light_is_found_despite_spots_and_highlights(received):
-    """Catches light that is drawn to hair, brows and highlights, and one that turns with the head."""
+    """Catches light that is drawn to hair, brows and highlights, and one that turns with the
+    head."""
     angle = np.radians(25)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
     light = soft_light()
     found, residual = fit_light(*recorded(received, light, [np.eye(3), turn, turn.T]))
     normals = even_directions(200)

@@ -1,4 +1,5 @@
-"""Irradiance of lights against closed forms and Blender's path tracer, shadows against cast rays."""
+"""Irradiance of lights against closed forms and Blender's path tracer, shadows against cast
+rays."""
 
 import subprocess
 import sys
@@ -15,13 +16,24 @@ from stga_addon.light.values import Caster, Light, Lighting
 NO_FACES = np.zeros((0, 3), np.int32)
 AROUND = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])
 UP = np.array([[0.0, 0.0, 1.0]])
-TILTED = Light("area", np.ones(3) * 40, (0.3, 0.2, 0.6), direction=(-0.3, -0.2, -0.6), size=(0.4, 0.3))
+TILTED = Light(
+    "area", np.ones(3) * 40, (0.3, 0.2, 0.6), direction=(-0.3, -0.2, -0.6), size=(0.4, 0.3)
+)
 CASES = {
     "sun": Light("sun", np.ones(3) * 3, direction=(-1, 0, -1)),
     "point": Light("point", np.ones(3) * 100, (0.5, 0.5, 2)),
-    "spot": Light("spot", np.ones(3) * 100, (0, 0, 2), direction=(0.25, 0, -1), cone=1.0, blend=0.6),
+    "spot": Light(
+        "spot", np.ones(3) * 100, (0, 0, 2), direction=(0.25, 0, -1), cone=1.0, blend=0.6
+    ),
     "area": TILTED,
-    "disk": Light("area", np.ones(3) * 40, (0, 0.2, 0.8), direction=(0, 0, -1), size=(0.5, 0.5), shape="ellipse"),
+    "disk": Light(
+        "area",
+        np.ones(3) * 40,
+        (0, 0.2, 0.8),
+        direction=(0, 0, -1),
+        size=(0.5, 0.5),
+        shape="ellipse",
+    ),
 }
 
 
@@ -34,7 +46,9 @@ def test_units_are_blenders():
     """Catches a wrong factor of π, and a cosine or distance that is left out."""
     assert irradiance(CASES["sun"]) == pytest.approx(3 * np.sqrt(0.5), rel=1e-5)
     square = 0.25 + 0.25 + 4
-    assert irradiance(CASES["point"]) == pytest.approx(100 / (4 * np.pi) / square * 2 / np.sqrt(square), rel=1e-5)
+    assert irradiance(CASES["point"]) == pytest.approx(
+        100 / (4 * np.pi) / square * 2 / np.sqrt(square), rel=1e-5
+    )
     small = Light("area", np.ones(3) * 100, (0, 0, 2), size=(0.01, 0.01))
     assert irradiance(small) == pytest.approx(100 / np.pi / 4, rel=1e-4)
 
@@ -98,7 +112,11 @@ def blender_light(light: Light) -> dict:
         settings |= {"spot_size": light.cone, "spot_blend": light.blend, "shadow_soft_size": 0.0}
     if light.kind == "point":
         settings |= {"shadow_soft_size": 0.0}
-    vectors = {"direction": light.direction.tolist(), "position": light.position.tolist(), "tangent": across.tolist()}
+    vectors = {
+        "direction": light.direction.tolist(),
+        "position": light.position.tolist(),
+        "tangent": across.tolist(),
+    }
     return {"kind": light.kind, "settings": settings, **vectors}
 
 
@@ -109,7 +127,9 @@ def test_irradiance_is_the_path_tracers(tmp_path):
     import json
     from dataclasses import replace
 
-    cases = {n: replace(v, tangent=np.cross(v.direction, (0.0, 1.0, 0.0))) for n, v in CASES.items()}
+    cases = {
+        n: replace(v, tangent=np.cross(v.direction, (0.0, 1.0, 0.0))) for n, v in CASES.items()
+    }
     wanted = json.dumps({name: blender_light(light) for name, light in cases.items()})
     command = [sys.executable, "-c", PATH_TRACER, wanted, str(tmp_path / "x.exr")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent)
@@ -121,11 +141,15 @@ def test_irradiance_is_the_path_tracers(tmp_path):
 
 @pytest.mark.parametrize(
     "light",
-    [Light("sun", np.ones(3), direction=(-0.3, -1, 0.1)), Light("point", np.ones(3), (0.3, 0.8, 0.2))],
+    [
+        Light("sun", np.ones(3), direction=(-0.3, -1, 0.1)),
+        Light("point", np.ones(3), (0.3, 0.8, 0.2)),
+    ],
     ids=["sun", "point"],
 )
 def test_shadows_are_those_of_cast_rays(light):
-    """Catches shadow maps in which the surface shades itself, that miss the plate, or put its shadow elsewhere."""
+    """Catches shadow maps in which the surface shades itself, that miss the plate, or put its
+    shadow elsewhere."""
     vertices, faces = ball_and_plate(3)
     normals = vertex_normals(vertices, faces)
     points = vertices + LIFT_M * normals
@@ -134,10 +158,16 @@ def test_shadows_are_those_of_cast_rays(light):
         to_light = light.position - points
         to_light = to_light / np.linalg.norm(to_light, axis=1, keepdims=True)
     facing = (normals * to_light).sum(1) > 0.1
-    expected = np.array([not blocked(p[None], d, vertices, faces)[0] for p, d in zip(points, to_light, strict=True)])
+    expected = np.array(
+        [not blocked(p[None], d, vertices, faces)[0] for p, d in zip(points, to_light, strict=True)]
+    )
     assert 0.02 < (facing & ~expected).mean() < 0.5
-    with_shadow = Lamps(Lighting(lights=(light,)), vertices, faces).irradiance(points, normals)[:, 0]
-    without = Lamps(Lighting(lights=(light,), shadows=False), vertices, faces).irradiance(points, normals)[:, 0]
+    with_shadow = Lamps(Lighting(lights=(light,)), vertices, faces).irradiance(points, normals)[
+        :, 0
+    ]
+    without = Lamps(Lighting(lights=(light,), shadows=False), vertices, faces).irradiance(
+        points, normals
+    )[:, 0]
     lit = with_shadow[facing] / without[facing]
     assert (np.abs(lit - expected[facing]) > 0.5).mean() < 0.02
     assert np.abs(lit - expected[facing]).mean() < 0.04
@@ -152,13 +182,18 @@ def test_another_object_throws_its_shadow():
     up = np.array([[0.0, 1.0, 0.0]])
     wall = Caster(np.array([[-1.0, 1, -1], [1, 1, -1], [0, 1, 1]]), np.array([[0, 1, 2]]))
     assert Lamps(sun, vertices[:162], ball).irradiance(top, up)[0, 0] == pytest.approx(1, abs=1e-3)
-    assert Lamps(sun, vertices[:162], ball, [wall]).irradiance(top, up)[0, 0] == pytest.approx(0, abs=1e-3)
+    assert Lamps(sun, vertices[:162], ball, [wall]).irradiance(top, up)[0, 0] == pytest.approx(
+        0, abs=1e-3
+    )
 
 
 def test_depth_of_a_large_triangle():
-    """Catches a wall from near a lamp to the head whose depth is that of its corners' mean and not of its plane."""
+    """Catches a wall from near a lamp to the head whose depth is that of its corners' mean and not
+    of its plane."""
     lamp = Light("point", np.ones(3), (0, 0, 1))
-    wall = Caster(np.array([[0.0, 0.4, 0.9], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]]), np.array([[0, 1, 2]]))
+    wall = Caster(
+        np.array([[0.0, 0.4, 0.9], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]]), np.array([[0, 1, 2]])
+    )
     found = ShadowMap(AROUND, NO_FACES, lamp, [wall]).depth
     view = light_view(head_bounds(AROUND), lamp)
     y, x = (np.indices(found.shape) + 0.5 - view.size / 2) / view.scale

@@ -24,7 +24,9 @@ SUN = Light("sun", np.full(3, 3.0), direction=(0, -1, 0))
 def eye_below_a_lid() -> tuple[np.ndarray, np.ndarray]:
     """An eyeball around the origin, and behind it a small plate at LID_HEIGHT whose normal is y."""
     ball = trimesh.creation.icosphere(4, EYE_RADIUS)
-    lid = trimesh.creation.box((0.02, 0.002, 0.01), trimesh.transformations.translation_matrix((0, 0.015, -0.004)))
+    lid = trimesh.creation.box(
+        (0.02, 0.002, 0.01), trimesh.transformations.translation_matrix((0, 0.015, -0.004))
+    )
     both = trimesh.util.concatenate([ball, lid.subdivide().subdivide()])
     return np.array(both.vertices), np.array(both.faces, np.int32)
 
@@ -35,7 +37,9 @@ def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avat
     transfer, occlusion = transfer_of(vertices, faces, 64)
     irradiance = np.full((len(vertices), 3), np.pi, np.float32)
     wet = np.where(np.linalg.norm(vertices, axis=1) < 0.0121, 0.2, 0).astype(np.float32)
-    light = AvatarLight(uniform(np.ones(3)).astype(np.float32), transfer, occlusion, irradiance, wet, 0.0)
+    light = AvatarLight(
+        uniform(np.ones(3)).astype(np.float32), transfer, occlusion, irradiance, wet, 0.0
+    )
     count = len(faces) + 1
     top = np.flatnonzero(vertices[faces][:, :, 1].min(1) > LID_HEIGHT - 1e-6)
     splats = Splats(
@@ -49,9 +53,12 @@ def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avat
     )
     avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces, light=light)
     frames = avatar.frames(vertices)
-    splats.xyz[-1] = frames.rotation[top[0]].T @ (np.array([0, LID_HEIGHT, 0]) + offset - frames.origin[top[0]])
+    splats.xyz[-1] = frames.rotation[top[0]].T @ (
+        np.array([0, LID_HEIGHT, 0]) + offset - frames.origin[top[0]]
+    )
     splats.log_scale[-1] = np.log([0.0002, 0.0002, 0.0002])
-    # The axes of the card are x and z of the world: turned about the lid's normal from the triangle's.
+    # The axes of the card are x and z of the world: turned about the lid's normal from the
+    # triangle's.
     axes = np.eye(4)
     axes[:3, :3] = frames.rotation[top[0]].T @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
     splats.rotation[-1] = trimesh.transformations.quaternion_from_matrix(axes)
@@ -61,7 +68,8 @@ def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avat
 
 
 def test_a_lash_shades_the_eye_as_cast_rays_say():
-    """Catches lashes that throw no shadow, one at another place or of another size, and one that does not follow."""
+    """Catches lashes that throw no shadow, one at another place or of another size, and one that
+    does not follow."""
     relighter = Relighter(avatar_with((0, 0.003, 0.006)))
     assert len(relighter.lashes.face) == 1
     corners = np.array([[0.008, 0, 0], [0, 0, -0.004], [-0.008, 0, 0], [0, 0, 0.004]])
@@ -80,10 +88,14 @@ def test_a_lash_shades_the_eye_as_cast_rays_say():
     up = normals[:, 1] > 0.5
     eye = np.flatnonzero(up & (np.linalg.norm(points, axis=1) < EYE_RADIUS))
     dark = blocked(points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0]), with_lid, faces)
-    alone = blocked(points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0]), vertices, avatar.faces)
+    alone = blocked(
+        points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0]), vertices, avatar.faces
+    )
     assert 20 < (dark & ~alone).sum() < (~alone).sum() - 20
     lit = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0))[eye, 1]
-    open_ = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0, shadows=False))[eye, 1]
+    open_ = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0, shadows=False))[
+        eye, 1
+    ]
     assert ((lit < 0.5 * open_) == dark).mean() > 0.9  # but for the soft edge
     assert (lit[dark & ~alone] < 0.5 * open_[dark & ~alone]).mean() > 0.9
 
@@ -112,18 +124,22 @@ def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
     assert avatar.light is not None
     dry = replace(avatar.light, roughness=np.zeros_like(avatar.light.roughness))
     relighters["no eyes"] = Relighter(replace(avatar, light=dry))
-    assert {name: len(each.lashes.face) for name, each in relighters.items()} == dict.fromkeys(relighters, 0)
+    assert {name: len(each.lashes.face) for name, each in relighters.items()} == dict.fromkeys(
+        relighters, 0
+    )
 
 
 def test_splats_are_at_the_nearest_point_of_the_mesh():
-    """Catches splats that stay in a triangle that they have left, walk away from themselves, or are lit on the wrong
-    corner's side; and a walk that leaves the mesh at its border."""
+    """Catches splats that stay in a triangle that they have left, walk away from themselves, or are
+    lit on the wrong corner's side; and a walk that leaves the mesh at its border."""
     avatar = lit_avatar()
     rng = np.random.default_rng(0)
     ball = avatar.faces[np.linalg.norm(avatar.neutral[avatar.faces].mean(1), axis=1) < 0.101]
     ball = ball[avatar.neutral[ball].mean(1)[:, 2] > -0.07]  # with a border
     xyz = (rng.normal(0, 1, (len(ball), 3)) * [1.0, 1.0, 0.1]).astype(np.float32)
-    splats = replace(avatar.splats.rows(np.arange(len(ball))), xyz=xyz, face=np.arange(len(ball), dtype=np.int32))
+    splats = replace(
+        avatar.splats.rows(np.arange(len(ball))), xyz=xyz, face=np.arange(len(ball), dtype=np.int32)
+    )
     avatar = replace(avatar, splats=splats, faces=ball)
     frames = avatar.frames(avatar.neutral)
     points = frames.origin + frames.scale[:, None] * np.einsum("nij,nj->ni", frames.rotation, xyz)

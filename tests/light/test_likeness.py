@@ -33,17 +33,20 @@ def relighter_of(light: np.ndarray) -> Relighter:
 
 
 def test_the_captures_light_is_found_in_the_heads_axes():
-    """Catches light between skin and skin that is taken for the studio's, and channels that are exchanged."""
+    """Catches light between skin and skin that is taken for the studio's, and channels that are
+    exchanged."""
     np.testing.assert_allclose(relighter_of(studio()).recorded_light, studio(), atol=0.01)
 
 
 def test_the_captures_own_light_keeps_all_that_was_recorded():
-    """Catches highlights of the studio that are lost under it, a tint or level that is not that of the light, and a
-    head that turns away from its studio or takes the studio along."""
+    """Catches highlights of the studio that are lost under it, a tint or level that is not that of
+    the light, and a head that turns away from its studio or takes the studio along."""
     relighter = relighter_of(studio())
     mesh = relighter.avatar.neutral.astype(np.float64)
     recorded = relighter.radiance(mesh, EYE, Lighting(mode="recorded"))
-    np.testing.assert_allclose(relighter.radiance(mesh, EYE, Lighting(studio() * TINT)), recorded * TINT, rtol=0.03)
+    np.testing.assert_allclose(
+        relighter.radiance(mesh, EYE, Lighting(studio() * TINT)), recorded * TINT, rtol=0.03
+    )
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     along, turned = Lighting(rotated(studio(), turn)), mesh @ turn.T
     there = relighter.radiance(turned, EYE, replace(along, mode="recorded"))
@@ -53,8 +56,8 @@ def test_the_captures_own_light_keeps_all_that_was_recorded():
 
 
 def test_another_light_keeps_nothing():
-    """Catches recorded shades that shine through under a light from elsewhere, and a share that jumps while the light
-    moves away."""
+    """Catches recorded shades that shine through under a light from elsewhere, and a share that
+    jumps while the light moves away."""
     relighter = relighter_of(studio())
     mesh = relighter.avatar.neutral.astype(np.float64)
     shares = []
@@ -72,7 +75,10 @@ def test_another_light_keeps_nothing():
 def test_other_highlights_keep_nothing(options):
     """Catches highlights of the capture that stay although others, or none, are asked for."""
     relighter = relighter_of(studio())
-    assert relighter.distant_in_head(relighter.avatar.neutral, Lighting(studio(), **options))[1].share == 0
+    assert (
+        relighter.distant_in_head(relighter.avatar.neutral, Lighting(studio(), **options))[1].share
+        == 0
+    )
 
 
 def test_shadows_of_other_objects_stay():

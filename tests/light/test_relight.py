@@ -39,16 +39,21 @@ def test_albedo_is_what_was_recorded_without_its_light(relighter):
 
 def normals_of(relighter):
     """(N, 3) the neutral mesh's smooth normals at the splats."""
-    normals = relighter._at_splats(vertex_normals(relighter.avatar.neutral.astype(np.float64), relighter.avatar.faces))
+    normals = relighter._at_splats(
+        vertex_normals(relighter.avatar.neutral.astype(np.float64), relighter.avatar.faces)
+    )
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def test_a_sun_gives_lamberts_cosine(relighter):
-    """Catches irradiance in other units than Blender's: albedo times strength times cosine over π."""
+    """Catches irradiance in other units than Blender's: albedo times strength times cosine over
+    π."""
     sun = Light("sun", np.array([2.0, 2.0, 2.0]), direction=(0, 1, 0))
     lit = relighter.radiance(relighter.avatar.neutral, EYE, Lighting(lights=(sun,), specular=0))
     normals = normals_of(relighter)
-    down = (normals[:, 1] < -0.3) & (np.linalg.norm(relighter.avatar.neutral[relighter.corners[:, 0]], axis=1) < 0.101)
+    down = (normals[:, 1] < -0.3) & (
+        np.linalg.norm(relighter.avatar.neutral[relighter.corners[:, 0]], axis=1) < 0.101
+    )
     assert down.sum() > 100
     expected = np.array(ALBEDO) * 2 * -normals[down, 1:2] / np.pi
     np.testing.assert_allclose(lit[down], expected, rtol=0.03, atol=0.004)
@@ -66,12 +71,16 @@ def test_light_that_turns_with_the_head_changes_nothing(relighter):
     here = relighter.radiance(mesh, EYE, Lighting(world, (lamp,)))
     there_light = Lighting(rotated(world, rotation), (lamp.transformed(matrix),))
     there = relighter.radiance(moved, matrix[:3, :3] @ EYE + matrix[:3, 3], there_light)
-    assert np.abs(here - there).mean() < 0.002 * here.mean() + 2e-3  # the shadow map's texels lie elsewhere
+    # the shadow map's texels lie elsewhere
+    assert np.abs(here - there).mean() < 0.002 * here.mean() + 2e-3
 
 
 def test_a_still_head_under_still_light_does_not_flicker(relighter):
     """Catches anything random, or a state that one frame leaves to the next."""
-    mesh, lamp = relighter.avatar.neutral, Light("spot", np.ones(3) * 40, (0.2, 0.3, 0.8), direction=(-0.2, -0.3, -0.8))
+    mesh, lamp = (
+        relighter.avatar.neutral,
+        Light("spot", np.ones(3) * 40, (0.2, 0.3, 0.8), direction=(-0.2, -0.3, -0.8)),
+    )
     lighting = Lighting(uniform((0.1, 0.1, 0.2)), (lamp,))
     first = relighter.colors(mesh, EYE, lighting)
     relighter.colors(turned(mesh, 20)[0], EYE, Lighting(uniform((1, 1, 1))))
@@ -89,13 +98,16 @@ def test_recorded_and_mix(relighter):
     scene = relighter.colors(mesh, EYE, lighting)
     half = relighter.colors(mesh, EYE, replace(lighting, mode="mix", mix=0.25))
     np.testing.assert_allclose(
-        srgb_to_linear(half), 0.25 * srgb_to_linear(scene) + 0.75 * srgb_to_linear(recorded), rtol=1e-3, atol=1e-4
+        srgb_to_linear(half),
+        0.25 * srgb_to_linear(scene) + 0.75 * srgb_to_linear(recorded),
+        rtol=1e-3,
+        atol=1e-4,
     )
 
 
 def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypatch):
-    """Catches light that is taken away otherwise than it is given: bounce, occlusion, exposure, white; also where
-    nothing of the recorded colors is kept."""
+    """Catches light that is taken away otherwise than it is given: bounce, occlusion, exposure,
+    white; also where nothing of the recorded colors is kept."""
     monkeypatch.setattr(relight, "UNLIKE_LIGHT", 1e-12)
     own = Lighting(relighter.light.radiance)
     lit = relighter.radiance(relighter.avatar.neutral, EYE, own)
@@ -104,12 +116,15 @@ def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypa
     facing = normals_of(relighter)
     seen = open_ & (facing[:, 2] > 0.8)
     np.testing.assert_allclose(lit[seen], recorded[seen], rtol=0.06)
-    bright = relighter.radiance(relighter.avatar.neutral, EYE, replace(own, exposure=1.0, white=(1.0, 2.0, 0.5)))
+    bright = relighter.radiance(
+        relighter.avatar.neutral, EYE, replace(own, exposure=1.0, white=(1.0, 2.0, 0.5))
+    )
     np.testing.assert_allclose(bright, lit * np.float32([2, 1, 4]), rtol=1e-5)
 
 
 def test_color_that_depends_on_the_view_is_no_albedo():
-    """Catches highlights that were baked into harmonics and would stay where the recorded light put them."""
+    """Catches highlights that were baked into harmonics and would stay where the recorded light put
+    them."""
     plain, glossy = lit_avatar(ALBEDO), lit_avatar(ALBEDO, degree=1)
     normals = Relighter(plain).avatar.frames(plain.neutral).rotation[:, :, 2]
     sh = glossy.splats.sh.copy()
@@ -124,12 +139,15 @@ def test_color_that_depends_on_the_view_is_no_albedo():
 
 
 def test_recorded_color_is_a_mean_over_the_directions_that_see_a_splat():
-    """Catches a factor of a degree, or a direction, that is not that of the mean: against sampled directions."""
+    """Catches a factor of a degree, or a direction, that is not that of the mean: against sampled
+    directions."""
     avatar = lit_avatar(ALBEDO, degree=3)
     sh = np.random.default_rng(0).normal(0, 0.1, avatar.splats.sh.shape).astype(np.float32)
     relighter = Relighter(replace(avatar, splats=replace(avatar.splats, sh=sh)))
     mesh = avatar.neutral.astype(np.float64)
-    normals = np.einsum("nk,nkc->nc", relighter.weights, vertex_normals(mesh, avatar.faces)[relighter.corners])[:40]
+    normals = np.einsum(
+        "nk,nkc->nc", relighter.weights, vertex_normals(mesh, avatar.faces)[relighter.corners]
+    )[:40]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     directions = even_directions(4000)
     for normal, coefficients, found in zip(normals, sh, relighter.diffuse_color, strict=False):

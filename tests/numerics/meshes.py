@@ -29,7 +29,8 @@ DEGENERATE = {
 
 
 def mesh_of(triangles: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (3·F, 3), as a float32 file would hold them, and faces (F, 3) int32 of separate triangles."""
+    """Vertices (3·F, 3), as a float32 file would hold them, and faces (F, 3) int32 of separate
+    triangles."""
     vertices = np.concatenate(triangles).astype(np.float32).astype(np.float64)
     return vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
 

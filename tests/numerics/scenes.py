@@ -13,9 +13,15 @@ IMAGES = "rgb", "alpha", "depth"
 
 
 def facing(
-    count: int, seed: int = 0, size: tuple[int, int] = (37, 29), focal: float = 40.0, degree: int = 1, **changes: object
+    count: int,
+    seed: int = 0,
+    size: tuple[int, int] = (37, 29),
+    focal: float = 40.0,
+    degree: int = 1,
+    **changes: object,
 ) -> Scene:
-    """`count` splats two meters before a camera at the origin that looks along +z; `changes` replaces parameters."""
+    """`count` splats two meters before a camera at the origin that looks along +z; `changes`
+    replaces parameters."""
     rng = np.random.default_rng(seed)
     width, height = size
     splats = {
@@ -26,7 +32,9 @@ def facing(
         "sh": rng.normal(0, 0.4, (count, (degree + 1) ** 2, 3)),
     } | changes
     camera = Camera(width, height, focal, focal * 1.1, width / 2 - 0.3, height / 2 + 0.2, np.eye(4))
-    return Scene({name: np.asarray(value, np.float32) for name, value in splats.items()}, camera, degree)
+    return Scene(
+        {name: np.asarray(value, np.float32) for name, value in splats.items()}, camera, degree
+    )
 
 
 def rows(scene: Scene, keep: np.ndarray) -> Scene:
@@ -41,25 +49,34 @@ def reference_gradients(
     images = reference.render(*tensors, scene.camera, sh_degree=scene.degree, near=near)
     loss = sum((image * v).sum() for image, v in zip(images, cotangents, strict=True))
     gradients = torch.autograd.grad(loss, tensors)
-    return [image.detach().numpy() for image in images], {n: g.numpy() for n, g in zip(NAMES, gradients, strict=True)}
+    return [image.detach().numpy() for image in images], {
+        n: g.numpy() for n, g in zip(NAMES, gradients, strict=True)
+    }
 
 
 def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
-    """(H, W) bool: pixels where no splat is within `margin` (relative) of one of the renderer's jumps.
+    """(H, W) bool: pixels where no splat is within `margin` (relative) of one of the renderer's
+    jumps.
 
-    They are alpha at 1/255 and at the clamp 0.999, and transmittance at the stop 1e-4. On which side a float32 lies
-    there is chance, and both sides are right.
+    They are alpha at 1/255 and at the clamp 0.999, and transmittance at the stop 1e-4. On which
+    side a float32 lies there is chance, and both sides are right.
     """
     tensors = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
     xyz, rotation, log_scale, opacity, _ = tensors
     z = reference.camera_space(xyz, scene.camera)[:, 2]
     order = torch.argsort(z, stable=True)
     order = order[z[order] >= 0.0099]
-    center, projected, _, _ = reference.project(xyz[order], rotation[order], log_scale[order], scene.camera)
+    center, projected, _, _ = reference.project(
+        xyz[order], rotation[order], log_scale[order], scene.camera
+    )
     shape = (scene.camera.height, scene.camera.width)
-    steady, transmittance = torch.ones(shape, dtype=torch.bool), torch.ones(shape, dtype=torch.float64)
+    steady, transmittance = (
+        torch.ones(shape, dtype=torch.bool),
+        torch.ones(shape, dtype=torch.float64),
+    )
     running = torch.ones(shape, dtype=torch.bool)
-    # The same with the cut-offs moved by the margin, by making each splat a little more or less opaque.
+    # The same with the cut-offs moved by the margin, by making each splat a little more or less
+    # opaque.
     logit = torch.sigmoid(opacity[order])
     kept = reference.splat_alpha(center, projected, logit, scene.camera)
     for other in (logit * (1 - margin), logit * (1 + margin)):
@@ -73,23 +90,35 @@ def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
     return steady.numpy()
 
 
-def compare(scene: Scene, near: float = 0.01, roundings: int = 0) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """Largest differences between kernels and reference on steady pixels, and the kernels' gradients.
+def compare(
+    scene: Scene, near: float = 0.01, roundings: int = 0
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Largest differences between kernels and reference on steady pixels, and the kernels'
+    gradients.
 
-    Images: absolute for rgb and alpha, relative to the largest for depth and for colors above one. Gradients: under
-    random cotangents, over the largest of the quantity. Fails if anything is not finite.
-    roundings: how often the scene's numbers are rounded otherwise to see what that alone does to the float64 result;
-    only a difference beyond ten times as much counts, because what hangs on the last bit of its input, such as the
-    turning of a long needle or the slope at a splat's summit, no float32 can know.
+    Images: absolute for rgb and alpha, relative to the largest for depth and for colors above one.
+    Gradients: under random cotangents, over the largest of the quantity. Fails if anything is not
+    finite.
+    roundings: how often the scene's numbers are rounded otherwise to see what that alone does to
+    the float64 result; only a difference beyond ten times as much counts, because what hangs on the
+    last bit of its input, such as the turning of a long needle or the slope at a splat's summit, no
+    float32 can know.
     """
     steady = steady_pixels(scene)
     cotangents = [v * torch.from_numpy(steady) for v in random_cotangents(scene.camera)]
     images, gradients = kernel_gradients(scene, cotangents)
     got = _named(images, gradients, steady)
     want = _named(*reference_gradients(scene, cotangents, near), steady)
-    moved = [_named(*reference_gradients(rounded(scene, seed), cotangents, near), steady) for seed in range(roundings)]
-    scales = {name: max(np.abs(value).max(), 1 if name in IMAGES else 1e-6) for name, value in want.items()}
-    # Turning a ball changes nothing: what would be its gradient cancels, and float32 leaves the rounding of its parts.
+    moved = [
+        _named(*reference_gradients(rounded(scene, seed), cotangents, near), steady)
+        for seed in range(roundings)
+    ]
+    scales = {
+        name: max(np.abs(value).max(), 1 if name in IMAGES else 1e-6)
+        for name, value in want.items()
+    }
+    # Turning a ball changes nothing: what would be its gradient cancels, and float32 leaves the
+    # rounding of its parts.
     length = np.linalg.norm(scene.splats["rotation"].astype(np.float64), axis=1, keepdims=True)
     scales["rotation"] = max(scales["rotation"], np.abs(want["log_scale"] / length).max())
     errors = {}
@@ -100,9 +129,14 @@ def compare(scene: Scene, near: float = 0.01, roundings: int = 0) -> tuple[dict[
     return errors, gradients
 
 
-def _named(images: list[np.ndarray], gradients: dict[str, np.ndarray], steady: np.ndarray) -> dict[str, np.ndarray]:
+def _named(
+    images: list[np.ndarray], gradients: dict[str, np.ndarray], steady: np.ndarray
+) -> dict[str, np.ndarray]:
     """The images, black where they are not steady, and the gradients."""
-    return dict(zip(IMAGES, (np.where(steady, image, image * 0) for image in images), strict=True)) | gradients
+    return (
+        dict(zip(IMAGES, (np.where(steady, image, image * 0) for image in images), strict=True))
+        | gradients
+    )
 
 
 def rounded(scene: Scene, seed: int) -> Scene:
@@ -111,7 +145,11 @@ def rounded(scene: Scene, seed: int) -> Scene:
     return replace(
         scene,
         splats={
-            name: np.where(rng.random(value.shape) < 0.5, value, np.nextafter(value, np.copysign(np.inf, value)))
+            name: np.where(
+                rng.random(value.shape) < 0.5,
+                value,
+                np.nextafter(value, np.copysign(np.inf, value)),
+            )
             for name, value in scene.splats.items()
         },
     )
@@ -120,7 +158,11 @@ def rounded(scene: Scene, seed: int) -> Scene:
 def assert_close(errors: dict[str, float], image: float, gradient: float) -> None:
     """Every error below its tolerance; the message names those that are not."""
     limits = dict.fromkeys(IMAGES, image)
-    bad = {name: f"{value:.1e}" for name, value in errors.items() if not value < limits.get(name, gradient)}
+    bad = {
+        name: f"{value:.1e}"
+        for name, value in errors.items()
+        if not value < limits.get(name, gradient)
+    }
     assert not bad, bad
 
 

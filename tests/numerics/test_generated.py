@@ -1,4 +1,5 @@
-"""Scenes nobody thought of: the kernels against the float64 reference and against finite differences."""
+"""Scenes nobody thought of: the kernels against the float64 reference and against finite
+differences."""
 
 import os
 
@@ -9,15 +10,30 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from raster import reference
 
-from .scenes import NAMES, Scene, assert_close, compare, facing, kernel_gradients, random_cotangents, steady_pixels
+from .scenes import (
+    NAMES,
+    Scene,
+    assert_close,
+    compare,
+    facing,
+    kernel_gradients,
+    random_cotangents,
+    steady_pixels,
+)
 
 FUZZING = "STGA_FUZZ_SECONDS" in os.environ
-BOUNDED = {"deadline": None, "derandomize": True, "database": None, "suppress_health_check": list(HealthCheck)}
+BOUNDED = {
+    "deadline": None,
+    "derandomize": True,
+    "database": None,
+    "suppress_health_check": list(HealthCheck),
+}
 
 
 @st.composite
 def scenes(draw: st.DrawFn) -> Scene:
-    """Up to 30 splats, each quantity from nothing to far beyond what training produces, in images up to 40 pixels."""
+    """Up to 30 splats, each quantity from nothing to far beyond what training produces, in images
+    up to 40 pixels."""
 
     def between(low: float, high: float) -> float:
         return draw(st.floats(low, high, width=32))
@@ -35,7 +51,10 @@ def scenes(draw: st.DrawFn) -> Scene:
         size,
         focal,
         degree,
-        xyz=np.c_[rng.normal(0, 10 ** between(-3, 0.5), (count, 2)) * depth[:, None] * max(size) / focal, depth],
+        xyz=np.c_[
+            rng.normal(0, 10 ** between(-3, 0.5), (count, 2)) * depth[:, None] * max(size) / focal,
+            depth,
+        ],
         rotation=rng.normal(size=(count, 4)) * 10 ** between(-10, 10),
         log_scale=np.clip(rng.normal(between(-12, 3), between(0, 5), (count, 3)), -27, 7),
         opacity=rng.normal(between(-8, 12), between(0, 20), count),
@@ -46,7 +65,9 @@ def scenes(draw: st.DrawFn) -> Scene:
 def steady_colors(scene: Scene) -> bool:
     """Whether no color lies so near zero, where it is cut, that float32 may take the other side."""
     direction = torch.from_numpy(scene.splats["xyz"]).double()
-    basis = reference.sh_basis(torch.nn.functional.normalize(direction, dim=-1))[:, : (scene.degree + 1) ** 2]
+    basis = reference.sh_basis(torch.nn.functional.normalize(direction, dim=-1))[
+        :, : (scene.degree + 1) ** 2
+    ]
     sh = torch.from_numpy(scene.splats["sh"]).double()
     color = 0.5 + torch.einsum("nk,nkc->nc", basis, sh)
     return bool((color.abs() > 1e-5 * (0.5 + sh.abs().sum((1,)))).all())
@@ -62,8 +83,8 @@ def check(scene: Scene) -> None:
     if not (steady_colors(scene) and steady_order(scene)):
         return
     errors, _ = compare(scene, near=float(np.float32(0.01)), roundings=2)
-    # What shows through a splat of opacity 0.999 is known to 3e-5, the rounding of 0.999 over 1 - 0.999; through
-    # two to 6e-5, and the stop at 1e-4 leaves no third.
+    # What shows through a splat of opacity 0.999 is known to 3e-5, the rounding of 0.999 over 1 -
+    # 0.999; through two to 6e-5, and the stop at 1e-4 leaves no third.
     assert_close(errors, image=1e-4, gradient=1e-3)
 
 
@@ -82,20 +103,28 @@ def test_any_scene_is_the_references_at_length(scene: Scene) -> None:
     check(scene)
 
 
-WILD = st.sampled_from([0.0, 1e-45, 1e-38, 1e-20, 1.0, 50.0, 90.0, 1e4, 1e8, 1e20, 3e38, np.inf, np.nan])
+WILD = st.sampled_from(
+    [0.0, 1e-45, 1e-38, 1e-20, 1.0, 50.0, 90.0, 1e4, 1e8, 1e20, 3e38, np.inf, np.nan]
+)
 
 
 @settings(max_examples=60, **BOUNDED)
 @given(
     st.lists(
-        st.tuples(st.integers(0, 19), st.sampled_from(NAMES), st.integers(0, 11), st.booleans(), WILD), max_size=12
+        st.tuples(
+            st.integers(0, 19), st.sampled_from(NAMES), st.integers(0, 11), st.booleans(), WILD
+        ),
+        max_size=12,
     )
 )
-def test_any_number_in_any_place_harms_only_its_splat(places: list[tuple[int, str, int, bool, float]]) -> None:
-    """Catches overflow, 0/0 and NaN from any combination of extreme entries in up to a dozen places.
+def test_any_number_in_any_place_harms_only_its_splat(
+    places: list[tuple[int, str, int, bool, float]],
+) -> None:
+    """Catches overflow, 0/0 and NaN from any combination of extreme entries in up to a dozen
+    places.
 
-    The image and every gradient stay finite, except that a color beyond float32 may exceed it where it is blended:
-    so harmonics beyond 1e20 are left out.
+    The image and every gradient stay finite, except that a color beyond float32 may exceed it where
+    it is blended: so harmonics beyond 1e20 are left out.
     """
     scene = facing(20)
     for row, name, column, negative, value in places:
@@ -114,8 +143,9 @@ def test_any_number_in_any_place_harms_only_its_splat(places: list[tuple[int, st
 def test_gradient_is_the_central_difference(name: str) -> None:
     """Catches an error that reference and kernels share, which comparing the two would not show.
 
-    Differences of the float64 image in random directions, weighted by cotangents that vanish on every pixel where the
-    step crosses one of the renderer's jumps (alpha 1/255 and 0.999, transmittance 1e-4).
+    Differences of the float64 image in random directions, weighted by cotangents that vanish on
+    every pixel where the step crosses one of the renderer's jumps (alpha 1/255 and 0.999,
+    transmittance 1e-4).
     """
     scene, step = facing(25, log_scale=np.random.default_rng(5).normal(-1.8, 0.6, (25, 3))), 1e-6
     steady = torch.from_numpy(steady_pixels(scene, margin=1e-3))
@@ -129,8 +159,12 @@ def test_gradient_is_the_central_difference(name: str) -> None:
         ends = []
         for sign in (1, -1):
             moved = base | {name: base[name] + sign * step * torch.from_numpy(direction)}
-            images = reference.render(*(moved[n] for n in NAMES), scene.camera, sh_degree=scene.degree)
-            ends.append(sum(float((image * v).sum()) for image, v in zip(images, cotangents, strict=True)))
+            images = reference.render(
+                *(moved[n] for n in NAMES), scene.camera, sh_degree=scene.degree
+            )
+            ends.append(
+                sum(float((image * v).sum()) for image, v in zip(images, cotangents, strict=True))
+            )
         slope = (ends[0] - ends[1]) / (2 * step)
         scale = np.abs(gradients[name] * direction).sum()
         assert scale > 0

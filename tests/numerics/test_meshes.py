@@ -1,4 +1,5 @@
-"""Degenerate, flipping and turning triangles, and poses out of range: frames, lattice and what is rendered of them."""
+"""Degenerate, flipping and turning triangles, and poses out of range: frames, lattice and what is
+rendered of them."""
 
 import numpy as np
 import pytest
@@ -26,7 +27,9 @@ FACES = np.array([[0, 1, 2]])
 
 def assert_proper(rotation: np.ndarray) -> None:
     np.testing.assert_allclose(
-        rotation.transpose(0, 2, 1) @ rotation, np.tile(np.eye(3), (len(rotation), 1, 1)), atol=1e-12
+        rotation.transpose(0, 2, 1) @ rotation,
+        np.tile(np.eye(3), (len(rotation), 1, 1)),
+        atol=1e-12,
     )
     np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
 
@@ -35,8 +38,9 @@ def assert_proper(rotation: np.ndarray) -> None:
 @pytest.mark.parametrize("name", DEGENERATE)
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_a_line_in_the_neutral_mesh_does_not_grow(convention: str, name: str, dtype: type) -> None:
-    """Catches a ratio of areas whose denominator is rounding: three corners on a line, in float32 as in a file, have
-    1e-13 m², and when the triangle opens its splats would be rendered 20,000 times too large, a hundred meters away."""
+    """Catches a ratio of areas whose denominator is rounding: three corners on a line, in float32
+    as in a file, have 1e-13 m², and when the triangle opens its splats would be rendered 20,000
+    times too large, a hundred meters away."""
     neutral = DEGENERATE[name].astype(dtype).astype(float)
     splats = lattice_splats(neutral, FACES, convention=convention)
     frames = face_frames(WHOLE, FACES, neutral, convention)
@@ -51,7 +55,8 @@ def test_a_line_in_the_neutral_mesh_does_not_grow(convention: str, name: str, dt
 @pytest.mark.parametrize("name", DEGENERATE)
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_a_triangle_that_collapses_in_one_frame(convention: str, name: str) -> None:
-    """Catches an improper rotation, splats that leave the triangle, and an inverse that divides by a zero scale."""
+    """Catches an improper rotation, splats that leave the triangle, and an inverse that divides by
+    a zero scale."""
     splats = lattice_splats(WHOLE, FACES, convention=convention)
     posed = DEGENERATE[name].astype(np.float32).astype(float)
     frames = face_frames(posed, FACES, WHOLE, convention)
@@ -67,7 +72,8 @@ def test_a_triangle_that_collapses_in_one_frame(convention: str, name: str) -> N
 @pytest.mark.parametrize("name", [name for name in DEGENERATE if name != "point"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_rounding_does_not_turn_a_line(convention: str, name: str) -> None:
-    """Catches a normal made of rounding: the same line, rounded in 20 other ways, must keep its rotation.
+    """Catches a normal made of rounding: the same line, rounded in 20 other ways, must keep its
+    rotation.
 
     Without the threshold the frame of a closed eyelid turns at random from one frame to the next.
     """
@@ -76,11 +82,14 @@ def test_rounding_does_not_turn_a_line(convention: str, name: str) -> None:
     triangles = [posed, *(posed + noise)]
     vertices, faces = np.concatenate(triangles), np.arange(63).reshape(-1, 3)
     frames = face_frames(vertices, faces, np.tile(WHOLE, (21, 1)), convention)
-    np.testing.assert_allclose(frames.rotation[1:], np.broadcast_to(frames.rotation[0], (20, 3, 3)), atol=2e-5)
+    np.testing.assert_allclose(
+        frames.rotation[1:], np.broadcast_to(frames.rotation[0], (20, 3, 3)), atol=2e-5
+    )
 
 
 def test_collapsed_triangles_render_and_train_in_float32() -> None:
-    """Catches NaN from scales of e^−60 and smaller, and gradients that differ from the float64 reference's."""
+    """Catches NaN from scales of e^−60 and smaller, and gradients that differ from the float64
+    reference's."""
     flat = list(DEGENERATE.values())
     posed, faces = mesh_of([*flat, *(WHOLE + 0.02 * n for n in range(len(flat)))])
     neutral, _ = mesh_of([WHOLE] * len(flat) + flat)
@@ -103,7 +112,9 @@ def test_collapsed_triangles_render_and_train_in_float32() -> None:
         )
         frames.scale[:] = np.maximum(frames.scale, 1e-30)  # the reference wants its logarithm
         tensors = [torch.from_numpy(values[name]).double().requires_grad_() for name in NAMES]
-        expected_images = reference.render(*embed(tensors, frames, splats.face), camera, sh_degree=1)
+        expected_images = reference.render(
+            *embed(tensors, frames, splats.face), camera, sh_degree=1
+        )
         expected = torch.autograd.grad(
             sum((i * v).sum() for i, v in zip(expected_images, cotangents, strict=True)), tensors
         )
@@ -111,11 +122,14 @@ def test_collapsed_triangles_render_and_train_in_float32() -> None:
         for image, want in zip(images, expected_images, strict=True):
             np.testing.assert_allclose(image.detach(), want.detach(), atol=5e-6)
         for name, gradient, want in zip(NAMES, gradients, expected, strict=True):
-            np.testing.assert_allclose(gradient, want, atol=2e-5 * float(want.abs().max()), err_msg=name)
+            np.testing.assert_allclose(
+                gradient, want, atol=2e-5 * float(want.abs().max()), err_msg=name
+            )
 
 
 def test_a_triangle_that_flips_between_frames() -> None:
-    """Catches a frame that is mirrored instead of turned: a flip is half a turn about the first axis."""
+    """Catches a frame that is mirrored instead of turned: a flip is half a turn about the first
+    axis."""
     for convention in CONVENTIONS:
         before = face_frames(WHOLE, FACES, WHOLE, convention)
         axis = before.rotation[0][:, 0]
@@ -128,7 +142,8 @@ def test_a_triangle_that_flips_between_frames() -> None:
 
 
 def test_quaternions_near_half_turns_from_float32_matrices() -> None:
-    """Catches a square root of a negative number, or 0/0, where rounding leaves the trace a little below −1."""
+    """Catches a square root of a negative number, or 0/0, where rounding leaves the trace a little
+    below −1."""
     rng = np.random.default_rng(2)
     axes = rng.normal(size=(500, 3))
     axes[:30] = np.repeat(np.eye(3), 10, axis=0)
@@ -142,9 +157,12 @@ def test_quaternions_near_half_turns_from_float32_matrices() -> None:
     assert error.max() < 1e-6
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-30, 1e-8, 1e-4, np.pi - 1e-6, np.pi, np.pi + 1e-6, 2 * np.pi, 4 * np.pi])
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-30, 1e-8, 1e-4, np.pi - 1e-6, np.pi, np.pi + 1e-6, 2 * np.pi, 4 * np.pi]
+)
 def test_axis_angle_in_float32(angle: float) -> None:
-    """Catches 0/0 at no turn and the loss of the axis at a full one: matrix and Jacobian of float32 and float64 agree.
+    """Catches 0/0 at no turn and the loss of the axis at a full one: matrix and Jacobian of float32
+    and float64 agree.
 
     `flame/test_forward.py` holds the float64 ones against scipy and finite differences.
     """
@@ -153,7 +171,9 @@ def test_axis_angle_in_float32(angle: float) -> None:
     for dtype in (torch.float32, torch.float64):
         axis_angle = (angle * direction).float().to(dtype)
         matrices.append(axis_angle_matrices(axis_angle).double())
-        jacobians.append(torch.autograd.functional.jacobian(axis_angle_matrices, axis_angle).double())
+        jacobians.append(
+            torch.autograd.functional.jacobian(axis_angle_matrices, axis_angle).double()
+        )
     for values in (matrices, jacobians):
         assert torch.isfinite(values[0]).all()
         np.testing.assert_allclose(values[0], values[1], atol=2e-6)
@@ -163,7 +183,8 @@ def test_axis_angle_in_float32(angle: float) -> None:
 
 @pytest.mark.parametrize("jaw", [[0.9, 0, 0], [np.pi, 0, 0], [-2.0, 1.0, 3.0], [40.0, 0, 0]])
 def test_a_jaw_past_its_range(jaw: list[float]) -> None:
-    """Catches poses that leave float32's precision: torch's vertices in float32 against numpy's, and sound frames.
+    """Catches poses that leave float32's precision: torch's vertices in float32 against numpy's,
+    and sound frames.
 
     FLAME's jaw opens by about 0.5 rad; a tracker that fails delivers anything.
     """
@@ -173,7 +194,9 @@ def test_a_jaw_past_its_range(jaw: list[float]) -> None:
     expected = flame_forward(model, shape, frame)
     pose = torch.tensor(frame.pose[None], dtype=torch.float32).requires_grad_()
     rest = [torch.tensor(a[None], dtype=torch.float32) for a in (frame.expr, frame.translation)]
-    vertices = torch_forward(flame_tensors(model), torch.tensor(shape, dtype=torch.float32), rest[0], pose, rest[1])
+    vertices = torch_forward(
+        flame_tensors(model), torch.tensor(shape, dtype=torch.float32), rest[0], pose, rest[1]
+    )
     # An angle of 40 rad is itself rounded to 4e-6.
     assert np.abs(vertices[0].detach().numpy() - expected).max() < 2e-6
     (gradient,) = torch.autograd.grad(vertices.square().sum(), pose)

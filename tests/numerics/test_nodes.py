@@ -1,4 +1,5 @@
-"""Degenerate meshes in Blender's geometry nodes, which compute in float32: numpy's remedy, not just a finite one."""
+"""Degenerate meshes in Blender's geometry nodes, which compute in float32: numpy's remedy, not just
+a finite one."""
 
 import numpy as np
 import pytest
@@ -23,9 +24,12 @@ def _empty_scene():
 
 
 def shown_and_expected(posed: list[np.ndarray], neutral: list[np.ndarray], convention: str):
-    """Evaluated (xyz, rotation, scale) of a few splats a triangle, and `to_world` on the evaluated vertices."""
+    """Evaluated (xyz, rotation, scale) of a few splats a triangle, and `to_world` on the evaluated
+    vertices."""
     vertices, faces = mesh_of(posed)
-    splats = random_splats(len(faces), PER_FACE * len(faces), extent=0.005 if convention == "stga" else 0.5)
+    splats = random_splats(
+        len(faces), PER_FACE * len(faces), extent=0.005 if convention == "stga" else 0.5
+    )
     splats.face[:] = np.repeat(np.arange(len(faces)), PER_FACE)
     avatar = Avatar(splats, convention, mesh_of(neutral)[0].astype(np.float32), faces)
     mesh = bpy.data.meshes.new("head")
@@ -41,20 +45,26 @@ def shown_and_expected(posed: list[np.ndarray], neutral: list[np.ndarray], conve
 @pytest.mark.parametrize("when", ["now", "in the neutral mesh", "always"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_degenerate_triangles_are_numpys(convention: str, when: str) -> None:
-    """Catches Blender's own substitutes for missing axes, and a rounding error taken for a normal or for growth.
+    """Catches Blender's own substitutes for missing axes, and a rounding error taken for a normal
+    or for growth.
 
-    With the node's substitutes, and areas compared with zero, rotations differ by up to half a turn, and splats of a
-    triangle that is a line in the neutral mesh only fly up to 100 m away.
+    With the node's substitutes, and areas compared with zero, rotations differ by up to half a
+    turn, and splats of a triangle that is a line in the neutral mesh only fly up to 100 m away.
     """
     flat, whole = list(DEGENERATE.values()), [WHOLE + 0.02 * n for n in range(len(DEGENERATE))]
-    posed, neutral = {"now": (flat, whole), "in the neutral mesh": (whole, flat), "always": (flat, flat)}[when]
+    posed, neutral = {
+        "now": (flat, whole),
+        "in the neutral mesh": (whole, flat),
+        "always": (flat, flat),
+    }[when]
     (xyz, rotation, scale), expected = shown_and_expected(posed, neutral, convention)
     for n, name in enumerate(DEGENERATE):
         splats = slice(PER_FACE * n, PER_FACE * (n + 1))
         np.testing.assert_allclose(xyz[splats], expected.xyz[splats], atol=2e-6, err_msg=name)
         assert np.abs(expected.xyz[splats]).max() < 1, name
         assert same_rotation(rotation[splats], expected.rotation[splats]) < 1e-3, name
-        # A line's area is rounding; its splats are too small to be seen, whatever its square root is.
+        # A line's area is rounding; its splats are too small to be seen, whatever its square root
+        # is.
         np.testing.assert_allclose(
             scale[splats], np.exp(expected.log_scale[splats]), rtol=2e-3, atol=2e-5, err_msg=name
         )
@@ -62,7 +72,8 @@ def test_degenerate_triangles_are_numpys(convention: str, when: str) -> None:
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_half_turns_and_flips(convention: str) -> None:
-    """Catches a matrix-to-quaternion conversion that divides by zero at trace −1, and a mirrored frame."""
+    """Catches a matrix-to-quaternion conversion that divides by zero at trace −1, and a mirrored
+    frame."""
     turns = [np.eye(3), *HALF_TURNS]
     (xyz, rotation, _), expected = shown_and_expected(
         [WHOLE @ turn for turn in turns] + [WHOLE[[0, 2, 1]]], [WHOLE] * 5, convention

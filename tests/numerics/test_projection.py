@@ -1,4 +1,5 @@
-"""Splats, rotations and projections at the edge of float32: kernels against the float64 reference, both directions."""
+"""Splats, rotations and projections at the edge of float32: kernels against the float64 reference,
+both directions."""
 
 from dataclasses import replace
 
@@ -39,7 +40,9 @@ def log_normal(count: int, scale: float, seed: int = 1) -> np.ndarray:
 def beside(count: int, reach: float) -> np.ndarray:
     """Positions 89° off the axis, left and right, 2 to 20 cm ahead."""
     z = RNG.uniform(0.02, 0.2, count)
-    return np.c_[z * TAN_89 * np.where(np.arange(count) % 2, 1, -1), RNG.uniform(-reach, reach, count), z]
+    return np.c_[
+        z * TAN_89 * np.where(np.arange(count) % 2, 1, -1), RNG.uniform(-reach, reach, count), z
+    ]
 
 
 def needle(longest: float, count: int = 60) -> np.ndarray:
@@ -54,9 +57,11 @@ def with_depths(depths: np.ndarray) -> Scene:
 
 TWO = np.float32(2)
 SCENES = {
-    # Without PRECISION_X, SHEAR, PRECISION_Y instead of the inverse covariance, in this order: gradients of log_scale
-    # off by a factor of 200; by 5e-4; 200; 2e6; 8, and the image by 3e-4.
-    "scales from 1e-12 to 1e3 m": facing(60, log_scale=RNG.uniform(np.log(1e-12), np.log(1e3), (60, 3))),
+    # Without PRECISION_X, SHEAR, PRECISION_Y instead of the inverse covariance, in this order:
+    # gradients of log_scale off by a factor of 200; by 5e-4; 200; 2e6; 8, and the image by 3e-4.
+    "scales from 1e-12 to 1e3 m": facing(
+        60, log_scale=RNG.uniform(np.log(1e-12), np.log(1e3), (60, 3))
+    ),
     "needle of 0.6 m, 1e6 : 1": facing(60, log_scale=needle(0.6)),
     "needle of 20 m, 1e6 : 1": facing(60, log_scale=needle(20)),
     "needle of 1 km, 1e6 : 1": facing(60, log_scale=needle(1000)),
@@ -65,7 +70,9 @@ SCENES = {
         xyz=np.c_[RNG.uniform(-8, 8, (60, 2)), RNG.uniform(1.5, 2.5, 60)],
         log_scale=np.tile(np.log([7.4, 7e-3, 7e-3]), (60, 1)),
     ),
-    "pancakes 1e6 : 1": facing(60, log_scale=np.tile(np.log([20, 20, 2e-5]), (60, 1)), opacity=np.full(60, -2.0)),
+    "pancakes 1e6 : 1": facing(
+        60, log_scale=np.tile(np.log([20, 20, 2e-5]), (60, 1)), opacity=np.full(60, -2.0)
+    ),
     # Catches 1 − σ(x), which keeps two digits of the opacity's gradient in float32.
     "opacity logits of 12": facing(60, opacity=np.full(60, 12.0)),
     # Catches exp(50)², and σ(−50) / σ(−50) of a splat that nobody sees.
@@ -78,7 +85,8 @@ SCENES = {
     "on, before and behind the near plane": facing(
         8,
         xyz=np.c_[
-            RNG.uniform(-0.004, 0.004, (8, 2)), 0.01 * (1 + np.array([1e-6, -1e-6, 1e-3, 0.01, 0.1, -0.1, 0, 0]))
+            RNG.uniform(-0.004, 0.004, (8, 2)),
+            0.01 * (1 + np.array([1e-6, -1e-6, 1e-3, 0.01, 0.1, -0.1, 0, 0])),
         ],
         log_scale=log_normal(8, 3e-4),
         opacity=np.full(8, -1.0),
@@ -91,18 +99,25 @@ SCENES = {
     # Catches a sort that is not stable, or that compares fewer bits than a float32 has.
     "equal depths": with_depths(np.full(60, TWO)),
     "depths one ulp apart": with_depths(
-        np.choose(np.arange(60) * 7 % 3, [TWO, np.nextafter(TWO, np.float32(3)), np.nextafter(TWO, np.float32(0))])
+        np.choose(
+            np.arange(60) * 7 % 3,
+            [TWO, np.nextafter(TWO, np.float32(3)), np.nextafter(TWO, np.float32(0))],
+        )
     ),
 }
 for width, height in ((1, 1), (1, 40), (40, 1), (17, 33)):
     SCENES[f"{width} x {height} px"] = facing(
-        60, size=(width, height), log_scale=RNG.uniform(-12, 3, (60, 3)), opacity=RNG.normal(-1, 1, 60)
+        60,
+        size=(width, height),
+        log_scale=RNG.uniform(-12, 3, (60, 3)),
+        opacity=RNG.normal(-1, 1, 60),
     )
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_hard_scene_is_the_references(back_end: str, name: str) -> None:
-    """Catches what the comment beside the scene says; anything not finite; any error beyond the table's tolerances."""
+    """Catches what the comment beside the scene says; anything not finite; any error beyond the
+    table's tolerances."""
     # The kernel's near plane is the float32 next to 0.01.
     errors, gradients = compare(SCENES[name], near=float(np.float32(0.01)))
     assert all(gradient.any() for gradient in gradients.values()), "nothing to see"
@@ -111,10 +126,12 @@ def test_hard_scene_is_the_references(back_end: str, name: str) -> None:
 
 @pytest.mark.parametrize("norm", [0.0, 1e-38, 1e-20, 1e-13, 1e13, 1e20, 1e37])
 def test_quaternions_of_any_length(back_end: str, norm: float) -> None:
-    """Catches squares that leave float32's range: such splats, and those of length zero, used to vanish.
+    """Catches squares that leave float32's range: such splats, and those of length zero, used to
+    vanish.
 
-    A quaternion of length zero counts as no rotation, as in the embedding, and has no gradient. The gradient of any
-    other is 1 / length times that of the unit quaternion, up to 1e12, so that Adam can square it.
+    A quaternion of length zero counts as no rotation, as in the embedding, and has no gradient. The
+    gradient of any other is 1 / length times that of the unit quaternion, up to 1e12, so that Adam
+    can square it.
     """
     scene = facing(30)
     unit = scene.splats["rotation"].astype(np.float64)
@@ -130,15 +147,20 @@ def test_quaternions_of_any_length(back_end: str, norm: float) -> None:
         np.testing.assert_allclose(image, want, atol=5e-6)
     expected["rotation"] *= min(1 / norm, 1e12) if norm else 0
     for name in NAMES:
-        np.testing.assert_allclose(gradients[name], expected[name], atol=1e-5 * np.abs(expected[name]).max(), rtol=1e-4)
+        np.testing.assert_allclose(
+            gradients[name], expected[name], atol=1e-5 * np.abs(expected[name]).max(), rtol=1e-4
+        )
 
 
 def test_opposite_quaternions_are_the_same_image(back_end: str) -> None:
-    """Catches a rotation that depends on the sign: bit-identical image, exactly opposite rotation gradient."""
+    """Catches a rotation that depends on the sign: bit-identical image, exactly opposite rotation
+    gradient."""
     scene = facing(30)
     opposite = replace(scene, splats=scene.splats | {"rotation": -scene.splats["rotation"]})
     cotangents = random_cotangents(scene.camera)
-    (images, gradients), (others, mirrored) = (kernel_gradients(s, cotangents) for s in (scene, opposite))
+    (images, gradients), (others, mirrored) = (
+        kernel_gradients(s, cotangents) for s in (scene, opposite)
+    )
     for image, other in zip(images, others, strict=True):
         np.testing.assert_array_equal(image, other)
     mirrored["rotation"] = -mirrored["rotation"]
@@ -158,8 +180,8 @@ BROKEN = {name: (name, np.nan) for name in NAMES} | {
 def test_a_broken_splat_is_dropped(back_end: str, name: str) -> None:
     """Catches NaN that spreads, or that a clamp turns into a plausible number.
 
-    NaN in `sh` was cut to zero: a black splat with NaN gradients. The image and the other rows' gradients must be
-    bit-identical to those without the splat, and its own row zero.
+    NaN in `sh` was cut to zero: a black splat with NaN gradients. The image and the other rows'
+    gradients must be bit-identical to those without the splat, and its own row zero.
     """
     scene = facing(20)
     field, value = BROKEN[name]
@@ -171,7 +193,9 @@ def test_a_broken_splat_is_dropped(back_end: str, name: str) -> None:
     for image, want in zip(images, expected_images, strict=True):
         np.testing.assert_array_equal(image, want)
     for parameter in NAMES:
-        np.testing.assert_array_equal(gradients[parameter][others], expected[parameter], err_msg=parameter)
+        np.testing.assert_array_equal(
+            gradients[parameter][others], expected[parameter], err_msg=parameter
+        )
         assert not gradients[parameter][3].any(), parameter
 
 
@@ -182,12 +206,15 @@ def test_a_broken_splat_is_counted(name: str) -> None:
     field, value = BROKEN[name]
     scene.splats[field][3] = value
     splats = Parameters(*(scene.splats[n] for n in NAMES))
-    rendering = render_forward(splats, np.zeros(20, np.int32), frames_in_camera(WORLD, scene.camera), 1)
+    rendering = render_forward(
+        splats, np.zeros(20, np.int32), frames_in_camera(WORLD, scene.camera), 1
+    )
     np.testing.assert_array_equal(np.flatnonzero(rendering.projection.rect[:, 0] < 0), [3])
 
 
 def test_one_nan_component_of_a_quaternion_is_enough(back_end: str) -> None:
-    """Catches a comparison that NaN slips through: a quaternion (0, 0, 0, NaN) is not one of length zero."""
+    """Catches a comparison that NaN slips through: a quaternion (0, 0, 0, NaN) is not one of length
+    zero."""
     for component in range(4):
         scene = facing(1, xyz=[[0, 0, 2.0]])
         scene.splats["rotation"][:] = 0
@@ -197,10 +224,12 @@ def test_one_nan_component_of_a_quaternion_is_enough(back_end: str) -> None:
 
 
 def test_ten_thousand_opaque_layers(back_end: str) -> None:
-    """Catches a backward pass that divides by 1 − alpha beyond the pixel's end: gradients of 1e30 and NaN.
+    """Catches a backward pass that divides by 1 − alpha beyond the pixel's end: gradients of 1e30
+    and NaN.
 
-    Within the first 300 layers every pixel is closed; behind that nothing may have a gradient, before it the
-    reference's. Reading the stop from the transmittance again instead of the stored last splat fails here.
+    Within the first 300 layers every pixel is closed; behind that nothing may have a gradient,
+    before it the reference's. Reading the stop from the transmittance again instead of the stored
+    last splat fails here.
     """
     depths = np.linspace(1, 3, 10_000)
     scene = facing(
@@ -221,7 +250,9 @@ def test_ten_thousand_opaque_layers(back_end: str) -> None:
         np.testing.assert_allclose(image * steady.numpy(), want * steady.numpy(), atol=1e-5)
     for name in NAMES:
         assert np.isfinite(gradients[name]).all(), name
-        np.testing.assert_allclose(gradients[name][:300], expected[name], atol=1e-4 * np.abs(expected[name]).max())
+        np.testing.assert_allclose(
+            gradients[name][:300], expected[name], atol=1e-4 * np.abs(expected[name]).max()
+        )
         assert not gradients[name][300:].any(), name
 
 
@@ -237,7 +268,9 @@ def triangles(seed: int = 3, count: int = 12) -> tuple[np.ndarray, np.ndarray, n
 def embedded(count: int = 60, faces: int = 12) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Splats in the frames of the triangles: parameters and face (N,) int32."""
     rng = np.random.default_rng(4)
-    scene = facing(count, 4, xyz=rng.normal(0, 0.005, (count, 3)), log_scale=log_normal(count, 0.008))
+    scene = facing(
+        count, 4, xyz=rng.normal(0, 0.005, (count, 3)), log_scale=log_normal(count, 0.008)
+    )
     return scene.splats, rng.integers(0, faces, count).astype(np.int32)
 
 
@@ -249,7 +282,9 @@ def draw(
     cotangents = random_cotangents(camera)
     loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
     gradients = torch.autograd.grad(loss, tensors)
-    return [i.detach().numpy() for i in images], {n: g.numpy() for n, g in zip(NAMES, gradients, strict=True)}
+    return [i.detach().numpy() for i in images], {
+        n: g.numpy() for n, g in zip(NAMES, gradients, strict=True)
+    }
 
 
 def head_camera(distance: float = 0.8, focal: float = 90.0) -> Camera:
@@ -260,7 +295,8 @@ def head_camera(distance: float = 0.8, focal: float = 90.0) -> Camera:
 
 @pytest.mark.parametrize("shift", [[100.0, 0, 0], [-60.0, 70, 40], [1e4, 1e4, 1e4]])
 def test_a_head_far_from_the_origin_is_the_same_head(back_end: str, shift: list[float]) -> None:
-    """Catches frames or cameras composed in float32: at 100 m that is 8 µm a coordinate, at 10 km a millimeter."""
+    """Catches frames or cameras composed in float32: at 100 m that is 8 µm a coordinate, at 10 km a
+    millimeter."""
     posed, neutral, faces = triangles()
     splats, face = embedded()
     camera = head_camera()
@@ -268,34 +304,53 @@ def test_a_head_far_from_the_origin_is_the_same_head(back_end: str, shift: list[
     moved = camera.world_to_camera.copy()
     moved[:3, 3] -= moved[:3, :3] @ shift
     far = replace(camera, world_to_camera=moved)
-    far_images, far_gradients = draw(splats, face, face_frames(posed + shift, faces, neutral + shift), far)
+    far_images, far_gradients = draw(
+        splats, face, face_frames(posed + shift, faces, neutral + shift), far
+    )
     assert images[1].max() > 0.5
     for image, other in zip(images, far_images, strict=True):
         np.testing.assert_allclose(other, image, atol=2e-6)
     for name in NAMES:
         np.testing.assert_allclose(
-            far_gradients[name], gradients[name], atol=1e-5 * np.abs(gradients[name]).max(), err_msg=name
+            far_gradients[name],
+            gradients[name],
+            atol=1e-5 * np.abs(gradients[name]).max(),
+            err_msg=name,
         )
 
 
-@pytest.mark.parametrize(("size", "distance", "focal"), [(1000.0, 800.0, 90.0), (1e-3, 0.08, 9e3), (1e-3, 0.02, 2e3)])
-def test_a_mesh_a_thousand_times_too_large_or_small(back_end: str, size: float, distance: float, focal: float) -> None:
-    """Catches absolute thresholds (areas, lengths) on the way from a mesh to an image and back to the splats.
+@pytest.mark.parametrize(
+    ("size", "distance", "focal"), [(1000.0, 800.0, 90.0), (1e-3, 0.08, 9e3), (1e-3, 0.02, 2e3)]
+)
+def test_a_mesh_a_thousand_times_too_large_or_small(
+    back_end: str, size: float, distance: float, focal: float
+) -> None:
+    """Catches absolute thresholds (areas, lengths) on the way from a mesh to an image and back to
+    the splats.
 
-    The large one is seen from as far away; the small one through a longer lens, and from just before the near plane.
+    The large one is seen from as far away; the small one through a longer lens, and from just
+    before the near plane.
     """
     posed, neutral, faces = triangles()
     splats, face = embedded()
     camera = head_camera(distance, focal)
     camera.world_to_camera[:2, 3] *= size
-    frames = face_frames(posed * size, faces, neutral)  # the splats stay in meters of the neutral mesh
+    # the splats stay in meters of the neutral mesh
+    frames = face_frames(posed * size, faces, neutral)
     images, gradients = draw(splats, face, frames, camera)
     tensors = [torch.from_numpy(splats[name]).double().requires_grad_() for name in NAMES]
     expected_images = reference.render(*embed(tensors, frames, face), camera, sh_degree=1)
-    loss = sum((image * v).sum() for image, v in zip(expected_images, random_cotangents(camera), strict=True))
+    loss = sum(
+        (image * v).sum()
+        for image, v in zip(expected_images, random_cotangents(camera), strict=True)
+    )
     expected = torch.autograd.grad(loss, tensors)
     assert images[1].max() > 0.5
     for image, want in zip(images, expected_images, strict=True):
-        np.testing.assert_allclose(image, want.detach(), atol=5e-6 * max(1, float(want.detach().max())))
+        np.testing.assert_allclose(
+            image, want.detach(), atol=5e-6 * max(1, float(want.detach().max()))
+        )
     for name, want in zip(NAMES, expected, strict=True):
-        np.testing.assert_allclose(gradients[name], want, atol=2e-5 * float(want.abs().max()), err_msg=name)
+        np.testing.assert_allclose(
+            gradients[name], want, atol=2e-5 * float(want.abs().max()), err_msg=name
+        )

@@ -38,7 +38,9 @@ def loss_errors(image: np.ndarray, target: np.ndarray) -> tuple[float, float]:
     _, ssim = image_gradient(image, target, whole_image(HEIGHT, WIDTH), 0.2, out)
     assert np.isfinite(out).all()
     gradient, _, similar = loss_reference(image, target, 0.2)
-    return float(np.abs(out - gradient).max() / np.abs(gradient).max()), abs(ssim - float(similar.mean()))
+    return float(np.abs(out - gradient).max() / np.abs(gradient).max()), abs(
+        ssim - float(similar.mean())
+    )
 
 
 def random_target() -> np.ndarray:
@@ -51,10 +53,12 @@ EXTREMES += [("constant", value) for value in (0.0, 1.0, 10.0)]
 
 @pytest.mark.parametrize(("kind", "value"), EXTREMES)
 def test_loss_of_extreme_images(kind: str, value: float) -> None:
-    """Catches overflow of the product of two variances, and 0/0 where image or target does not vary.
+    """Catches overflow of the product of two variances, and 0/0 where image or target does not
+    vary.
 
-    Harmonics of 1e4 do make images of 1e4. The target is noise: where both are constant SSIM is flat, and what is left
-    of its gradient is rounding (`training/test_losses.py::test_constant_images`).
+    Harmonics of 1e4 do make images of 1e4. The target is noise: where both are constant SSIM is
+    flat, and what is left of its gradient is rounding
+    (`training/test_losses.py::test_constant_images`).
     """
     gradient, ssim = loss_errors(image_of(kind, value), random_target())
     assert gradient < 5e-4
@@ -64,10 +68,11 @@ def test_loss_of_extreme_images(kind: str, value: float) -> None:
 @pytest.mark.parametrize("value", [1.0, 2.0, 10.0, 100.0, 1e4, 1e8, 1e15, 1e18])
 @pytest.mark.parametrize("kind", ["constant", "nearly constant", "noise", "sparks"])
 def test_loss_never_runs_away(kind: str, value: float) -> None:
-    """Catches a variance that rounding makes negative, which turns SSIM's gradient round and inflates it, and NaN.
+    """Catches a variance that rounding makes negative, which turns SSIM's gradient round and
+    inflates it, and NaN.
 
-    An image is training's to change, so what counts is that every pixel is pulled towards the target no harder than
-    the loss can: by about one per pixel from L1 and a few more from SSIM.
+    An image is training's to change, so what counts is that every pixel is pulled towards the
+    target no harder than the loss can: by about one per pixel from L1 and a few more from SSIM.
     """
     image, target = image_of(kind, value), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     out = np.full_like(image, np.nan)
@@ -81,14 +86,29 @@ def test_loss_never_runs_away(kind: str, value: float) -> None:
 def test_limits_where_every_norm_is_zero() -> None:
     """Catches 0/0 in the gradients of |x| at the origin and of a norm of nothing but zeros."""
     count = 4
-    rows, face, unbound = np.arange(count, dtype=np.int32), np.zeros(count, np.int32), np.zeros(count, bool)
+    rows, face, unbound = (
+        np.arange(count, dtype=np.int32),
+        np.zeros(count, np.int32),
+        np.zeros(count, bool),
+    )
     for limit in (0.0, 1.0):
         gradient = np.zeros((count, 3), np.float32)
-        norm = distance_limit(rows, np.zeros((count, 3), np.float32), face, unbound, np.float32([limit]), 0.1, gradient)
+        norm = distance_limit(
+            rows,
+            np.zeros((count, 3), np.float32),
+            face,
+            unbound,
+            np.float32([limit]),
+            0.1,
+            gradient,
+        )
         assert norm == 0
         assert not gradient.any()
         flat = np.full((count, 3), -200, np.float32)  # scales of e^−200 are zero in float32
-        assert scale_limit(rows, flat, face, unbound, np.float32([[limit], [limit]]), 0.1, gradient) == 0
+        assert (
+            scale_limit(rows, flat, face, unbound, np.float32([[limit], [limit]]), 0.1, gradient)
+            == 0
+        )
         assert not gradient.any()
 
 
@@ -105,7 +125,8 @@ def test_limit_of_one_enormous_splat() -> None:
 
 
 def test_nothing_and_everything_selected() -> None:
-    """Catches an empty list of tiles, rectangles or rows, and a full selection that is not a global iteration."""
+    """Catches an empty list of tiles, rectangles or rows, and a full selection that is not a global
+    iteration."""
     scene = facing(40, size=(70, 50), focal=60.0)
     splats, face = Parameters(*(scene.splats[n] for n in NAMES)), np.zeros(40, np.int32)
     camera_frames = frames_in_camera(WORLD, scene.camera)
@@ -118,12 +139,16 @@ def test_nothing_and_everything_selected() -> None:
         results.append((rows, gradients))
     np.testing.assert_array_equal(results[0][0], results[1][0])
     for name in NAMES:
-        np.testing.assert_array_equal(getattr(results[0][1], name), getattr(results[1][1], name), err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(results[0][1], name), getattr(results[1][1], name), err_msg=name
+        )
         assert (getattr(results[2][1], name) == 7).all(), name
     assert len(results[2][0]) == 0
     no_tiles = tile_rectangles(np.zeros((4, 5), bool), 50, 70)
     out = np.full((3, 50, 70), 7, np.float32)
-    assert image_gradient(np.zeros_like(out), np.zeros((50, 70, 3), np.uint8), no_tiles, 0.2, out) == (0, 0)
+    assert image_gradient(
+        np.zeros_like(out), np.zeros((50, 70, 3), np.uint8), no_tiles, 0.2, out
+    ) == (0, 0)
     assert (out == 7).all()
     state = new_state(random_splats(5, 3))
     before = bits(state)
@@ -144,7 +169,8 @@ def float64_adam(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
 
 
 def adam_path(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
-    """The same for the opacity of one of three rows, by the kernel; the other two have gradients of one."""
+    """The same for the opacity of one of three rows, by the kernel; the other two have gradients of
+    one."""
     state = new_state(random_splats(3, 3))
     state.steps[1] = steps
     state.parameters.opacity[:] = 0
@@ -167,13 +193,17 @@ def test_adam_with_vanishing_moments(size: float) -> None:
     Second moments of 1e-30 and less: there ε = 1e-15 decides, and the step tends to nothing.
     """
     gradients = size * np.random.default_rng(2).normal(size=30)
-    # Where squares are subnormal, only their order of magnitude is left, beside an ε that outweighs them.
-    np.testing.assert_allclose(adam_path(gradients), float64_adam(gradients), atol=1e-4 if size != 1e-20 else 1e-3)
+    # Where squares are subnormal, only their order of magnitude is left, beside an ε that outweighs
+    # them.
+    np.testing.assert_allclose(
+        adam_path(gradients), float64_adam(gradients), atol=1e-4 if size != 1e-20 else 1e-3
+    )
 
 
 @pytest.mark.parametrize("spike", [1e8, 1e15, 1e17])
 def test_adam_after_a_spike(spike: float) -> None:
-    """Catches a spike that overflows the second moment: as in float64, it moves by a few rates and is forgotten."""
+    """Catches a spike that overflows the second moment: as in float64, it moves by a few rates and
+    is forgotten."""
     gradients = np.random.default_rng(3).normal(size=40)
     gradients[10] = spike
     np.testing.assert_allclose(adam_path(gradients), float64_adam(gradients), atol=1e-4)
@@ -193,8 +223,8 @@ def test_adam_after_a_spike_whose_square_overflows(spike: float) -> None:
 
 
 def test_a_row_that_is_stepped_once_in_ten_thousand() -> None:
-    """Catches bias correction by iterations instead of the row's own steps: after three rare ones its moments are
-    still corrected by 1 − β³, while its neighbor's are not any more."""
+    """Catches bias correction by iterations instead of the row's own steps: after three rare ones
+    its moments are still corrected by 1 − β³, while its neighbor's are not any more."""
     state = new_state(random_splats(2, 3))
     state.parameters.opacity[:] = 0
     for array in state.gradients:
@@ -207,13 +237,18 @@ def test_a_row_that_is_stepped_once_in_ten_thousand() -> None:
         for _ in range(20):
             state.gradients.opacity[:] = float(rng.normal())
             adam.step(state, np.array([0], np.int32), RATE)
-        state.steps[0] += 10_000 - 21  # the steps in between do nothing to row 1, however many they are
+        # the steps in between do nothing to row 1, however many they are
+        state.steps[0] += 10_000 - 21
     assert state.steps.tolist() == [30_000, 3]
-    assert float(state.parameters.opacity[1]) == pytest.approx(1e-3 * float64_adam(rare)[-1], rel=1e-5)
+    assert float(state.parameters.opacity[1]) == pytest.approx(
+        1e-3 * float64_adam(rare)[-1], rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("steps", [0, 1, 10_000, 10_000_000, 2**31 - 50])
 def test_adam_of_any_age(steps: int) -> None:
     """Catches 1 − β^n that cancels at the first steps or overflows a count at the last."""
     gradients = np.random.default_rng(5).normal(size=20)
-    np.testing.assert_allclose(adam_path(gradients, steps), float64_adam(gradients, steps), atol=1e-4, rtol=1e-5)
+    np.testing.assert_allclose(
+        adam_path(gradients, steps), float64_adam(gradients, steps), atol=1e-4, rtol=1e-5
+    )

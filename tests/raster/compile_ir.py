@@ -1,7 +1,8 @@
 """Compiles LLVM IR for processors, none of which has to be at hand.
 
-A process of its own, because LLVM ends the process that it finds an error in. Standard input: JSON of `ir` and
-`targets`, processor -> triple; output: processor -> assembly, null where this llvmlite was built without the triple.
+A process of its own, because LLVM ends the process that it finds an error in. Standard input: JSON
+of `ir` and `targets`, processor -> triple; output: processor -> assembly, null where this llvmlite
+was built without the triple.
 """
 
 import json
@@ -41,4 +42,7 @@ if __name__ == "__main__":
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     asked = json.load(sys.stdin)
-    json.dump({cpu: assembly(asked["ir"], cpu, triple) for cpu, triple in asked["targets"].items()}, sys.stdout)
+    json.dump(
+        {cpu: assembly(asked["ir"], cpu, triple) for cpu, triple in asked["targets"].items()},
+        sys.stdout,
+    )

@@ -1,4 +1,5 @@
-"""Differentiable rendering of torch tensors by the WebGPU kernels: copied to the device and back."""
+"""Differentiable rendering of torch tensors by the WebGPU kernels: copied to the device and
+back."""
 
 from functools import cache
 from typing import Any
@@ -23,14 +24,17 @@ def render_differentiable(
     degree: int = 3,
     antialiased: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Differentiable rendering on the first adapter; everything as in `cpu.autograd.render_differentiable`."""
+    """Differentiable rendering on the first adapter; everything as in
+    `cpu.autograd.render_differentiable`."""
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
     camera_frames = frames_in_camera(frames, camera)
     strains = camera_frames.strain.shape[1]
     given = [tensor for tensor in splats if tensor is not None]
     images = []
     for depth_as_color in (False, True):
-        options = ViewOptions(camera, degree, strains=strains, depth_as_color=depth_as_color, antialiased=antialiased)
+        options = ViewOptions(
+            camera, degree, strains=strains, depth_as_color=depth_as_color, antialiased=antialiased
+        )
         images.append(_Blend.apply(options, camera_frames, face, *given))
     (rgb, transmittance), (depth, _) = images
     return rgb, 1 - transmittance, depth[0]
@@ -44,7 +48,11 @@ def _rasterizer() -> Rasterizer:
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray, *tensors: torch.Tensor
+        ctx: Any,
+        options: ViewOptions,
+        camera_frames: CameraFrames,
+        face: np.ndarray,
+        *tensors: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         ctx.saved = options, camera_frames, face, splats
@@ -57,7 +65,12 @@ class _Blend(torch.autograd.Function):
         options, camera_frames, face, splats = ctx.saved
         _, _, gradients = _render(options, camera_frames, face, splats, cotangents)
         given = [gradient for gradient in gradients if gradient is not None]
-        return None, None, None, *(torch.from_numpy(g) for g in given[: len(ctx.needs_input_grad) - 3])
+        return (
+            None,
+            None,
+            None,
+            *(torch.from_numpy(g) for g in given[: len(ctx.needs_input_grad) - 3]),
+        )
 
 
 def _render(
@@ -72,9 +85,13 @@ def _render(
         gradients = device.upload("gradients", np.zeros((table.count, table.stride), np.float32))
         v_images = [device.upload(f"v {n}", v) for n, v in enumerate(cotangents or ())]
         with device.record() as work:
-            rendering = rasterizer.forward(work, table, frames, options, rasterizer.upload_view(table, options))
+            rendering = rasterizer.forward(
+                work, table, frames, options, rasterizer.upload_view(table, options)
+            )
             if cotangents is not None:
-                rasterizer.backward(work, rendering, table, options.camera, v_images[0], gradients, v_images[1])
+                rasterizer.backward(
+                    work, rendering, table, options.camera, v_images[0], gradients, v_images[1]
+                )
         if rasterizer.pairs_fit():
             break
     pixels = device.read(rendering["pixels"], (height, width, 2))

@@ -11,5 +11,6 @@ from stga_addon.raster.gpu.device import Device  # noqa: E402
 
 @cache
 def device() -> Device:
-    """The first adapter's device, whose kernels stay compiled, for tests marked `needs("adapter")`."""
+    """The first adapter's device, whose kernels stay compiled, for tests marked
+    `needs("adapter")`."""
     return Device()

@@ -1,4 +1,5 @@
-"""Hashes of a forward and a backward pass of the CPU's kernels; run by test_cache.py in processes of its own."""
+"""Hashes of a forward and a backward pass of the CPU's kernels; run by test_cache.py in processes
+of its own."""
 
 import hashlib
 
@@ -21,7 +22,10 @@ splats = Parameters(
     rng.normal(0, 0.4, (n, 16, 3)),
 )
 splats = Parameters(*(a.astype(np.float32) for a in splats[:5]))
-camera_frames, face = frames_in_camera(WORLD, Camera(70, 50, 90.0, 90.0, 35.0, 25.0, pose)), np.zeros(n, np.int32)
+camera_frames, face = (
+    frames_in_camera(WORLD, Camera(70, 50, 90.0, 90.0, 35.0, 25.0, pose)),
+    np.zeros(n, np.int32),
+)
 rendering = render_forward(splats, face, camera_frames, 3)
 target = rng.integers(0, 256, (50, 70, 3)).astype(np.uint8)
 v_image = np.empty_like(rendering.image)

@@ -1,7 +1,9 @@
-"""Reference renderer: one plain torch function per stage, against which both sets of kernels are tested.
+"""Reference renderer: one plain torch function per stage, against which both sets of kernels are
+tested.
 
-Any dtype, gradients by autograd. Small scenes only: every splat is evaluated at every pixel. Stages: `embed` (triangles
-to world space), `project`, `sh_color`, `splat_alpha` and `blend`, which `render` chains, and `image_loss`.
+Any dtype, gradients by autograd. Small scenes only: every splat is evaluated at every pixel.
+Stages: `embed` (triangles to world space), `project`, `sh_color`, `splat_alpha` and `blend`, which
+`render` chains, and `image_loss`.
 """
 
 from math import pi, sqrt
@@ -33,18 +35,21 @@ def render(
     near: float = NEAR_M,
     antialiased: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Image of world-space splats: color (3, H, W) on black, alpha (H, W), depth (H, W) = Σ weight · z.
+    """Image of world-space splats: color (3, H, W) on black, alpha (H, W), depth (H, W) = Σ weight
+    · z.
 
-    xyz (N, 3) meters, rotation (N, 4) wxyz of any length, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3) of
-    which the first (sh_degree + 1)² are used. near in meters, z the camera's.
-    antialiased: opacity loses what the low-pass adds to the projected area (Mip-Splatting, 2D filter).
-    Splats closer than `near` are dropped; the rest are blended front to back by z, in input order where z ties.
-    (3D Gaussian Splatting, sections 4 to 6, with gsplat's constants.)
+    xyz (N, 3) meters, rotation (N, 4) wxyz of any length, log_scale (N, 3), opacity (N,) logit, sh
+    (N, K, 3) of which the first (sh_degree + 1)² are used. near in meters, z the camera's.
+    antialiased: opacity loses what the low-pass adds to the projected area (Mip-Splatting, 2D
+    filter). Splats closer than `near` are dropped; the rest are blended front to back by z, in
+    input order where z ties. (3D Gaussian Splatting, sections 4 to 6, with gsplat's constants.)
     """
     z = camera_space(xyz, camera)[:, 2].detach()
     order = torch.argsort(z, stable=True)
     order = order[z[order] >= near]
-    center, covariance, depth, compensation = project(xyz[order], rotation[order], log_scale[order], camera)
+    center, covariance, depth, compensation = project(
+        xyz[order], rotation[order], log_scale[order], camera
+    )
     position = torch.as_tensor(camera.position, dtype=xyz.dtype, device=xyz.device)
     visible = torch.sigmoid(opacity[order])
     if antialiased:
@@ -56,8 +61,8 @@ def render(
 def embed(
     xyz: Tensor, rotation: Tensor, log_scale: Tensor, frames: FaceFrames, face: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """World-space xyz (N, 3), rotation (N, 4) wxyz and log_scale (N, 3) of splats in the frames of triangles face
-    (N,)."""
+    """World-space xyz (N, 3), rotation (N, 4) wxyz and log_scale (N, 3) of splats in the frames of
+    triangles face (N,)."""
     n = len(xyz)
     assert xyz.shape == log_scale.shape == (n, 3), (xyz.shape, log_scale.shape)
     assert rotation.shape == (n, 4), rotation.shape
@@ -80,10 +85,13 @@ def camera_space(xyz: Tensor, camera: Camera) -> Tensor:
     return xyz @ view[:3, :3].T + view[:3, 3]
 
 
-def project(xyz: Tensor, rotation: Tensor, log_scale: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def project(
+    xyz: Tensor, rotation: Tensor, log_scale: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Project N world-space Gaussians; all must be in front of the camera.
 
-    Returns center (N, 2) in pixels, covariance (N, 2, 2) in square pixels with the low-pass, depth (N,) in meters, and
+    Returns center (N, 2) in pixels, covariance (N, 2, 2) in square pixels with the low-pass, depth
+    (N,) in meters, and
     compensation (N,): the factor of opacity that keeps what the low-pass adds from showing.
     """
     n = len(xyz)
@@ -111,7 +119,8 @@ def project(xyz: Tensor, rotation: Tensor, log_scale: Tensor, camera: Camera) ->
 
 
 def clamp_to_frustum(slope: Tensor, size: int, focal: float, principal: float) -> Tensor:
-    """Slopes x/z or y/z (N,) kept near the image's borders: the linearized projection explodes far outside it."""
+    """Slopes x/z or y/z (N,) kept near the image's borders: the linearized projection explodes far
+    outside it."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     return slope.clamp(-principal / focal - margin, (size - principal) / focal + margin)
 
@@ -129,7 +138,8 @@ def rotation_matrix(quaternion: Tensor) -> Tensor:
 
 
 def sh_color(sh: Tensor, direction: Tensor, degree: int) -> Tensor:
-    """Color (N, 3) ≥ 0 of coefficients sh (N, K, 3) seen along `direction` (N, 3), of any length."""
+    """Color (N, 3) ≥ 0 of coefficients sh (N, K, 3) seen along `direction` (N, 3), of any
+    length."""
     count = (degree + 1) ** 2
     assert direction.shape == (len(sh), 3), direction.shape
     assert sh.shape == (len(sh), sh.shape[1], 3), sh.shape
@@ -139,7 +149,8 @@ def sh_color(sh: Tensor, direction: Tensor, degree: int) -> Tensor:
 
 
 def sh_basis(direction: Tensor) -> Tensor:
-    """Real spherical harmonics (N, 16) up to degree 3 of unit directions (N, 3), 3D Gaussian Splatting's signs."""
+    """Real spherical harmonics (N, 16) up to degree 3 of unit directions (N, 3), 3D Gaussian
+    Splatting's signs."""
     assert direction.shape == (len(direction), 3), direction.shape
     x, y, z = direction.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
@@ -167,8 +178,8 @@ def sh_basis(direction: Tensor) -> Tensor:
 
 
 def splat_alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Camera) -> Tensor:
-    """Alpha (N, H, W) of projected splats at every pixel's center: center (N, 2), covariance (N, 2, 2), opacity
-    (N,)."""
+    """Alpha (N, H, W) of projected splats at every pixel's center: center (N, 2), covariance (N, 2,
+    2), opacity (N,)."""
     n = len(center)
     assert center.shape == (n, 2), center.shape
     assert covariance.shape == (n, 2, 2), covariance.shape
@@ -184,7 +195,8 @@ def splat_alpha(center: Tensor, covariance: Tensor, opacity: Tensor, camera: Cam
 
 
 def blend(alpha: Tensor, color: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend splats given front to back: alpha (N, H, W), color (N, 3), depth (N,), to the three images of `render`.
+    """Blend splats given front to back: alpha (N, H, W), color (N, 3), depth (N,), to the three
+    images of `render`.
 
     A pixel ends before the splat that would leave it a transmittance of MIN_TRANSMITTANCE or less.
     """
@@ -205,9 +217,11 @@ def blend(alpha: Tensor, color: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def image_loss(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Maps (3, H, W) of |difference| and SSIM of two images (3, H, W) in 0…1; the loss mixes 1 − SSIM and the other.
+    """Maps (3, H, W) of |difference| and SSIM of two images (3, H, W) in 0…1; the loss mixes 1 −
+    SSIM and the other.
 
-    SSIM: Gaussian window of 11 pixels, σ 1.5, zero padding (Wang et al. 2004, as used by 3D Gaussian Splatting).
+    SSIM: Gaussian window of 11 pixels, σ 1.5, zero padding (Wang et al. 2004, as used by 3D
+    Gaussian Splatting).
     """
     assert image.shape == target.shape == (3, *image.shape[1:]), (image.shape, target.shape)
     line = torch.exp(-(torch.arange(-5.0, 6.0, dtype=image.dtype) ** 2) / (2 * 1.5**2))

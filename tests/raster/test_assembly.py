@@ -1,6 +1,8 @@
-"""The assembly of the kernels' inner loops on processors of several kinds, none of which has to be at hand.
+"""The assembly of the kernels' inner loops on processors of several kinds, none of which has to be
+at hand.
 
-Numba's unoptimized IR of a loop is given to LLVM for another processor, through the passes that Numba runs.
+Numba's unoptimized IR of a loop is given to LLVM for another processor, through the passes that
+Numba runs.
 """
 
 import json
@@ -26,8 +28,9 @@ X86, ARM = "x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"
 
 @dataclass(frozen=True)
 class Processor:
-    """triple: LLVM's name of the architecture; vector: what only an instruction of full width names; packed: an
-    arithmetic instruction on packed floats; scalar: one on a single float; conditional: a masked or scattered access.
+    """triple: LLVM's name of the architecture; vector: what only an instruction of full width
+    names; packed: an arithmetic instruction on packed floats; scalar: one on a single float;
+    conditional: a masked or scattered access.
     """
 
     triple: str
@@ -44,7 +47,13 @@ PACKED_X86, SCALAR_X86 = (
 MASKED_X86 = r"\svp?maskmov|\sv\w*(gather|scatter)|\sv\w*mov\w*\s.*\(.*\{%k"
 AVX2 = Processor(X86, "%ymm", PACKED_X86, SCALAR_X86, MASKED_X86)
 AVX512 = Processor(X86, "%zmm", PACKED_X86, SCALAR_X86, MASKED_X86)
-NEON = Processor(ARM, r"\.4s", r"\sf\w+\s+v.*\.4s", r"\sf(add|sub|mul|div|sqrt|min|max|n?m\w+)\s+s\d", r"\s(ld|st)\d\s")
+NEON = Processor(
+    ARM,
+    r"\.4s",
+    r"\sf\w+\s+v.*\.4s",
+    r"\sf(add|sub|mul|div|sqrt|min|max|n?m\w+)\s+s\d",
+    r"\s(ld|st)\d\s",
+)
 PROCESSORS = {"znver3": AVX2, "znver4": AVX512, "sapphirerapids": AVX2, "apple-m1": NEON}
 """LLVM prefers 256 bits on Sapphire Rapids, whose wider instructions lower the clock."""
 
@@ -52,21 +61,30 @@ PROCESSORS = {"znver3": AVX2, "znver4": AVX512, "sapphirerapids": AVX2, "apple-m
 def unoptimized_ir(function: Callable, signature: object, monkeypatch: pytest.MonkeyPatch) -> str:
     """Numba's LLVM IR of a function, compiled as the kernels are but for the optimization.
 
-    What it calls must be inlined by Numba (`inline_jit`): other functions would be kept, unoptimized, in the cache.
+    What it calls must be inlined by Numba (`inline_jit`): other functions would be kept,
+    unoptimized, in the cache.
     """
     monkeypatch.setattr(config, "OPT", type(config.OPT)(0))
     python = getattr(function, "py_func", function)
-    compiled = numba.njit(signature, fastmath=FASTMATH, error_model="numpy", no_cpython_wrapper=True)(python)
+    compiled = numba.njit(
+        signature, fastmath=FASTMATH, error_model="numpy", no_cpython_wrapper=True
+    )(python)
     ir = next(iter(compiled.inspect_llvm().values()))
     # Reference counting is in the form for this processor where this process has used it before.
     return re.sub(
-        r"^define linkonce_odr (\w+ @NRT_\w+)\(.*?^\}", r"declare \1(ptr)", ir, flags=re.MULTILINE | re.DOTALL
+        r"^define linkonce_odr (\w+ @NRT_\w+)\(.*?^\}",
+        r"declare \1(ptr)",
+        ir,
+        flags=re.MULTILINE | re.DOTALL,
     )
 
 
 def assemblies(ir: str) -> dict[str, str]:
-    """Processor -> the IR compiled for it. Skips where this llvmlite was built without one of them."""
-    asked = json.dumps({"ir": ir, "targets": {cpu: kind.triple for cpu, kind in PROCESSORS.items()}})
+    """Processor -> the IR compiled for it. Skips where this llvmlite was built without one of
+    them."""
+    asked = json.dumps(
+        {"ir": ir, "targets": {cpu: kind.triple for cpu, kind in PROCESSORS.items()}}
+    )
     ran = subprocess.run([sys.executable, DRIVER], input=asked, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)
@@ -79,8 +97,12 @@ def assemblies(ir: str) -> dict[str, str]:
 def inner_loops(text: str) -> list[list[str]]:
     """The instructions of each loop that holds no other loop."""
     lines = text.splitlines()
-    labels = {found[1]: n for n, line in enumerate(lines) if (found := re.match(r"(\.L\w+):", line))}
-    jumps = (re.match(r"\s+(?:j\w+|b\.?\w*|cbn?z|tbn?z)\s+(?:.*,\s*)?(\.L\w+)", line) for line in lines)
+    labels = {
+        found[1]: n for n, line in enumerate(lines) if (found := re.match(r"(\.L\w+):", line))
+    }
+    jumps = (
+        re.match(r"\s+(?:j\w+|b\.?\w*|cbn?z|tbn?z)\s+(?:.*,\s*)?(\.L\w+)", line) for line in lines
+    )
     spans = [(labels[j[1]], n) for n, j in enumerate(jumps) if j and labels.get(j[1], n) < n]
     inner = [s for s in spans if not any(s != o and s[0] <= o[0] and o[1] <= s[1] for o in spans)]
     return [[line for line in lines[a : b + 1] if re.match(r"\s+[a-z]", line)] for a, b in inner]
@@ -91,7 +113,8 @@ def count(pattern: str, loop: list[str]) -> int:
 
 
 def faults(text: str, cpu: str, loops: int, spills: int) -> str:
-    """What is wrong with the assembly of a function that should have so many vectorized inner loops, or nothing.
+    """What is wrong with the assembly of a function that should have so many vectorized inner
+    loops, or nothing.
 
     spills: how many values, at most, each of them may keep in memory for want of registers.
     """
@@ -106,7 +129,11 @@ def faults(text: str, cpu: str, loops: int, spills: int) -> str:
                 return f"{cpu}: scalar arithmetic in a vectorized loop\n" + "\n".join(loop)
             if (found := count("Spill|Reload", loop)) > spills:
                 return f"{cpu}: {found} values in memory for want of registers\n" + "\n".join(loop)
-    return "" if len(full) >= loops else f"{cpu}: {len(full)} of {loops} loops are vectorized at full width"
+    return (
+        ""
+        if len(full) >= loops
+        else f"{cpu}: {len(full)} of {loops} loops are vectorized at full width"
+    )
 
 
 STATE = "f4[::1]"
@@ -144,15 +171,20 @@ LOOPS = {
         1,
         230,
     ),
-    "gradient of the harmonics": (splat_block.differentiate_position, f"void({STATE}, f4[:, ::1])", 1, 52),
+    "gradient of the harmonics": (
+        splat_block.differentiate_position,
+        f"void({STATE}, f4[:, ::1])",
+        1,
+        52,
+    ),
 }
 """name -> function, signature, its vectorized loops, and the spills that each may have"""
 
 
 @pytest.mark.parametrize("name", LOOPS)
 def test_inner_loops_are_vectorized_on_every_processor(name, monkeypatch):
-    """Catches a change that leaves a hot loop scalar, half as wide, with masked stores or with spills on a processor
-    other than the one that it was tuned on."""
+    """Catches a change that leaves a hot loop scalar, half as wide, with masked stores or with
+    spills on a processor other than the one that it was tuned on."""
     function, signature, loops, spills = LOOPS[name]
     compiled = assemblies(unoptimized_ir(function, signature, monkeypatch))
     found = [fault for cpu, text in compiled.items() if (fault := faults(text, cpu, loops, spills))]
@@ -160,15 +192,20 @@ def test_inner_loops_are_vectorized_on_every_processor(name, monkeypatch):
 
 
 def test_the_image_loss_needs_the_arithmetic_that_its_floor_is_made_of(monkeypatch):
-    """Catches a floor of `benchmarks/iteration.py` that the kernel could not reach, or a kernel that computes more."""
+    """Catches a floor of `benchmarks/iteration.py` that the kernel could not reach, or a kernel
+    that computes more."""
     benchmark = Path(__file__).resolve().parents[2] / "benchmarks" / "iteration.py"
-    terms = re.search(r"LOSS_OPERATIONS = 3 \* \(14 \* (\d+) \+ (\d+) \+ (\d+)\)", benchmark.read_text("utf-8"))
+    terms = re.search(
+        r"LOSS_OPERATIONS = 3 \* \(14 \* (\d+) \+ (\d+) \+ (\d+)\)", benchmark.read_text("utf-8")
+    )
     blur, similarity, rest = (int(term) for term in terms.groups())
     found, store = {}, r"\svmovups\s+%ymm\d+, [-\d]*\(%r"
     for name in ("horizontal blur", "vertical blur", "SSIM", "gradient of the loss"):
         function, signature, _, _ = LOOPS[name]
         loops = inner_loops(assemblies(unoptimized_ir(function, signature, monkeypatch))["znver3"])
-        found[name] = max(count(AVX2.packed, loop) / count(store, loop) for loop in loops if count(store, loop))
+        found[name] = max(
+            count(AVX2.packed, loop) / count(store, loop) for loop in loops if count(store, loop)
+        )
     assert found["horizontal blur"] == found["vertical blur"] == blur
     assert 4 * found["SSIM"] == similarity  # it stores four values
     # It stores two values. And their sum, x² + y², x·y and the scale of the target.
@@ -188,6 +225,7 @@ def with_call(s, order, limit):
 
 @pytest.mark.parametrize("function", [with_conditional_store, with_call])
 def test_the_check_finds_what_it_looks_for(function, monkeypatch):
-    """Catches a check that passes whatever the assembly holds: these loops had the faults that it is there for."""
+    """Catches a check that passes whatever the assembly holds: these loops had the faults that it
+    is there for."""
     compiled = assemblies(unoptimized_ir(function, f"void({STATE}, f4, f4)", monkeypatch))
     assert all(faults(compiled[cpu], cpu, 1, 0) for cpu in ("znver3", "apple-m1"))

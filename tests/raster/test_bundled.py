@@ -26,29 +26,42 @@ print("RESULT", USES_BUNDLED_KERNELS, out.min(), out.max())
 
 def run(folder: Path, cache: Path, package: str = "stga_addon", **variables: str) -> str:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
-    environment |= {"NUMBA_CACHE_DIR": str(cache), "STGA_CACHE": str(cache), "NUMBA_DEBUG_CACHE": "1"}
+    environment |= {
+        "NUMBA_CACHE_DIR": str(cache),
+        "STGA_CACHE": str(cache),
+        "NUMBA_DEBUG_CACHE": "1",
+    }
     command = [sys.executable, "-c", STEP.replace("stga_addon", package)]
     environment |= variables
-    return subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        command, env=environment, cwd=folder, capture_output=True, text=True, check=True
+    ).stdout
 
 
 def loads(output: str) -> bool:
     """Whether the kernel came from the cache."""
-    kernel = [line for line in output.splitlines() if "change_background" in line and "data " in line]
+    kernel = [
+        line for line in output.splitlines() if "change_background" in line and "data " in line
+    ]
     assert kernel
     return all("data loaded" in line for line in kernel)
 
 
 @pytest.mark.slow
-def test_kernels_of_another_machine_are_used_where_they_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a first training that compiles what the zip holds, because of the folder, the time of the files or the
-    processor's name; and kernels of an older version that are used for newer sources."""
+def test_kernels_of_another_machine_are_used_where_they_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a first training that compiles what the zip holds, because of the folder, the time of
+    the files or the processor's name; and kernels of an older version that are used for newer
+    sources."""
     assert BUNDLE == ROOT / KERNELS_FOLDER
     built = tmp_path / "built"
     assert not loads(run(ROOT, built, NUMBA_CPU_NAME=PROCESSOR, NUMBA_CPU_FEATURES=""))
     shutil.copytree(ROOT / "stga_addon", tmp_path / "installed/stga_addon")
     shutil.copytree(next(built.iterdir()), tmp_path / "installed" / KERNELS_FOLDER)
-    monkeypatch.setattr("stga_addon.raster.cpu.bundled.BUNDLE", tmp_path / "installed" / KERNELS_FOLDER)
+    monkeypatch.setattr(
+        "stga_addon.raster.cpu.bundled.BUNDLE", tmp_path / "installed" / KERNELS_FOLDER
+    )
     monkeypatch.setattr("stga_addon.raster.cpu.bundled.config", type("Config", (), {})())
     if not kernel_folder(tmp_path / "a", tmp_path / "b")[1]:
         pytest.skip("this processor lacks AVX2")

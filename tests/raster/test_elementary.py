@@ -22,14 +22,19 @@ def logarithms(x, out):
 
 
 def test_exponential_and_logarithm_are_numpys():
-    """Catches a wrong coefficient, and a reduction that loses digits far from zero or at a power of two."""
-    x = np.concatenate([np.linspace(-86, 88, 20_001), np.arange(-120, 120) * np.log(2) / 2]).astype(np.float32)
+    """Catches a wrong coefficient, and a reduction that loses digits far from zero or at a power of
+    two."""
+    x = np.concatenate([np.linspace(-86, 88, 20_001), np.arange(-120, 120) * np.log(2) / 2]).astype(
+        np.float32
+    )
     x = x[(x > -86) & (x < 88)]
     found = np.empty_like(x)
     exponentials(x, found)
     exact = np.exp(x.astype(np.float64))
     assert np.abs(found / exact - 1).max() < 3e-7
-    positive = np.concatenate([exact.astype(np.float32), np.linspace(0.5, 2, 20_001, dtype=np.float32)])
+    positive = np.concatenate(
+        [exact.astype(np.float32), np.linspace(0.5, 2, 20_001, dtype=np.float32)]
+    )
     found = np.empty_like(positive)
     logarithms(positive, found)
     exact = np.log(positive.astype(np.float64))

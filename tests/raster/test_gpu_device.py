@@ -35,7 +35,9 @@ def device() -> Device:
 def numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The kernel "numbers.main" adds STEP times its index to every word."""
     source = device_module._source
-    monkeypatch.setattr(device_module, "_source", lambda name: NUMBERS if name == "numbers" else source(name))
+    monkeypatch.setattr(
+        device_module, "_source", lambda name: NUMBERS if name == "numbers" else source(name)
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int32])
@@ -47,7 +49,9 @@ def test_arrays_arrive_whole(device: Device, dtype: type, count: int) -> None:
     np.testing.assert_array_equal(device.read(buffer, values.shape, dtype), values)
 
 
-def test_every_thread_of_a_long_dispatch_runs_once(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_thread_of_a_long_dispatch_runs_once(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches threads beyond the longest row of workgroups that are lost or run twice."""
     monkeypatch.setattr(device_module, "MAX_GROUPS", 7)
     count = 100 * 256 + 10
@@ -63,14 +67,19 @@ def test_every_thread_of_a_long_dispatch_runs_once(device: Device, monkeypatch: 
 def test_recorded_work_runs_in_order_in_one_submit(device: Device) -> None:
     """Catches a dispatch that does not see what an earlier dispatch, copy or constant did."""
     words, submits, dispatches = 1000, device.submits, device.dispatches
-    source, target = device.upload("source", np.full(words, 5, np.uint32)), device.buffer("target", words)
+    source, target = (
+        device.upload("source", np.full(words, 5, np.uint32)),
+        device.buffer("target", words),
+    )
     with device.record() as work:
         work.copy(source, target, words)
         work.dispatch("numbers.main", words, {"numbers": target})
         work.dispatch("numbers.main", words, {"numbers": target}, STEP=3)
     assert device.submits == submits + 1
     assert device.dispatches == dispatches + 2
-    np.testing.assert_array_equal(device.read(target, (words,), np.uint32), 5 + 4 * np.arange(words))
+    np.testing.assert_array_equal(
+        device.read(target, (words,), np.uint32), 5 + 4 * np.arange(words)
+    )
 
 
 def test_an_upload_does_not_change_work_submitted_before(device: Device) -> None:
@@ -85,7 +94,10 @@ def test_an_upload_does_not_change_work_submitted_before(device: Device) -> None
 
 def test_groups_from_the_device(device: Device) -> None:
     """Catches an indirect dispatch at the wrong offset."""
-    groups, target = device.upload("groups", np.uint32([9, 9, 9, 2, 1, 1]), "indirect"), device.buffer("two", 1024)
+    groups, target = (
+        device.upload("groups", np.uint32([9, 9, 9, 2, 1, 1]), "indirect"),
+        device.buffer("two", 1024),
+    )
     with device.record() as work:
         work.clear(target)
         work.dispatch("numbers.main", (groups, 12), {"numbers": target})
@@ -127,7 +139,9 @@ def test_what_the_user_is_told(device: Device) -> None:
         raise gpu_device.wgpu.GPUValidationError("Parent device is lost")
 
 
-def test_a_lost_device_is_told_to_who_waits(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_device_is_told_to_who_waits(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a run that waits for ever for a driver that was reset."""
     readback = Readback(device, 4)
     words = device.upload("words", np.zeros(4, np.uint32))
@@ -168,7 +182,8 @@ def count_up(device: Device, count: int, repeats: int) -> None:
 
 
 def test_every_dispatch_is_timed(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches stamps of another dispatch or recording, lost beyond the first, in another unit, or read twice."""
+    """Catches stamps of another dispatch or recording, lost beyond the first, in another unit, or
+    read twice."""
     if "timestamp-query" not in device.gpu.features:
         pytest.skip(f"{device.name} has no timestamp queries")
     monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "benchmarks")

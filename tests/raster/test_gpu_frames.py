@@ -20,7 +20,14 @@ pytestmark = pytest.mark.needs("adapter")
 FRAME_TOLERANCE = 2e-6
 """Of origins in meters and of rotations times scale: float32 at a few meters from the camera."""
 
-SHAPES = {"xyz": (3,), "rotation": (4,), "log_scale": (3,), "opacity": (), "sh": (1, 3), "strain_color": (0, 3)}
+SHAPES = {
+    "xyz": (3,),
+    "rotation": (4,),
+    "log_scale": (3,),
+    "opacity": (),
+    "sh": (1, 3),
+    "strain_color": (0, 3),
+}
 """Of a splat of degree 0 whose color does not follow strain."""
 
 
@@ -32,7 +39,8 @@ def device() -> Device:
 @pytest.mark.parametrize("mesh", ["ball", "collapsed", "lines in the neutral mesh", "far away"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_frames_and_strain_are_numpys(device: Device, convention: str, mesh: str) -> None:
-    """Catches another rule for a triangle without area, an axis that differs, and edges that lose digits in float32."""
+    """Catches another rule for a triangle without area, an axis that differs, and edges that lose
+    digits in float32."""
     posed, neutral, faces = bent_ball() if mesh in ("ball", "far away") else collapsed()
     camera = SCENES["plain"].camera
     camera = Camera(camera.width, camera.height, 50, 50, 25, 20, camera.world_to_camera.copy())
@@ -40,9 +48,17 @@ def test_frames_and_strain_are_numpys(device: Device, convention: str, mesh: str
         posed, neutral = neutral, posed
     if mesh == "far away":
         shift = np.array([1e4, -1e4, 1e4])
-        posed, camera.world_to_camera[:3, 3] = posed + shift, -camera.world_to_camera[:3, :3] @ shift
-    ends = np.random.default_rng(8).uniform(0, 1.5, (2, len(faces), STRAIN_COMPONENTS)) * [[[-1]], [[1]]]
-    basis = strain_basis(neutral, faces, np.float32(ends.swapaxes(0, 1)) if mesh == "ball" else None)
+        posed, camera.world_to_camera[:3, 3] = (
+            posed + shift,
+            -camera.world_to_camera[:3, :3] @ shift,
+        )
+    ends = np.random.default_rng(8).uniform(0, 1.5, (2, len(faces), STRAIN_COMPONENTS)) * [
+        [[-1]],
+        [[1]],
+    ]
+    basis = strain_basis(
+        neutral, faces, np.float32(ends.swapaxes(0, 1)) if mesh == "ball" else None
+    )
     expected = frames_in_camera(face_frames(posed, faces, neutral, convention, basis), camera)
     step = Embedding(device, neutral, faces, convention, basis)
     step.upload(posed, camera)
@@ -62,7 +78,8 @@ def test_frames_and_strain_are_numpys(device: Device, convention: str, mesh: str
 
 
 def test_without_strain_there_is_none(device: Device) -> None:
-    """Catches columns of strain where nobody asked for them, and triangles that lie elsewhere then."""
+    """Catches columns of strain where nobody asked for them, and triangles that lie elsewhere
+    then."""
     posed, neutral, faces = bent_ball()
     camera = SCENES["plain"].camera
     step = Embedding(device, neutral, faces, "stga")
@@ -72,17 +89,22 @@ def test_without_strain_there_is_none(device: Device) -> None:
     expected = frames_in_camera(face_frames(posed, faces, neutral), camera)
     frames = device.read(table, (len(faces), 12))
     np.testing.assert_allclose(frames[:, :3], expected.origin, atol=FRAME_TOLERANCE)
-    np.testing.assert_allclose(frames[:, 3:].reshape(-1, 3, 3), expected.matrix, atol=FRAME_TOLERANCE)
+    np.testing.assert_allclose(
+        frames[:, 3:].reshape(-1, 3, 3), expected.matrix, atol=FRAME_TOLERANCE
+    )
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_frames_moved_by_strain_are_the_avatars(device: Device, convention: str) -> None:
-    """Catches strain that is not averaged, or over other triangles (an open border, three triangles on one edge), rest
-    that is not subtracted, a shift in other axes or units, and frames that stay moved."""
+    """Catches strain that is not averaged, or over other triangles (an open border, three triangles
+    on one edge), rest that is not subtracted, a shift in other axes or units, and frames that stay
+    moved."""
     posed, neutral, faces = bent_ball()
     faces = np.concatenate([faces[10:], [[*faces[40][:2], faces[30][2]]]])
     rng = np.random.default_rng(9)
-    range_of_strain = COLOR_RANGE * rng.uniform(0.5, 1, (len(faces), 1, STRAIN_COMPONENTS)).astype(np.float32)
+    range_of_strain = COLOR_RANGE * rng.uniform(0.5, 1, (len(faces), 1, STRAIN_COMPONENTS)).astype(
+        np.float32
+    )
     unit = face_frames(neutral, faces, neutral, convention).scale.mean()
     coefficients = rng.normal(0, 0.01 / unit, (len(faces), STRAIN_COMPONENTS, 3)).astype(np.float32)
     bare = {name: np.zeros((0, *shape), np.float32) for name, shape in SHAPES.items()}
@@ -103,10 +125,14 @@ def test_frames_moved_by_strain_are_the_avatars(device: Device, convention: str)
     step = Embedding(device, neutral, faces, convention, basis, ["strain_position"])
     step.upload(posed, camera)
     for moved, want in ((coefficients, expected), (None, still)):
-        uploaded = {} if moved is None else {"strain_position": device.upload("test coefficients", moved)}
+        uploaded = (
+            {} if moved is None else {"strain_position": device.upload("test coefficients", moved)}
+        )
         with device.record() as work:
             table = step.compose(work, uploaded)
         frames = device.read(table, (len(faces), 12 + STRAIN_COMPONENTS))
         np.testing.assert_allclose(frames[:, :3], want.origin, atol=FRAME_TOLERANCE)
-        np.testing.assert_allclose(frames[:, 3:12].reshape(-1, 3, 3), want.matrix, atol=FRAME_TOLERANCE)
+        np.testing.assert_allclose(
+            frames[:, 3:12].reshape(-1, 3, 3), want.matrix, atol=FRAME_TOLERANCE
+        )
         np.testing.assert_allclose(frames[:, 12:], want.strain, atol=5e-6)

@@ -29,7 +29,11 @@ def on_device(
     """Gradient (3, H, W), filled with 77 before, and loss; touched (rows, columns) of tiles."""
     _, height, width = image.shape
     view = np.zeros(1, VIEW)
-    view["width"], view["height"], (view["tiles_x"], view["tiles_y"]) = width, height, tile_grid(width, height)
+    view["width"], view["height"], (view["tiles_x"], view["tiles_y"]) = (
+        width,
+        height,
+        tile_grid(width, height),
+    )
     upload_target(device, target, SSIM_WEIGHT, **options)
     device.upload("v_image", np.full_like(image, 77))
     with device.record() as work:
@@ -52,24 +56,32 @@ def pictures(width: int, height: int, seed: int = 1) -> tuple[np.ndarray, np.nda
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("kind", ["noise", "bright and flat", "equal"])
 def test_loss_and_gradient_are_the_cpus(device: Device, size: tuple[int, int], kind: str) -> None:
-    """Catches a window, a padding, a byte of the target or a sign that differs, and a tile left out of the sum."""
+    """Catches a window, a padding, a byte of the target or a sign that differs, and a tile left out
+    of the sum."""
     image, target = pictures(*size)
     if kind == "bright and flat":
         image, target = np.full_like(image, 0.999), np.full_like(target, 255)
         image[:, 20:30, 40:60] = 0.5
     if kind == "equal":
-        image = np.ascontiguousarray((target.astype(np.float32) * np.float32(1 / 255)).transpose(2, 0, 1))
+        image = np.ascontiguousarray(
+            (target.astype(np.float32) * np.float32(1 / 255)).transpose(2, 0, 1)
+        )
     expected = np.empty_like(image)
     l1, ssim = image_gradient(image, target, whole_image(*image.shape[1:]), SSIM_WEIGHT, expected)
     gradient, loss = on_device(device, image, target, np.ones(tile_grid(*size)[::-1], bool))
     # In flat regions both lose digits to the same cancellation, each in its own order of summation.
     tolerance = 2e-5 if kind == "noise" else 5e-4
-    np.testing.assert_allclose(gradient, expected, atol=tolerance * max(np.abs(expected).max(), 0.1 / image.size))
-    assert loss == pytest.approx((1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim), rel=1e-5, abs=tolerance / 10)
+    np.testing.assert_allclose(
+        gradient, expected, atol=tolerance * max(np.abs(expected).max(), 0.1 / image.size)
+    )
+    assert loss == pytest.approx(
+        (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim), rel=1e-5, abs=tolerance / 10
+    )
 
 
 def test_touched_tiles_have_the_whole_images_gradient(device: Device) -> None:
-    """Catches pixels read that a local iteration does not render (they hold NaN), and gradients written elsewhere."""
+    """Catches pixels read that a local iteration does not render (they hold NaN), and gradients
+    written elsewhere."""
     image, target = pictures(100, 70)
     touched = np.zeros((5, 7), bool)
     touched[1, 2], touched[2, 3], touched[4, 6] = True, True, True
@@ -77,15 +89,18 @@ def test_touched_tiles_have_the_whole_images_gradient(device: Device) -> None:
     pixels = np.kron(touched, np.ones((TILE, TILE), bool))[:70, :100]
     near = pixels.copy()
     for y, x in np.argwhere(pixels):
-        near[max(0, y - LOSS_REACH_PX) : y + LOSS_REACH_PX + 1, max(0, x - LOSS_REACH_PX) : x + LOSS_REACH_PX + 1] = (
-            True
-        )
+        near[
+            max(0, y - LOSS_REACH_PX) : y + LOSS_REACH_PX + 1,
+            max(0, x - LOSS_REACH_PX) : x + LOSS_REACH_PX + 1,
+        ] = True
     gradient, _ = on_device(device, np.where(near, image, np.nan), target, touched)
     np.testing.assert_array_equal(gradient[:, pixels], whole[:, pixels])
     assert (gradient[:, ~pixels] == 77).all()
     expected = np.empty_like(image)
     image_gradient(image, target, tile_rectangles(touched, 70, 100), SSIM_WEIGHT, expected)
-    np.testing.assert_allclose(gradient[:, pixels], expected[:, pixels], atol=2e-5 * np.abs(whole).max())
+    np.testing.assert_allclose(
+        gradient[:, pixels], expected[:, pixels], atol=2e-5 * np.abs(whole).max()
+    )
 
 
 @pytest.mark.parametrize("size", [(64, 48), (33, 17)], ids=str)

@@ -1,4 +1,5 @@
-"""Adam on splats and driven offsets, limits and statistics on a WebGPU device against the CPU's and against float64."""
+"""Adam on splats and driven offsets, limits and statistics on a WebGPU device against the CPU's and
+against float64."""
 
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -94,7 +95,10 @@ def on_device(
         history=upload("test history", history), limits=upload("test limits", state.limits.T),
         traits=upload("test traits", np.stack([state.unbound, state.share], 1).astype(np.float32)),
     )  # fmt: skip
-    splats, gradients = upload("test splats", state.splats), upload("test gradients", state.gradients)
+    splats, gradients = (
+        upload("test splats", state.splats),
+        upload("test gradients", state.gradients),
+    )
     upload_step(device, RATES, (BETA1, BETA2), epsilon, ema_share, weights, statistics)
     with device.record() as work:
         optimize(
@@ -103,25 +107,38 @@ def on_device(
             wanted=upload("test wanted", state.wanted.astype(np.uint32)), screen=upload("test screen", state.screen),
         )  # fmt: skip
     after = device.read(tables.history, (n, 3), np.int32)
-    read = {"splats": splats, "gradients": gradients, **{k: getattr(tables, k) for k in ("first", "second", "average")}}
+    read = {
+        "splats": splats,
+        "gradients": gradients,
+        **{k: getattr(tables, k) for k in ("first", "second", "average")},
+    }
     return replace(
         state, **{name: device.read(buffer, (n, STRIDE)) for name, buffer in read.items()}, steps=after[:, 0].copy(),
         statistics=after[:, 1:].copy().view(np.float32),
     )  # fmt: skip
 
 
-def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), ema_share: float = 0.05) -> State:
+def on_cpu(
+    state: State, weights: tuple[float, float, float] = (0, 0, 0), ema_share: float = 0.05
+) -> State:
     """The same by the CPU's kernels."""
     state, rows = state.copy(), np.flatnonzero(state.wanted).astype(np.int32)
-    splats, gradients = split_rows(state.splats, COEFFICIENTS), split_rows(state.gradients, COEFFICIENTS)
+    splats, gradients = (
+        split_rows(state.splats, COEFFICIENTS),
+        split_rows(state.gradients, COEFFICIENTS),
+    )
     given = state.face, state.unbound
     if weights[0]:
-        scale_limit(rows, splats.log_scale, *given, state.limits[:2].copy(), weights[0], gradients.log_scale)
+        scale_limit(
+            rows, splats.log_scale, *given, state.limits[:2].copy(), weights[0], gradients.log_scale
+        )
     if weights[2]:
         opacity_weight(rows, splats.opacity, state.share, weights[2], gradients.opacity)
     if weights[1]:
         distance_limit(rows, splats.xyz, *given, state.limits[2].copy(), weights[1], gradients.xyz)
-    tables = [split_rows(table, COEFFICIENTS) for table in (state.first, state.second, state.average)]
+    tables = [
+        split_rows(table, COEFFICIENTS) for table in (state.first, state.second, state.average)
+    ]
     parameters = []
     for name, *parts in zip(Parameters._fields, splats, gradients, *tables, strict=True):
         flat = [part.reshape(len(part), -1) for part in parts]
@@ -132,7 +149,10 @@ def on_cpu(state: State, weights: tuple[float, float, float] = (0, 0, 0), ema_sh
     options = AdamOptions(BETA1, BETA2, EPSILON, np.float32(ema_share))
     adam_rows(rows, state.steps, tuple(parameters), options)
     names = ("splats", "gradients", "first", "second", "average")
-    rows_of = {name: splat_rows(table) for name, table in zip(names, (splats, gradients, *tables), strict=True)}
+    rows_of = {
+        name: splat_rows(table)
+        for name, table in zip(names, (splats, gradients, *tables), strict=True)
+    }
     return replace(state, **rows_of)
 
 
@@ -148,39 +168,57 @@ def assert_same_step(got: State, want: State, before: State) -> None:
         assert not off.any(), f"{name}: {np.argwhere(off)[:5].tolist()}"
 
 
-@pytest.mark.parametrize("weights", [(0, 0, 0), (0.3, 0, 0), (0, 0.2, 0), (0, 0, 0.5), (0.3, 0.2, 0.5)], ids=str)
+@pytest.mark.parametrize(
+    "weights", [(0, 0, 0), (0.3, 0, 0), (0, 0.2, 0), (0, 0, 0.5), (0.3, 0.2, 0.5)], ids=str
+)
 def test_a_step_is_the_cpus(device: Device, weights: tuple[float, float, float]) -> None:
-    """Catches a wrong moment, correction, rate or limit, a norm that misses rows, and a row that is not its own."""
+    """Catches a wrong moment, correction, rate or limit, a norm that misses rows, and a row that is
+    not its own."""
     state = random_state()
     assert_same_step(on_device(device, state, weights), on_cpu(state, weights), state)
 
 
 def test_rows_that_are_not_wanted_keep_every_bit(device: Device) -> None:
-    """Catches momentum, limits or statistics that reach frozen rows: in every table, NaN's own bits too."""
+    """Catches momentum, limits or statistics that reach frozen rows: in every table, NaN's own bits
+    too."""
     state = random_state()
     for table in (state.splats, state.gradients, state.first, state.second, state.average):
-        table.view(np.uint32)[~state.wanted] = np.random.default_rng(4).integers(0, 2**32, STRIDE, np.uint32)
+        table.view(np.uint32)[~state.wanted] = np.random.default_rng(4).integers(
+            0, 2**32, STRIDE, np.uint32
+        )
     got = on_device(device, state, (0.3, 0.2, 0.5), statistics=True)
     for name in (*TABLES, "statistics"):
         got_bits, bits = (getattr(s, name)[~state.wanted].view(np.uint32) for s in (got, state))
         np.testing.assert_array_equal(got_bits, bits, err_msg=name)
         if name != "gradients":
-            assert (getattr(got, name)[state.wanted] != getattr(state, name)[state.wanted]).any(), name
+            assert (getattr(got, name)[state.wanted] != getattr(state, name)[state.wanted]).any(), (
+                name
+            )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e18, -1e20])
 def test_a_broken_gradient_leaves_its_field(device: Device, value: float) -> None:
-    """Catches NaN, or a square beyond float32, that gets into a row; and other fields that stop with it."""
+    """Catches NaN, or a square beyond float32, that gets into a row; and other fields that stop
+    with it."""
     state = random_state(40)
     state.wanted[:] = True
-    columns = {"xyz": 1, "rotation": 6, "log_scale": 8, "opacity": 10, "sh": 20, "strain_color": STRIDE - 1}
+    columns = {
+        "xyz": 1,
+        "rotation": 6,
+        "log_scale": 8,
+        "opacity": 10,
+        "sh": 20,
+        "strain_color": STRIDE - 1,
+    }
     for row, column in enumerate(columns.values()):
         state.gradients[row, column] = value
     got, want = on_device(device, state), on_cpu(state)
     state.gradients[:], got.gradients[:], want.gradients[:] = 0, 0, 0  # which are broken
     assert_same_step(got, want, state)
     for row, field in enumerate(columns):
-        before, after = (getattr(split_rows(s.splats, COEFFICIENTS), field)[row] for s in (state, got))
+        before, after = (
+            getattr(split_rows(s.splats, COEFFICIENTS), field)[row] for s in (state, got)
+        )
         np.testing.assert_array_equal(after, before)
 
 
@@ -212,7 +250,9 @@ def test_limit_of_one_enormous_splat(device: Device, log_scale: float) -> None:
     got, want = on_device(device, state, (0.3, 0.2, 0)), on_cpu(state, (0.3, 0.2, 0))
     for row in (5, slice(None)):
         largest = np.abs(want.gradients[row]).max()
-        np.testing.assert_allclose(got.gradients[row], want.gradients[row], rtol=2e-5, atol=1e-6 * min(largest, 1e-3))
+        np.testing.assert_allclose(
+            got.gradients[row], want.gradients[row], rtol=2e-5, atol=1e-6 * min(largest, 1e-3)
+        )
 
 
 @pytest.mark.parametrize("wanted", ["none", "within the limits"])
@@ -253,7 +293,9 @@ def random_offset(seed: int = 0) -> OffsetState:
     """Triangles of any age."""
     rng = np.random.default_rng(seed)
     value, first, second, average = rng.normal(size=(4, TRIANGLES, 3, 3)).astype(np.float32)
-    return OffsetState(value, first, second**2, average, rng.integers(0, 3000, TRIANGLES).astype(np.int32))
+    return OffsetState(
+        value, first, second**2, average, rng.integers(0, 3000, TRIANGLES).astype(np.int32)
+    )
 
 
 def stepped(
@@ -264,10 +306,15 @@ def stepped(
     view = np.zeros(1, VIEW)
     view["splats"], view["coefficients"], view["strain_colors"] = SPLATS, 4, 2
     rates = {**RATES, "xyz": rate}
-    upload_step(device, rates, (BETA1, BETA2), OFFSET_EPSILON, EMA_SHARE, (0, 0, 0), False, TRIANGLES)
-    named = {name: device.upload(f"test position {name}", table) for name, table in vars(state).items()}
+    upload_step(
+        device, rates, (BETA1, BETA2), OFFSET_EPSILON, EMA_SHARE, (0, 0, 0), False, TRIANGLES
+    )
+    named = {
+        name: device.upload(f"test position {name}", table) for name, table in vars(state).items()
+    }
     tables = OffsetTables(
-        *named.values(), device.upload("test splats by triangle", splats_by_triangle(face, TRIANGLES))
+        *named.values(),
+        device.upload("test splats by triangle", splats_by_triangle(face, TRIANGLES)),
     )
     with device.record() as work:
         step_offsets(
@@ -280,8 +327,9 @@ def stepped(
 
 
 def test_a_step_of_offsets_is_the_cpus(device: Device) -> None:
-    """Catches gradients of splats that were not trained or of other triangles, a wrong age, rate or average, a broken
-    gradient that gets in, and a triangle stepped that is not to be: over several steps."""
+    """Catches gradients of splats that were not trained or of other triangles, a wrong age, rate or
+    average, a broken gradient that gets in, and a triangle stepped that is not to be: over several
+    steps."""
     rng, state = np.random.default_rng(1), random_offset()
     expected = deepcopy(state)
     face = rng.integers(0, TRIANGLES, SPLATS).astype(np.int32)
@@ -300,7 +348,14 @@ def test_a_step_of_offsets_is_the_cpus(device: Device) -> None:
         with np.errstate(invalid="ignore", over="ignore"):
             rows, xyz = np.flatnonzero(wanted).astype(np.int32), gradients[:, :3].copy()
             cpu_offsets.step(
-                {NAME: expected}, rows, face, xyz, lambda _, s=smoothed: s, 0.02, EMA_SHARE, OFFSET_EPSILON
+                {NAME: expected},
+                rows,
+                face,
+                xyz,
+                lambda _, s=smoothed: s,
+                0.02,
+                EMA_SHARE,
+                OFFSET_EPSILON,
             )
         np.testing.assert_array_equal(state.steps, expected.steps, err_msg=str(number))
         for name in ("value", "first", "second", "average"):
@@ -308,7 +363,9 @@ def test_a_step_of_offsets_is_the_cpus(device: Device) -> None:
             np.testing.assert_allclose(got, want, rtol=1e-4, atol=2e-6, err_msg=f"{number} {name}")
             kept = before.steps == state.steps
             assert 10 < kept.sum() < TRIANGLES / 2
-            np.testing.assert_array_equal(got[kept].view(np.uint32), getattr(before, name)[kept].view(np.uint32))
+            np.testing.assert_array_equal(
+                got[kept].view(np.uint32), getattr(before, name)[kept].view(np.uint32)
+            )
 
 
 def test_splats_by_triangle_lists_each_once() -> None:

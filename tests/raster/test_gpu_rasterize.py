@@ -1,4 +1,5 @@
-"""The GPU rasterizer: what it has beside the tests that both back ends share, which are those with `back_end`."""
+"""The GPU rasterizer: what it has beside the tests that both back ends share, which are those with
+`back_end`."""
 
 import numpy as np
 import pytest
@@ -21,15 +22,25 @@ from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
 from stga_addon.raster.gpu import trial
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import split_rows
-from stga_addon.raster.gpu.rasterize import Rasterizer, Tables, ViewOptions, mark_focus, upload_frames, upload_splats
+from stga_addon.raster.gpu.rasterize import (
+    Rasterizer,
+    Tables,
+    ViewOptions,
+    mark_focus,
+    upload_frames,
+    upload_splats,
+)
 
 pytestmark = pytest.mark.needs("adapter")
 
 
 class Raw:
-    """Renders a scene of numpy arrays by `Rasterizer`, forward and backward; rows not written keep `fill`."""
+    """Renders a scene of numpy arrays by `Rasterizer`, forward and backward; rows not written keep
+    `fill`."""
 
-    def __init__(self, scene: Scene, rasterizer: Rasterizer | None = None, antialiased: bool = False) -> None:
+    def __init__(
+        self, scene: Scene, rasterizer: Rasterizer | None = None, antialiased: bool = False
+    ) -> None:
         self.rasterizer = rasterizer or Rasterizer(Device())
         self.device, self.scene, self.antialiased = self.rasterizer.device, scene, antialiased
         self.count = len(scene.splats["xyz"])
@@ -43,7 +54,9 @@ class Raw:
     def image(self, rendering: Tables) -> np.ndarray:
         return self.read(rendering["image"], 3, self.scene.camera.height, self.scene.camera.width)
 
-    def forward(self, focus: np.ndarray | None = None, reach: int = 0, background=(0, 0, 0)) -> Tables:
+    def forward(
+        self, focus: np.ndarray | None = None, reach: int = 0, background=(0, 0, 0)
+    ) -> Tables:
         self.table = upload_splats(self.device, self.splats, np.zeros(self.count, np.int32))
         frames = upload_frames(self.device, frames_in_camera(WORLD, self.scene.camera))
         options = ViewOptions(
@@ -55,18 +68,28 @@ class Raw:
             view = self.rasterizer.upload_view(self.table, options)
             return self.rasterizer.forward(work, self.table, frames, options, view, marked)
 
-    def gradients(self, rendering: Tables, fill: float = 0.0) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    def gradients(
+        self, rendering: Tables, fill: float = 0.0
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
         """Gradients by name, the rows written, and those rows' screen gradient."""
         table, device = self.table, self.device
-        gradients = device.upload("gradients", np.full((table.count, table.stride), fill, np.float32))
-        v_image, v_transmittance = (device.upload(f"v {n}", v) for n, v in enumerate(self.cotangents))
+        gradients = device.upload(
+            "gradients", np.full((table.count, table.stride), fill, np.float32)
+        )
+        v_image, v_transmittance = (
+            device.upload(f"v {n}", v) for n, v in enumerate(self.cotangents)
+        )
         with device.record() as work:
             screen = self.rasterizer.backward(
                 work, rendering, table, self.scene.camera, v_image, gradients, v_transmittance
             )
         written = np.flatnonzero(self.read(rendering["wanted"], self.count, dtype=np.uint32))
         rows = split_rows(self.read(gradients, table.count, table.stride), table.coefficients)
-        return {name: getattr(rows, name) for name in NAMES}, written, self.read(screen, self.count)[written]
+        return (
+            {name: getattr(rows, name) for name in NAMES},
+            written,
+            self.read(screen, self.count)[written],
+        )
 
 
 def test_background_shows_through_and_pulls_on_the_splats() -> None:
@@ -91,12 +114,15 @@ def test_screen_gradient_is_the_other_back_ends() -> None:
     _, written, screen = raw.gradients(raw.forward())
     _, _, expected_rows, expected = test_kernels.raw_gradients(scene)
     np.testing.assert_array_equal(written, np.sort(expected_rows))
-    np.testing.assert_allclose(screen, expected[written], atol=GRADIENT_TOLERANCE["xyz"] * expected[written].max())
+    np.testing.assert_allclose(
+        screen, expected[written], atol=GRADIENT_TOLERANCE["xyz"] * expected[written].max()
+    )
 
 
 @pytest.mark.parametrize("count", [80, 700])
 def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count: int) -> None:
-    """Catches a local iteration whose restricted tiles change a selected gradient, or touch another row."""
+    """Catches a local iteration whose restricted tiles change a selected gradient, or touch another
+    row."""
     scene = cloud(21, count=count, size=(100, 70), log_scale=-3.0)
     focus = np.zeros(count, bool)
     focus[[3, 17, 40]] = True
@@ -115,7 +141,9 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count: i
     scales = {name: np.abs(values).max() for name, values in full.items()}
     for name, gradient in gradients.items():
         # Batches begin elsewhere, so pixels are added up in another grouping.
-        np.testing.assert_allclose(gradient[written], full[name][written], atol=1e-6 * scales[name], err_msg=name)
+        np.testing.assert_allclose(
+            gradient[written], full[name][written], atol=1e-6 * scales[name], err_msg=name
+        )
         assert (np.delete(gradient, written, axis=0) == 123).all(), name
     np.testing.assert_allclose(screen, full_screen[np.isin(all_written, written)], rtol=1e-5)
 
@@ -129,7 +157,8 @@ def test_coefficients_above_the_degree_are_overwritten() -> None:
 
 
 def test_the_same_bits_twice_and_from_used_buffers() -> None:
-    """Catches sums in the order of chance, and results that depend on what an earlier image left in the buffers."""
+    """Catches sums in the order of chance, and results that depend on what an earlier image left in
+    the buffers."""
     rasterizer = Raw(SCENES["plain"]).rasterizer
     for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
         fresh, used = Raw(SCENES[name]), Raw(SCENES[name], rasterizer)
@@ -139,11 +168,14 @@ def test_the_same_bits_twice_and_from_used_buffers() -> None:
         gradients, same_rows, _ = used.gradients(rendering)
         np.testing.assert_array_equal(same_rows, rows_written)
         for parameter, want in wanted.items():
-            np.testing.assert_array_equal(gradients[parameter], want, err_msg=f"{name}: {parameter}")
+            np.testing.assert_array_equal(
+                gradients[parameter], want, err_msg=f"{name}: {parameter}"
+            )
 
 
 def test_what_does_not_fit_is_not_drawn_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches pairs that are dropped in silence, written past the buffers' end, or gradients of half a rendering."""
+    """Catches pairs that are dropped in silence, written past the buffers' end, or gradients of
+    half a rendering."""
     scene = SCENES["plain"]
     whole = Raw(scene)
     expected = whole.image(whole.forward())
@@ -167,7 +199,8 @@ def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     backward = Rasterizer.backward
 
     def loses_a_tile(self, work, rendering, *arguments):
-        work.clear(work.device.buffer("pair_gradients", 0))  # which hold the right ones of the first trial
+        # which hold the right ones of the first trial
+        work.clear(work.device.buffer("pair_gradients", 0))
         work.clear(rendering["touched"], 12)
         return backward(self, work, rendering, *arguments)
 
@@ -193,7 +226,9 @@ def test_a_broken_splat_is_dropped(field: str, value: float) -> None:
     raw.splats = Parameters(*(scene.splats[name].copy() for name in NAMES))
     getattr(raw.splats, field).reshape(raw.count, -1)[row, 0] = value
     frames = frames_in_camera(WORLD, scene.camera)
-    on_cpu = render_forward(raw.splats, np.zeros(raw.count, np.int32), frames, scene.degree).projection.rect
+    on_cpu = render_forward(
+        raw.splats, np.zeros(raw.count, np.int32), frames, scene.degree
+    ).projection.rect
     found, columns = projected()
     visible, others = found[:, 2] > found[:, 0], np.arange(raw.count) != row
     np.testing.assert_array_equal(found[others], bounds[others])
@@ -209,5 +244,7 @@ def test_focus_is_the_selected_triangles_splats() -> None:
     table = upload_splats(raw.device, raw.splats, face)
     with raw.device.record() as work:
         view = raw.rasterizer.upload_view(table, ViewOptions(raw.scene.camera, 3))
-        focus = mark_focus(work, table, view, raw.device.upload("selected", selected.astype(np.uint8)))
+        focus = mark_focus(
+            work, table, view, raw.device.upload("selected", selected.astype(np.uint8))
+        )
     np.testing.assert_array_equal(raw.read(focus, raw.count, dtype=np.uint32), selected[face])

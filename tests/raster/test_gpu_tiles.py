@@ -9,7 +9,16 @@ from raster import gpu_device
 from raster.test_outline import covariances
 from stga_addon.raster.cpu.layout import PROJECTED, TILE
 from stga_addon.raster.gpu.device import Device
-from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, PAIRS, VIEW, WANTED, WORKGROUP
+from stga_addon.raster.gpu.layout import (
+    COUNTS,
+    HIDDEN,
+    NEEDED,
+    OVERFLOWED,
+    PAIRS,
+    VIEW,
+    WANTED,
+    WORKGROUP,
+)
 from stga_addon.raster.gpu.rasterize import choose_tiles, counts_buffer, list_pairs, sort_keys
 
 pytestmark = pytest.mark.needs("adapter")
@@ -23,9 +32,16 @@ def device() -> Device:
     return gpu_device.device()
 
 
-def view_of(device: Device, splats: int, capacity: int = CAPACITY, focused: bool = False, ring: int = 0) -> Any:
+def view_of(
+    device: Device, splats: int, capacity: int = CAPACITY, focused: bool = False, ring: int = 0
+) -> Any:
     view = np.zeros((), VIEW)
-    view["splats"], view["capacity"], view["focused"], view["ring"] = splats, capacity, focused, ring
+    view["splats"], view["capacity"], view["focused"], view["ring"] = (
+        splats,
+        capacity,
+        focused,
+        ring,
+    )
     view["tiles_x"], view["tiles_y"] = TILES_X, TILES_Y
     return device.upload("view", view, "uniform")
 
@@ -66,7 +82,8 @@ def listed(
     device: Device, depth_key: np.ndarray, rect: np.ndarray, capacity: int = CAPACITY,
     focus: np.ndarray | None = None, ring: int = 0, columns: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Run the kernels; the tables by name. columns (N, PROJECTED): splats that fill their bounds by default."""
+    """Run the kernels; the tables by name. columns (N, PROJECTED): splats that fill their bounds by
+    default."""
     count, tiles = len(rect), TILES_X * TILES_Y
     if columns is None:
         columns = np.tile(np.float32([0, 0, 1e-9, 0, 1e-9, 1, 0, 0, 0]), (count, 1))
@@ -86,10 +103,15 @@ def listed(
     shapes |= dict.fromkeys(("pair_slot", "slot_splat"), (int(counts[PAIRS]),))
     shapes |= {"slots": (count, 2), "wanted": (count,)}
     found = {name: device.read(tables[name], shape, np.uint32) for name, shape in shapes.items()}
-    return found | {"counts": counts, "pair_splat": found["slot_splat"][found["pair_slot"]] & (WANTED - 1)}
+    return found | {
+        "counts": counts,
+        "pair_splat": found["slot_splat"][found["pair_slot"]] & (WANTED - 1),
+    }
 
 
-def expected_lists(depth_key: np.ndarray, rect: np.ndarray, rendered: np.ndarray) -> list[list[int]]:
+def expected_lists(
+    depth_key: np.ndarray, rect: np.ndarray, rendered: np.ndarray
+) -> list[list[int]]:
     """The splats of every tile, near to far."""
     lists: list[list[int]] = [[] for _ in rendered]
     for i in np.argsort(depth_key, kind="stable"):
@@ -103,7 +125,8 @@ def expected_lists(depth_key: np.ndarray, rect: np.ndarray, rendered: np.ndarray
 @pytest.mark.parametrize("count", [1, 256, 257, 3000])
 @pytest.mark.parametrize("focused", [False, True])
 def test_every_tile_lists_its_splats_near_to_far(device: Device, count: int, focused: bool) -> None:
-    """Catches pairs that are lost, counted twice, out of order, or whose slots are another splat's."""
+    """Catches pairs that are lost, counted twice, out of order, or whose slots are another
+    splat's."""
     depth_key, rect = scene(count)
     focus = np.random.default_rng(1).random(count) < 3 / count if focused else None
     found = listed(device, depth_key, rect, focus=focus, ring=1)
@@ -144,7 +167,8 @@ def test_pairs_that_do_not_fit_change_nothing_until_the_host_makes_room(device: 
     """Catches writes past the buffers, and an iteration that trains with half of its splats."""
     depth_key, rect = scene(1000)
     needed = int(np.clip(rect[:, 2:] - rect[:, :2], 0, None).prod(axis=1).sum())
-    for capacity in (needed - 1, needed):  # the second would fit, but the first has not been repeated yet
+    # the second would fit, but the first has not been repeated yet
+    for capacity in (needed - 1, needed):
         found = listed(device, depth_key, rect, capacity)
         assert found["counts"][NEEDED] == needed
         assert found["counts"][OVERFLOWED] == 1
@@ -156,9 +180,14 @@ def test_pairs_that_do_not_fit_change_nothing_until_the_host_makes_room(device: 
 
 
 def test_a_count_beyond_32_bits_is_too_many(device: Device) -> None:
-    """Catches a sum that wraps around to a small number: of three workgroups with 2³¹ − 1 pairs each."""
+    """Catches a sum that wraps around to a small number: of three workgroups with 2³¹ − 1 pairs
+    each."""
     until = device.upload("pairs_until", np.full(3 * WORKGROUP + 3, 0x7FFFFFFF, np.uint32))
-    tables = {"view": view_of(device, 3 * WORKGROUP), "counts": counts_buffer(device), "pairs_until": until}
+    tables = {
+        "view": view_of(device, 3 * WORKGROUP),
+        "counts": counts_buffer(device),
+        "pairs_until": until,
+    }
     with device.record() as work:
         work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
     counts = device.read(counts_buffer(device), (COUNTS,), np.uint32)
@@ -168,9 +197,15 @@ def test_a_count_beyond_32_bits_is_too_many(device: Device) -> None:
 
 
 def ellipses(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Projected columns (count, PROJECTED) of splats on the grid and around it, and their bounds in tiles."""
+    """Projected columns (count, PROJECTED) of splats on the grid and around it, and their bounds in
+    tiles."""
     rng, size = np.random.default_rng(5), np.array([TILES_X, TILES_Y]) * TILE
-    longest, shortest = {"round": (30, 2), "needles": (90, 0.6), "tiny": (0.7, 0.55), "huge": (3000, 200)}[kind]
+    longest, shortest = {
+        "round": (30, 2),
+        "needles": (90, 0.6),
+        "tiny": (0.7, 0.55),
+        "huge": (3000, 200),
+    }[kind]
     _, xx, xy, yy = covariances(rng, count, longest, shortest, kind == "needles")
     opacity = rng.uniform(0.005, 1, count)
     mean = rng.uniform((-20, -20), size + 20, (count, 2))
@@ -184,14 +219,17 @@ def ellipses(kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reached(columns: np.ndarray, spare: float) -> np.ndarray:
-    """(N, tiles) bool: whether a pixel of the tile has its center in the outline, made larger by a share `spare`."""
+    """(N, tiles) bool: whether a pixel of the tile has its center in the outline, made larger by a
+    share `spare`."""
     x, y = (np.arange(side * TILE) + 0.5 for side in (TILES_X, TILES_Y))
     found = []
-    for mean_x, mean_y, precision_x, shear, precision_y, opacity in columns[:, :6].astype(np.float64):
+    for mean_x, mean_y, precision_x, shear, precision_y, opacity in columns[:, :6].astype(
+        np.float64
+    ):
         dy = (y - mean_y)[:, None]
-        inside = precision_x * (x - mean_x - shear * dy) ** 2 + precision_y * dy**2 <= 2 * np.log(255 * opacity) * (
-            1 + spare
-        )
+        inside = precision_x * (x - mean_x - shear * dy) ** 2 + precision_y * dy**2 <= 2 * np.log(
+            255 * opacity
+        ) * (1 + spare)
         found.append(inside.reshape(TILES_Y, TILE, TILES_X, TILE).any(axis=(1, 3)).ravel())
     return np.array(found)
 
@@ -203,7 +241,8 @@ def test_a_splat_is_listed_where_its_outline_reaches(device: Device, kind: str) 
     depth = np.random.default_rng(2).integers(1, 90, 300).astype(np.uint32)
     visible = rect[:, 2] > rect[:, 0]
     found = listed(device, np.where(visible, depth, np.uint32(HIDDEN)), rect, columns=columns)
-    np.testing.assert_array_equal(found["wanted"], visible)  # as on the CPU, also where no pixel is reached
+    # as on the CPU, also where no pixel is reached
+    np.testing.assert_array_equal(found["wanted"], visible)
     pairs = np.zeros((300, TILES_X * TILES_Y), bool)
     for tile, (first, past) in enumerate(found["tile_range"]):
         members = found["pair_splat"][first:past]
@@ -212,6 +251,8 @@ def test_a_splat_is_listed_where_its_outline_reaches(device: Device, kind: str) 
     assert not (reached(columns, -1e-5) & ~pairs).any()
     boxes = np.prod(rect[:, 2:] - rect[:, :2], axis=1).sum()
     assert pairs.sum() == found["counts"][PAIRS] <= boxes
-    assert (pairs & ~reached(columns, 0.02)).sum() <= 0.02 * pairs.sum() + (60 if kind == "tiny" else 10)
+    assert (pairs & ~reached(columns, 0.02)).sum() <= 0.02 * pairs.sum() + (
+        60 if kind == "tiny" else 10
+    )
     if kind == "needles":
         assert pairs.sum() < 0.5 * boxes

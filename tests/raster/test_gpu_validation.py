@@ -35,7 +35,8 @@ assert "libVkLayer_khronos_validation" in Path("/proc/self/maps").read_text()
 @pytest.mark.slow
 @pytest.mark.needs("adapter", "vulkan-validation")
 def test_vulkan_validation_has_nothing_to_say(toy_root: Path, tmp_path: Path) -> None:
-    """Catches a race between dispatches, or a buffer's use, that one driver forgives and another does not."""
+    """Catches a race between dispatches, or a buffer's use, that one driver forgives and another
+    does not."""
     device = gpu_device.device()
     log, settings = tmp_path / "validation.log", tmp_path / "vk_layer_settings.txt"
     log.touch()
@@ -52,5 +53,9 @@ def test_vulkan_validation_has_nothing_to_say(toy_root: Path, tmp_path: Path) ->
     command = [sys.executable, "-c", SCRIPT, device.name, str(toy_root)]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr
-    messages = [line for line in (log.read_text() + ran.stdout + ran.stderr).splitlines() if "alidation" in line]
+    messages = [
+        line
+        for line in (log.read_text() + ran.stdout + ran.stderr).splitlines()
+        if "alidation" in line
+    ]
     assert not messages, "\n".join(messages)

@@ -1,10 +1,10 @@
 """Reference and kernels against numbers that gsplat computed.
 
-`data/gsplat.npz`: 24 random splats, a camera, and what gsplat 1.5.3 (PyPI, Apache-2.0 license; `cuda/_torch_impl.py`,
-run
-in float64 on the CPU) makes of them: projected centers, conics, depths, compensations, colors, and the image and alpha
-without and with compensated opacities. The pixels of each splat, those where alpha is 1/255 or more, were listed by us;
-nothing in this scene is opaque enough to end a pixel.
+`data/gsplat.npz`: 24 random splats, a camera, and what gsplat 1.5.3 (PyPI, Apache-2.0 license;
+`cuda/_torch_impl.py`, run in float64 on the CPU) makes of them: projected centers, conics, depths,
+compensations, colors, and the image and alpha without and with compensated opacities. The pixels of
+each splat, those where alpha is 1/255 or more, were listed by us; nothing in this scene is opaque
+enough to end a pixel.
 """
 
 from pathlib import Path
@@ -17,7 +17,16 @@ from raster import reference
 from stga_addon.avatar.embedding import WORLD
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.layout import MEAN_X, OPACITY, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, Parameters
+from stga_addon.raster.cpu.layout import (
+    MEAN_X,
+    OPACITY,
+    PRECISION_X,
+    PRECISION_Y,
+    PROJECTED,
+    RED,
+    SHEAR,
+    Parameters,
+)
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
 
 from .test_kernels import NAMES
@@ -38,8 +47,8 @@ def conics(covariance: np.ndarray) -> np.ndarray:
 
 
 def test_reference_stages_are_gsplats() -> None:
-    """Catches a difference of convention in one stage: axes, pixel centers, low-pass, harmonics' signs,
-    compensation."""
+    """Catches a difference of convention in one stage: axes, pixel centers, low-pass, harmonics'
+    signs, compensation."""
     xyz, rotation, log_scale, _, sh = splats(torch.float64)
     center, covariance, depth, compensation = reference.project(xyz, rotation, log_scale, CAMERA)
     color = reference.sh_color(sh, xyz - torch.from_numpy(CAMERA.position), 3)
@@ -64,7 +73,9 @@ def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
     """(N, PROJECTED) of the scene, by the kernels of one back end."""
     if back_end == "cpu":
         parameters, face = Parameters(*(DATA[name] for name in NAMES)), np.zeros(24, np.int32)
-        output = render_forward(parameters, face, frames_in_camera(WORLD, CAMERA), 3, antialiased=antialiased)
+        output = render_forward(
+            parameters, face, frames_in_camera(WORLD, CAMERA), 3, antialiased=antialiased
+        )
         return output.projection.columns
     from .test_gpu_rasterize import Raw
 
@@ -85,7 +96,9 @@ def test_projection_kernels_are_gsplats(back_end: str, antialiased: bool) -> Non
     x, shear, y = columns[:, PRECISION_X], columns[:, SHEAR], columns[:, PRECISION_Y]
     opacity = 1 / (1 + np.exp(-DATA["opacity"])) * (DATA["compensations"] if antialiased else 1)
     # Splats below 1/255 are never projected.
-    seen = (opacity > 1 / 254) & (np.abs(DATA["means2d"] - DATA["size"] / 2) < DATA["size"] / 2).all(1)
+    seen = (opacity > 1 / 254) & (
+        np.abs(DATA["means2d"] - DATA["size"] / 2) < DATA["size"] / 2
+    ).all(1)
     assert seen.sum() > 12
     found = {
         "means2d": (columns[:, MEAN_X : MEAN_X + 2], DATA["means2d"]),
@@ -100,7 +113,9 @@ def test_projection_kernels_are_gsplats(back_end: str, antialiased: bool) -> Non
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_kernels_image_is_gsplats(back_end: str, antialiased: bool) -> None:
     """Catches blending that is wrong in both our reference and our kernels."""
-    rgb, alpha, _ = render_differentiable(Parameters(*splats(torch.float32)), CAMERA, antialiased=antialiased)
+    rgb, alpha, _ = render_differentiable(
+        Parameters(*splats(torch.float32)), CAMERA, antialiased=antialiased
+    )
     kind = "antialiased" if antialiased else "classic"
     np.testing.assert_allclose(rgb, DATA[f"image_{kind}"], atol=TOLERANCE)
     np.testing.assert_allclose(alpha, DATA[f"alpha_{kind}"], atol=TOLERANCE)

@@ -13,7 +13,12 @@ from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
+from stga_addon.raster.cpu.rasterize import (
+    BufferPool,
+    frames_in_camera,
+    render_backward,
+    render_forward,
+)
 from stga_addon.raster.cpu.threads import set_threads, threads
 
 NAMES = Parameters._fields[:5]
@@ -22,8 +27,8 @@ IMAGE_TOLERANCE = 1e-5
 # Depth is that sum times distances of a few meters.
 DEPTH_TOLERANCE = 4e-5
 # Gradients: largest error over the largest gradient of that quantity in the scene.
-# Color is a plain weighted sum. Opacity and the geometry come through (1 − alpha) divisions and the inverse 2D
-# covariance, whose float32 conditioning worsens with the splats' anisotropy.
+# Color is a plain weighted sum. Opacity and the geometry come through (1 − alpha) divisions and the
+# inverse 2D covariance, whose float32 conditioning worsens with the splats' anisotropy.
 GRADIENT_TOLERANCE = {"sh": 1e-5, "opacity": 2e-5, "xyz": 2e-5, "rotation": 2e-5, "log_scale": 5e-5}
 
 
@@ -55,7 +60,8 @@ def cloud(
     zoom: float = 1.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:
-    """`count` random splats around the origin; the image is wide enough to hold most of them at zoom 1."""
+    """`count` random splats around the origin; the image is wide enough to hold most of them at
+    zoom 1."""
     rng = np.random.default_rng(seed)
     width, height = size
     focal = zoom * 1.5 * max(width, height)
@@ -66,7 +72,15 @@ def cloud(
         "opacity": rng.normal(size=count) * 1.5 + logit,
         "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.4,
     }
-    camera = Camera(width, height, focal, focal * 1.1, width / 2 + shift[0], height / 2 + shift[1], random_pose(rng))
+    camera = Camera(
+        width,
+        height,
+        focal,
+        focal * 1.1,
+        width / 2 + shift[0],
+        height / 2 + shift[1],
+        random_pose(rng),
+    )
     return Scene({name: value.astype(np.float32) for name, value in splats.items()}, camera, degree)
 
 
@@ -87,7 +101,10 @@ SCENES = {
     "covering everything": cloud(14, count=12, log_scale=0.7, logit=-2.0),
     "opaque layers": cloud(15, count=100, log_scale=-1.0, logit=6.0),
     "smaller than a pixel": cloud(16, log_scale=-7.0, logit=3.0),
-    "needles": replace(cloud(17), splats=cloud(17).splats | {"log_scale": np.tile(np.float32([-1, -4, -5]), (60, 1))}),
+    "needles": replace(
+        cloud(17),
+        splats=cloud(17).splats | {"log_scale": np.tile(np.float32([-1, -4, -5]), (60, 1))},
+    ),
     "faint": cloud(18, logit=-4.0),
     "dark": replace(cloud(19), splats=cloud(19).splats | {"sh": cloud(19).splats["sh"] - 0.5}),
     "single": cloud(20, count=1, spread=0.0, log_scale=-1.0, logit=2.0),
@@ -95,38 +112,53 @@ SCENES = {
 }
 
 
-def reference_gradients(scene: Scene, cotangents: list[torch.Tensor]) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+def reference_gradients(
+    scene: Scene, cotangents: list[torch.Tensor]
+) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
     tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
     images = reference.render(*tensors, scene.camera, sh_degree=scene.degree)
     return finish(images, cotangents, tensors)
 
 
-def kernel_gradients(scene: Scene, cotangents: list[torch.Tensor]) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+def kernel_gradients(
+    scene: Scene, cotangents: list[torch.Tensor]
+) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
     tensors = [torch.from_numpy(scene.splats[name]).clone().requires_grad_() for name in NAMES]
     images = render_differentiable(Parameters(*tensors), scene.camera, degree=scene.degree)
     return finish(images, cotangents, tensors)
 
 
 def finish(images, cotangents, tensors) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
-    loss = sum((image * v.to(image.dtype)).sum() for image, v in zip(images, cotangents, strict=True))
+    loss = sum(
+        (image * v.to(image.dtype)).sum() for image, v in zip(images, cotangents, strict=True)
+    )
     gradients = torch.autograd.grad(loss, tensors)
-    return [image.detach().numpy() for image in images], dict(zip(NAMES, (g.numpy() for g in gradients), strict=True))
+    return [image.detach().numpy() for image in images], dict(
+        zip(NAMES, (g.numpy() for g in gradients), strict=True)
+    )
 
 
 def random_cotangents(camera: Camera, seed: int = 0) -> list[torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     shape = (camera.height, camera.width)
-    return [torch.randn(s, generator=generator, dtype=torch.float64) for s in ((3, *shape), shape, shape)]
+    return [
+        torch.randn(s, generator=generator, dtype=torch.float64)
+        for s in ((3, *shape), shape, shape)
+    ]
 
 
 def assert_images_agree(images: list[np.ndarray], expected: list[np.ndarray]) -> None:
     tolerances = (IMAGE_TOLERANCE, IMAGE_TOLERANCE, DEPTH_TOLERANCE)
-    for name, image, want, tolerance in zip(("rgb", "alpha", "depth"), images, expected, tolerances, strict=True):
+    for name, image, want, tolerance in zip(
+        ("rgb", "alpha", "depth"), images, expected, tolerances, strict=True
+    ):
         assert image.shape == want.shape, name
         assert np.abs(image - want).max() < tolerance, f"{name}: {np.abs(image - want).max():.2e}"
 
 
-def assert_gradients_agree(gradients: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+def assert_gradients_agree(
+    gradients: dict[str, np.ndarray], expected: dict[str, np.ndarray]
+) -> None:
     for name, want in expected.items():
         largest = np.abs(want).max()
         error = np.abs(gradients[name] - want).max() / max(largest, 1e-6)
@@ -135,7 +167,8 @@ def assert_gradients_agree(gradients: dict[str, np.ndarray], expected: dict[str,
 
 @pytest.mark.parametrize("name", SCENES)
 def test_image_and_gradients_are_the_references(back_end, name):
-    """Catches any error in projection, harmonics, tile bounds, blending or their derivatives, one scene a trap."""
+    """Catches any error in projection, harmonics, tile bounds, blending or their derivatives, one
+    scene a trap."""
     scene = SCENES[name]
     cotangents = random_cotangents(scene.camera)
     images, gradients = kernel_gradients(scene, cotangents)
@@ -147,7 +180,8 @@ def test_image_and_gradients_are_the_references(back_end, name):
 
 @pytest.mark.parametrize("quantity", [0, 1, 2])
 def test_each_image_alone_has_the_references_gradient(back_end, quantity):
-    """Catches color, alpha and depth gradients that are only right in sum, or one that is dropped."""
+    """Catches color, alpha and depth gradients that are only right in sum, or one that is
+    dropped."""
     scene = SCENES["plain"]
     cotangents = [v * (i == quantity) for i, v in enumerate(random_cotangents(scene.camera, 1))]
     _, gradients = kernel_gradients(scene, cotangents)
@@ -157,16 +191,21 @@ def test_each_image_alone_has_the_references_gradient(back_end, quantity):
 
 
 def embed(local: list[torch.Tensor], frames, face: np.ndarray) -> list[torch.Tensor]:
-    """World-space splats in torch, so that autograd carries the reference's gradient to the local parameters."""
+    """World-space splats in torch, so that autograd carries the reference's gradient to the local
+    parameters."""
     return [*reference.embed(*local[:3], frames, torch.from_numpy(face).long()), *local[3:]]
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
-    """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on triangles."""
+    """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on
+    triangles."""
     scene = SCENES["plain"]
     rng = np.random.default_rng(30)
-    vertices, faces = rng.normal(size=(12, 3)) * 0.6, rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]
+    vertices, faces = (
+        rng.normal(size=(12, 3)) * 0.6,
+        rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3],
+    )
     neutral = vertices + rng.normal(size=vertices.shape) * 0.2
     frames = face_frames(vertices, faces, neutral, convention)
     face = rng.integers(0, len(faces), len(scene.splats["xyz"])).astype(np.int32)
@@ -185,17 +224,22 @@ def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
 
 
 def raw_gradients(scene: Scene, fill: float = 0.0, buffers: BufferPool | None = None, **options):
-    """Forward and backward of numpy arrays: rendering, gradients whose untouched rows keep `fill`, and rows.
+    """Forward and backward of numpy arrays: rendering, gradients whose untouched rows keep `fill`,
+    and rows.
 
     background, focus and reach are `render_forward`'s. The cotangents are of color and alpha.
     """
     splats = Parameters(*(scene.splats[name] for name in NAMES))
     face = np.zeros(len(splats.xyz), np.int32)
     camera_frames = frames_in_camera(WORLD, scene.camera)
-    rendering = render_forward(splats, face, camera_frames, scene.degree, buffers=buffers, **options)
+    rendering = render_forward(
+        splats, face, camera_frames, scene.degree, buffers=buffers, **options
+    )
     v_image, v_alpha, _ = (v.float().numpy() for v in random_cotangents(scene.camera, 3))
     gradients = Parameters(*(np.full_like(a, fill) for a in splats if a is not None))
-    rows, screen = render_backward(rendering, splats, face, camera_frames, v_image, gradients, -v_alpha, buffers)
+    rows, screen = render_backward(
+        rendering, splats, face, camera_frames, v_image, gradients, -v_alpha, buffers
+    )
     return rendering, gradients, rows, screen
 
 
@@ -210,67 +254,95 @@ def test_background_shows_through_and_pulls_on_the_splats():
     expected = torch.autograd.grad((image * v_image).sum() + (alpha * v_alpha).sum(), tensors)
     assert np.abs(rendering.image - image.detach().numpy()).max() < IMAGE_TOLERANCE
     assert np.abs(1 - rendering.transmittance - alpha.detach().numpy()).max() < IMAGE_TOLERANCE
-    assert_gradients_agree(gradients._asdict(), dict(zip(NAMES, (g.numpy() for g in expected), strict=True)))
+    assert_gradients_agree(
+        gradients._asdict(), dict(zip(NAMES, (g.numpy() for g in expected), strict=True))
+    )
 
 
 def test_screen_gradient_is_that_of_the_projected_center():
-    """Catches density control fed with pixels, or with the gradient of something else: half images, by both axes."""
+    """Catches density control fed with pixels, or with the gradient of something else: half images,
+    by both axes."""
     scene = cloud(25, count=40, size=(60, 35))
-    xyz, rotation, log_scale, opacity, sh = (torch.from_numpy(scene.splats[name]).double() for name in NAMES)
+    xyz, rotation, log_scale, opacity, sh = (
+        torch.from_numpy(scene.splats[name]).double() for name in NAMES
+    )
     order = torch.argsort(reference.camera_space(xyz, scene.camera)[:, 2])
-    center, projected, depth, _ = reference.project(xyz[order], rotation[order], log_scale[order], scene.camera)
+    center, projected, depth, _ = reference.project(
+        xyz[order], rotation[order], log_scale[order], scene.camera
+    )
     center.requires_grad_()
     color = reference.sh_color(sh, xyz - torch.from_numpy(scene.camera.position), 3)[order]
     opacity = torch.sigmoid(opacity[order])
-    rgb, alpha, _ = reference.blend(reference.splat_alpha(center, projected, opacity, scene.camera), color, depth)
+    rgb, alpha, _ = reference.blend(
+        reference.splat_alpha(center, projected, opacity, scene.camera), color, depth
+    )
     v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
     gradient = torch.autograd.grad((rgb * v_image).sum() + (alpha * v_alpha).sum(), center)[0]
     expected = np.zeros(40)
     expected[order] = np.hypot(gradient[:, 0] * 60 / 2, gradient[:, 1] * 35 / 2)
     _, _, rows, screen = raw_gradients(scene)
     assert len(rows) > 20
-    np.testing.assert_allclose(screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max())
+    np.testing.assert_allclose(
+        screen[rows], expected[rows], atol=GRADIENT_TOLERANCE["xyz"] * expected.max()
+    )
 
 
 def test_color_follows_strain_with_the_right_gradient(back_end):
-    """Catches strain of the wrong triangle, a coefficient in the wrong unit, and a gradient that misses the clamp."""
+    """Catches strain of the wrong triangle, a coefficient in the wrong unit, and a gradient that
+    misses the clamp."""
     scene, rng = SCENES["dark"], np.random.default_rng(31)
     count, neutral = len(scene.splats["xyz"]), rng.normal(size=(9, 3))
     faces = rng.permuted(np.tile(np.arange(9), (7, 1)), axis=1)[:, :3]
     basis = strain_basis(neutral, faces)
-    frames = face_frames(neutral + 0.1 * rng.normal(size=neutral.shape), faces, neutral, strain=basis)
+    frames = face_frames(
+        neutral + 0.1 * rng.normal(size=neutral.shape), faces, neutral, strain=basis
+    )
     face = rng.integers(0, len(faces), count).astype(np.int32)
     color = rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32)
     assert len(np.unique(frames.strain[face], axis=0)) > 5
     cotangents = random_cotangents(scene.camera, 5)
 
-    tensors = [torch.from_numpy(a).clone().requires_grad_() for a in (*map(scene.splats.get, NAMES), color)]
+    tensors = [
+        torch.from_numpy(a).clone().requires_grad_() for a in (*map(scene.splats.get, NAMES), color)
+    ]
     images = render_differentiable(Parameters(*tensors), scene.camera, frames, face)
     loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
     gradient = torch.autograd.grad(loss, tensors)[-1].numpy()
     local = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
     coefficients = torch.from_numpy(color).double().requires_grad_()
     placed = embed(local, frames, face)
-    shift = torch.einsum("ns,nsc->nc", torch.from_numpy(frames.strain[face]).double(), coefficients) / SH_C0
+    shift = (
+        torch.einsum("ns,nsc->nc", torch.from_numpy(frames.strain[face]).double(), coefficients)
+        / SH_C0
+    )
     sh = placed[4].clone()
     sh[:, 0] += shift
     expected_images = reference.render(*placed[:4], sh, scene.camera)
     loss = sum((image * v).sum() for image, v in zip(expected_images, cotangents, strict=True))
     expected = torch.autograd.grad(loss, coefficients)[0].numpy()
-    assert_images_agree([i.detach().numpy() for i in images], [i.detach().numpy() for i in expected_images])
+    assert_images_agree(
+        [i.detach().numpy() for i in images], [i.detach().numpy() for i in expected_images]
+    )
     assert np.abs(gradient - expected).max() < 2 * GRADIENT_TOLERANCE["sh"] * np.abs(expected).max()
 
 
-@pytest.mark.parametrize("name", ["plain", "smaller than a pixel", "needles", "around the camera", "degree 1"])
+@pytest.mark.parametrize(
+    "name", ["plain", "smaller than a pixel", "needles", "around the camera", "degree 1"]
+)
 def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
-    """Catches a compensation of the wrong determinant, and gradients that leave it out: scale, rotation, position."""
+    """Catches a compensation of the wrong determinant, and gradients that leave it out: scale,
+    rotation, position."""
     scene = SCENES[name]
     cotangents = random_cotangents(scene.camera, 6)
     tensors = [torch.from_numpy(scene.splats[n]).clone().requires_grad_() for n in NAMES]
-    images = render_differentiable(Parameters(*tensors), scene.camera, degree=scene.degree, antialiased=True)
+    images = render_differentiable(
+        Parameters(*tensors), scene.camera, degree=scene.degree, antialiased=True
+    )
     images, gradients = finish(images, cotangents, tensors)
     tensors = [torch.from_numpy(scene.splats[n]).double().requires_grad_() for n in NAMES]
-    expected_images = reference.render(*tensors, scene.camera, sh_degree=scene.degree, antialiased=True)
+    expected_images = reference.render(
+        *tensors, scene.camera, sh_degree=scene.degree, antialiased=True
+    )
     expected_images, expected = finish(expected_images, cotangents, tensors)
     plain, _ = kernel_gradients(scene, cotangents)
     assert np.abs(plain[1] - images[1]).max() > 0.01, "antialiasing changes nothing"
@@ -284,11 +356,14 @@ def test_gradients_are_overwritten():
     _, fresh, rows, _ = raw_gradients(scene)
     _, overwritten, _, _ = raw_gradients(scene, fill=5.0)
     for name in NAMES:
-        np.testing.assert_array_equal(getattr(overwritten, name)[rows], getattr(fresh, name)[rows], err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(overwritten, name)[rows], getattr(fresh, name)[rows], err_msg=name
+        )
 
 
 def test_reused_buffers_change_nothing():
-    """Catches results that depend on what an earlier, larger or smaller, rendering left in the buffers."""
+    """Catches results that depend on what an earlier, larger or smaller, rendering left in the
+    buffers."""
     buffers = BufferPool()
     for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
         scene = SCENES[name]
@@ -303,23 +378,29 @@ def test_reused_buffers_change_nothing():
 
 @pytest.mark.parametrize("count", [80, 900])
 def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
-    """Catches a local iteration whose restricted tiles change the gradient of a selected splat, and frozen splats in
-    front of it or behind that are left out where it reaches."""
+    """Catches a local iteration whose restricted tiles change the gradient of a selected splat, and
+    frozen splats in front of it or behind that are left out where it reaches."""
     scene = cloud(21, count=count, size=(100, 70), log_scale=-3.0)
     xyz = scene.splats["xyz"]
-    focus = np.isin(np.arange(80), [3, 17, 40]) if count == 80 else np.linalg.norm(xyz - xyz[3], axis=1) < 0.3
+    focus = (
+        np.isin(np.arange(80), [3, 17, 40])
+        if count == 80
+        else np.linalg.norm(xyz - xyz[3], axis=1) < 0.3
+    )
     full, expected, _, _ = raw_gradients(scene)
     part, gradients, rows, _ = raw_gradients(scene, focus=focus, reach=10)
     assert 0 < len(part.tiles) < len(full.tiles)
     assert len(rows)
     assert focus[rows].all()
     for name in NAMES:
-        np.testing.assert_array_equal(getattr(gradients, name)[focus], getattr(expected, name)[focus], err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(gradients, name)[focus], getattr(expected, name)[focus], err_msg=name
+        )
 
 
 def test_bounds_of_frozen_splats_end_at_rendered_tiles():
-    """Catches pairs with tiles that a local iteration does not render, which cost sorting, and a splat that loses one
-    that it does."""
+    """Catches pairs with tiles that a local iteration does not render, which cost sorting, and a
+    splat that loses one that it does."""
     scene = cloud(21, count=900, size=(100, 70), log_scale=-2.5)
     focus = np.linalg.norm(scene.splats["xyz"] - scene.splats["xyz"][3], axis=1) < 0.3
     full, part = raw_gradients(scene)[0], raw_gradients(scene, focus=focus, reach=10)[0]
@@ -329,7 +410,9 @@ def test_bounds_of_frozen_splats_end_at_rendered_tiles():
     for i in np.flatnonzero(~focus):
         x0, y0, x1, y1 = full.projection.rect[i]
         y, x = np.nonzero(rendered[y0:y1, x0:x1])
-        expected = [x0 + x.min(), y0 + y.min(), x0 + x.max() + 1, y0 + y.max() + 1] if len(x) else [0] * 4
+        expected = (
+            [x0 + x.min(), y0 + y.min(), x0 + x.max() + 1, y0 + y.max() + 1] if len(x) else [0] * 4
+        )
         np.testing.assert_array_equal(part.projection.rect[i], expected)
         shrunk += 0 < len(x) < (x1 - x0) * (y1 - y0)
     assert shrunk > 10
@@ -372,7 +455,8 @@ def test_focused_image_is_the_full_image_within_reach():
 
 
 def test_results_do_not_depend_on_threads():
-    """Catches races, and sums whose order depends on scheduling: a resumed run must equal an unbroken one."""
+    """Catches races, and sums whose order depends on scheduling: a resumed run must equal an
+    unbroken one."""
     scene, before = SCENES["opaque layers"], threads()
     many = [kernel_gradients(scene, random_cotangents(scene.camera)) for _ in range(2)]
     set_threads(1)
@@ -408,16 +492,23 @@ def test_splats_below_one_255th_are_invisible(back_end):
 
 
 def test_extreme_parameters_stay_finite(back_end):
-    """Catches overflow and 0/0 in float32: what one broken splat must never do is poison the image or the others."""
+    """Catches overflow and 0/0 in float32: what one broken splat must never do is poison the image
+    or the others."""
     scene = cloud(24, count=40)
     splats = scene.splats
     splats["log_scale"][0:4] = [[-60, -60, -60], [40, 40, 40], [40, -60, -60], [-60, -60, 5]]
     splats["opacity"][4:6] = [90, -90]
     splats["rotation"][6:9] = [[0, 0, 0, 0], [1e-20, 0, 0, 0], [1e18, 1e18, 0, 0]]
     splats["sh"][9:11] = np.array([1e6, -1e6])[:, None, None]
-    splats["xyz"][11:14] = [[1e8, 0, 0], [0, 1e8, 1e8], -scene.camera.world_to_camera[:3, :3].T @ [0.1, -0.2, 3.98]]
+    splats["xyz"][11:14] = [
+        [1e8, 0, 0],
+        [0, 1e8, 1e8],
+        -scene.camera.world_to_camera[:3, :3].T @ [0.1, -0.2, 3.98],
+    ]
     images, gradients = kernel_gradients(scene, random_cotangents(scene.camera))
     for image in images:
         assert np.isfinite(image).all()
     for name, gradient in gradients.items():
-        assert np.isfinite(gradient).all(), f"{name} rows {np.unique(np.argwhere(~np.isfinite(gradient))[:, 0])}"
+        assert np.isfinite(gradient).all(), (
+            f"{name} rows {np.unique(np.argwhere(~np.isfinite(gradient))[:, 0])}"
+        )

@@ -1,4 +1,5 @@
-"""Kernels on Python's threads: every unit once, errors told, several callers at a time, the lock let go."""
+"""Kernels on Python's threads: every unit once, errors told, several callers at a time, the lock
+let go."""
 
 import os
 import subprocess
@@ -49,7 +50,8 @@ def test_every_unit_is_done_once(count: int, units: int, piece: int) -> None:
 
 
 def test_threads_that_run_at_once_take_different_pieces() -> None:
-    """Catches a counter that two threads read before either has advanced it: pieces this short collide at once."""
+    """Catches a counter that two threads read before either has advanced it: pieces this short
+    collide at once."""
     set_threads(4)
     done = np.zeros(2_000_000, np.int64)
     call = parallel(len)(count_up)
@@ -70,7 +72,8 @@ def fail(work, numbers, at):
 
 @pytest.mark.parametrize("at", [0, 9])
 def test_an_error_reaches_the_caller(at: int) -> None:
-    """Catches an error that dies with its thread, a caller that then waits for ever, and threads lost to it."""
+    """Catches an error that dies with its thread, a caller that then waits for ever, and threads
+    lost to it."""
     set_threads(3)
     for _ in range(5):
         with pytest.raises(ValueError, match="this piece"):
@@ -94,8 +97,8 @@ def meet(work, met, patience):
 
 @pytest.mark.parametrize("rest", [0.0, 0.1])
 def test_the_threads_work_at_once(rest: float) -> None:
-    """Catches helpers that never come, after a rest in which they fell asleep as well: all is done, but by the caller
-    alone."""
+    """Catches helpers that never come, after a rest in which they fell asleep as well: all is done,
+    but by the caller alone."""
     set_threads(7)
     for _ in range(5):
         time.sleep(rest)
@@ -106,7 +109,8 @@ def test_the_threads_work_at_once(rest: float) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_a_forked_process_has_threads_of_its_own() -> None:
-    """Catches a child that gives its kernels to its parent's threads, or waits for the lock that one of them held."""
+    """Catches a child that gives its kernels to its parent's threads, or waits for the lock that
+    one of them held."""
     set_threads(3)
     meet(np.zeros(4, np.int64), 100_000_000)
     child = os.fork()
@@ -130,14 +134,18 @@ print(out.min())
 
 
 def test_a_process_ends_while_its_threads_look_for_work() -> None:
-    """Catches threads that run on where Python has already freed their memory and code: a crash after the last line."""
+    """Catches threads that run on where Python has already freed their memory and code: a crash
+    after the last line."""
     for _ in range(3):
-        done = subprocess.run([sys.executable, "-c", AT_EXIT], capture_output=True, text=True, timeout=60)
+        done = subprocess.run(
+            [sys.executable, "-c", AT_EXIT], capture_output=True, text=True, timeout=60
+        )
         assert (done.returncode, done.stdout, done.stderr) == (0, "7\n", "")
 
 
 def test_several_callers_at_a_time() -> None:
-    """Catches shared state between calls: Blender draws a viewport in a thread of its own while another one renders."""
+    """Catches shared state between calls: Blender draws a viewport in a thread of its own while
+    another one renders."""
     scene = SCENES["plain"]
     cotangents = random_cotangents(scene.camera)
     _, expected = kernel_gradients(scene, cotangents)
@@ -169,7 +177,8 @@ def spin(begin, end, times, out):
 
 
 def test_python_goes_on_meanwhile() -> None:
-    """Catches kernels that hold Python's lock: Blender's window would stand still while a picture is rendered."""
+    """Catches kernels that hold Python's lock: Blender's window would stand still while a picture
+    is rendered."""
     out = np.zeros(1)
     spin(0, 1, 1, out)
     ticks = []

@@ -1,4 +1,5 @@
-"""Order of the splats by depth against numpy's stable sort, and the order in which tiles are rendered."""
+"""Order of the splats by depth against numpy's stable sort, and the order in which tiles are
+rendered."""
 
 import numpy as np
 import pytest
@@ -20,8 +21,8 @@ def by_depth(depth: np.ndarray, rect: np.ndarray) -> tuple[np.ndarray, ...]:
 @pytest.mark.parametrize("most", [1.0, 1.0 + 1e-6, 1.1, 3.0, 1e9, 3e38])
 @pytest.mark.parametrize("least", [1.0, 0.01])
 def test_depths_are_sorted_whatever_their_range(least, most):
-    """Catches a pass left out where depths differ in high bits only, equal depths that change places, and parts that
-    overlap or lose splats or pairs where they meet."""
+    """Catches a pass left out where depths differ in high bits only, equal depths that change
+    places, and parts that overlap or lose splats or pairs where they meet."""
     rng = np.random.default_rng(0)
     depth = np.geomspace(least, most, 3000).astype(np.float32)[rng.integers(0, 3000, 60_000)]
     rect = np.zeros((60_000, 4), np.int32)
@@ -38,9 +39,14 @@ def test_depths_are_sorted_whatever_their_range(least, most):
 
 
 def test_splats_with_tiles_are_listed():
-    """Catches splats left out at the end, and broken ones (−1) that are listed, with depths that are not numbers."""
-    rect = np.array([[0, 0, 0, 0], [1, 2, 3, 4], [-1, -1, -1, -1], [0, 0, 1, 1], [5, 0, 6, 2]], np.int32)
-    visible, order, first_pair, _, total = by_depth(np.array([0, 3, np.nan, 1, 2], np.float32), rect)
+    """Catches splats left out at the end, and broken ones (−1) that are listed, with depths that
+    are not numbers."""
+    rect = np.array(
+        [[0, 0, 0, 0], [1, 2, 3, 4], [-1, -1, -1, -1], [0, 0, 1, 1], [5, 0, 6, 2]], np.int32
+    )
+    visible, order, first_pair, _, total = by_depth(
+        np.array([0, 3, np.nan, 1, 2], np.float32), rect
+    )
     assert (visible.tolist(), order.tolist(), total) == ([1, 3, 4], [3, 4, 1], 7)
     assert first_pair[visible].tolist() == [0, 4, 5]
     for n in (0, 1):
@@ -50,8 +56,8 @@ def test_splats_with_tiles_are_listed():
 
 @pytest.mark.parametrize("count", [1, 7, 8, 1785])
 def test_runs_of_tiles_begin_with_the_fullest(count):
-    """Catches tiles that are lost or doubled, neighbors that are torn apart, and a long run that is left to the end,
-    where all threads but one wait for it."""
+    """Catches tiles that are lost or doubled, neighbors that are torn apart, and a long run that is
+    left to the end, where all threads but one wait for it."""
     rng = np.random.default_rng(1)
     pairs = rng.integers(0, 400, 1785)
     given = np.sort(rng.choice(1785, count, replace=False)).astype(np.int32)
@@ -59,6 +65,8 @@ def test_runs_of_tiles_begin_with_the_fullest(count):
     np.testing.assert_array_equal(np.sort(tiles), given)
     whole = count // RUN_TILES * RUN_TILES
     runs = tiles[:whole].reshape(-1, RUN_TILES)
-    assert {tuple(run) for run in runs.tolist()} == {tuple(r) for r in given[:whole].reshape(-1, RUN_TILES).tolist()}
+    assert {tuple(run) for run in runs.tolist()} == {
+        tuple(r) for r in given[:whole].reshape(-1, RUN_TILES).tolist()
+    }
     weights = pairs[runs].sum(1)
     assert (np.diff(weights) <= weights.max(initial=0) / (RUN_BUCKETS - 1) + 1).all()

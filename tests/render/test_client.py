@@ -48,7 +48,9 @@ def embedded() -> PosedSplats:
     frames = face_frames(1.1 * neutral, faces, neutral, strain=strain_basis(neutral, faces))
     splats = cloud(60, 2, 2)
     colors = rng.normal(0, 0.3, (60, 3, 3)).astype(np.float32)
-    return PosedSplats(replace(splats, xyz=0.05 * splats.xyz, strain_color=colors), frames, HERE, True)
+    return PosedSplats(
+        replace(splats, xyz=0.05 * splats.xyz, strain_color=colors), frames, HERE, True
+    )
 
 
 def test_one_layer_gives_the_pixels_of_render():
@@ -62,7 +64,8 @@ def test_one_layer_gives_the_pixels_of_render():
 
 
 def test_layers_are_sorted_together():
-    """Catches layers that are composited one over the other: two halves of a cloud must make the whole cloud."""
+    """Catches layers that are composited one over the other: two halves of a cloud must make the
+    whole cloud."""
     splats = cloud()
     half = np.arange(len(splats)) % 2 == 0
     whole, halves = (compose(layers, CAMERA, True) for layers in (
@@ -81,7 +84,9 @@ def test_moving_scene_and_camera_together_changes_nothing():
     splats = cloud()
     for size in (1.0, 2.0):
         small = replace(
-            splats, xyz=splats.xyz / np.float32(size), log_scale=splats.log_scale - np.float32(np.log(size))
+            splats,
+            xyz=splats.xyz / np.float32(size),
+            log_scale=splats.log_scale - np.float32(np.log(size)),
         )
         picture = compose([world(small, turn @ np.diag([size, size, size, 1]))], camera)
         np.testing.assert_allclose(picture.rgb, compose([world(splats)], CAMERA).rgb, atol=1e-4)
@@ -90,7 +95,9 @@ def test_moving_scene_and_camera_together_changes_nothing():
 def test_depth_is_the_mean_of_what_a_pixel_shows():
     """Catches depth that is not divided by alpha."""
     one = cloud(1)
-    splats = replace(one, xyz=np.array([[0, 0, 3]], np.float32), log_scale=np.full((1, 3), -1, np.float32))
+    splats = replace(
+        one, xyz=np.array([[0, 0, 3]], np.float32), log_scale=np.full((1, 3), -1, np.float32)
+    )
     depth = compose([world(splats)], CAMERA, True).depth
     assert depth is not None
     np.testing.assert_allclose(depth[depth > 0], 3, rtol=1e-5)
@@ -105,7 +112,10 @@ def test_layers_survive_the_protocol():
             np.testing.assert_array_equal(getattr(back.splats, name), value)
         for name in ("origin", "rotation", "scale", "strain"):
             np.testing.assert_array_equal(getattr(back.frames, name), getattr(layer.frames, name))
-        assert (back.antialiased, back.to_world.tolist()) == (layer.antialiased, layer.to_world.tolist())
+        assert (back.antialiased, back.to_world.tolist()) == (
+            layer.antialiased,
+            layer.to_world.tolist(),
+        )
 
 
 @pytest.mark.slow
@@ -133,13 +143,16 @@ def test_the_server_renders_the_same(monkeypatch):
 
 @pytest.mark.slow
 def test_output_of_libraries_does_not_disturb_the_protocol(tmp_path, monkeypatch):
-    """Catches a server whose replies are mixed with what C code writes to descriptor 1 while packages are imported."""
+    """Catches a server whose replies are mixed with what C code writes to descriptor 1 while
+    packages are imported."""
     shim = "import os, sys\nos.write(1, b'noise' * 100)\nsys.path.remove({!r})\ndel sys.modules[__name__]\nimport {}\n"
     (tmp_path / "platformdirs.py").write_text(shim.format(str(tmp_path), "platformdirs"))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
     remote = RenderClient(lambda: sys.executable)
-    np.testing.assert_array_equal(remote.compose([world(cloud())], CAMERA).rgb, compose([world(cloud())], CAMERA).rgb)
+    np.testing.assert_array_equal(
+        remote.compose([world(cloud())], CAMERA).rgb, compose([world(cloud())], CAMERA).rgb
+    )
     remote.close()
 
 
@@ -156,7 +169,9 @@ def test_no_interpreter_that_can_render_is_one_sentence(monkeypatch):
         raise StgaError("no training Python")
 
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
-    with pytest.raises(StgaError, match=r"Rendering splats needs numba and platformdirs .*or another Python"):
+    with pytest.raises(
+        StgaError, match=r"Rendering splats needs numba and platformdirs .*or another Python"
+    ):
         RenderClient(nobody).compose([], CAMERA)
     with pytest.raises(StgaError, match="/no/such/python: cannot be started"):
         RenderClient(lambda: "/no/such/python").compose([], CAMERA)

@@ -1,4 +1,5 @@
-"""Layers rendered by the device that is there: on software Vulkan against the CPU, and what happens where it fails."""
+"""Layers rendered by the device that is there: on software Vulkan against the CPU, and what happens
+where it fails."""
 
 import logging
 import subprocess
@@ -28,7 +29,8 @@ def adapter() -> str:
 
 
 def scene() -> list[PosedSplats]:
-    """Layers of different degrees and with and without strain, antialiasing, and a place of their own."""
+    """Layers of different degrees and with and without strain, antialiasing, and a place of their
+    own."""
     place = np.diag([1.2, 1.2, 1.2, 1.0])
     place[:3, :3] = place[:3, :3] @ [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
     gray = cloud(70, 4)
@@ -50,8 +52,11 @@ def assert_same_picture(got: ComposedImage, want: ComposedImage) -> None:
     "layers", [scene(), [], [world(cloud(1).rows(np.zeros(1, bool)))]], ids=["three", "no", "empty"]
 )
 @pytest.mark.needs("adapter")
-def test_a_gpu_composes_the_same_picture(adapter: str, layers: list[PosedSplats], with_depth: bool) -> None:
-    """Catches a layer drawn with another's frames, camera, degree or rows, and a depth that is a color."""
+def test_a_gpu_composes_the_same_picture(
+    adapter: str, layers: list[PosedSplats], with_depth: bool
+) -> None:
+    """Catches a layer drawn with another's frames, camera, degree or rows, and a depth that is a
+    color."""
     want = compose(layers, CAMERA, with_depth)
     if want.alpha.max() > 0:
         assert_same_picture(gpu.compose(adapter, layers, CAMERA, with_depth), want)
@@ -75,14 +80,19 @@ def lost(*_: object) -> ComposedImage:
 def test_the_cpu_takes_over_where_a_gpu_fails(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Catches a failed driver that ends an animation, is asked again for each image, or is not mentioned."""
+    """Catches a failed driver that ends an animation, is asked again for each image, or is not
+    mentioned."""
     calls = []
-    monkeypatch.setattr(compose_module, "choose_device", lambda wanted, task: ("gpu:Card 9000", "why"))
+    monkeypatch.setattr(
+        compose_module, "choose_device", lambda wanted, task: ("gpu:Card 9000", "why")
+    )
     monkeypatch.setattr(gpu, "compose", lambda *given: calls.append(given) or lost())
     composer = Composer()
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
-            np.testing.assert_array_equal(composer.compose(scene(), CAMERA).rgb, compose(scene(), CAMERA).rgb)
+            np.testing.assert_array_equal(
+                composer.compose(scene(), CAMERA).rgb, compose(scene(), CAMERA).rgb
+            )
     assert len(calls) == 1
     assert composer.failure == "Card 9000 was lost; the CPU renders instead"
     assert caplog.messages == [composer.failure]
@@ -94,7 +104,9 @@ def test_the_cpu_takes_over_where_a_gpu_fails(
 
 def test_a_gpu_by_name_does_not_fall_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a CPU that renders where a GPU was asked for, unnoticed."""
-    monkeypatch.setattr(compose_module, "choose_device", lambda wanted, task: ("gpu:Card 9000", "why"))
+    monkeypatch.setattr(
+        compose_module, "choose_device", lambda wanted, task: ("gpu:Card 9000", "why")
+    )
     monkeypatch.setattr(gpu, "compose", lost)
     with pytest.raises(StgaError, match=r"^--device gpu: Card 9000 was lost; try again$"):
         Composer("gpu").compose(scene(), CAMERA)
@@ -112,18 +124,23 @@ def test_a_lost_device_is_opened_again(adapter: str, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.needs("adapter")
 def test_software_renders_by_name_only(adapter: str) -> None:
-    """Catches a machine without a GPU whose pictures come from software Vulkan: they must be the CPU's, bit for bit."""
+    """Catches a machine without a GPU whose pictures come from software Vulkan: they must be the
+    CPU's, bit for bit."""
     if not gpu_device.device().is_software:
         pytest.skip("the first adapter is a GPU")
     composer = Composer()
-    np.testing.assert_array_equal(composer.compose(scene(), CAMERA).rgb, compose(scene(), CAMERA).rgb)
+    np.testing.assert_array_equal(
+        composer.compose(scene(), CAMERA).rgb, compose(scene(), CAMERA).rgb
+    )
     assert composer.device == "cpu"
     assert Composer("gpu").choose() == f"gpu:{adapter}"
 
 
 @pytest.mark.slow
 @pytest.mark.needs("adapter")
-def test_the_server_renders_on_the_wanted_device(adapter: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_server_renders_on_the_wanted_device(
+    adapter: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a server that renders on something else, or goes on with the device of before."""
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
     device = [f"gpu:{adapter}"]
@@ -138,6 +155,8 @@ def test_the_server_renders_on_the_wanted_device(adapter: str, monkeypatch: pyte
     np.testing.assert_array_equal(remote.compose(layers, CAMERA, True).rgb, want.rgb)
     assert subprocess.Popen.poll(first) is not None
     device[0] = "gpu:Voodoo 2"
-    with pytest.raises(StgaError, match=r"could not render the image \(--device gpu:Voodoo 2: no adapter"):
+    with pytest.raises(
+        StgaError, match=r"could not render the image \(--device gpu:Voodoo 2: no adapter"
+    ):
         remote.compose(layers, CAMERA)
     remote.close()

@@ -22,7 +22,8 @@ CARD, OTHER, SOFTWARE = "Card 9000 (Vulkan)", "Card 9000 (DX12)", "llvmpipe (Vul
 
 @pytest.fixture
 def trials(monkeypatch: pytest.MonkeyPatch) -> dict[str, Trial]:
-    """A machine with two names of a card and a software adapter; what a trial of each finds, to be changed."""
+    """A machine with two names of a card and a software adapter; what a trial of each finds, to be
+    changed."""
     kinds = {CARD: "DiscreteGPU", OTHER: "DiscreteGPU", SOFTWARE: "CPU"}
     adapters = {name: SimpleNamespace(info={"adapter_type": kind}) for name, kind in kinds.items()}
     found = {name: Trial(1e-6, 0.002, 0.02) for name in adapters}
@@ -39,7 +40,10 @@ def test_a_right_and_faster_gpu_is_taken(trials: dict[str, Trial]) -> None:
     assert choose_device("auto") == choose_device("gpu")
     chosen, why = choose_device("auto")
     assert chosen == f"gpu:{CARD}"
-    assert why == f"Training on {CARD}, 10.0 times as fast as the CPU in a trial (2.0 and 20.0 ms an image)"
+    assert (
+        why
+        == f"Training on {CARD}, 10.0 times as fast as the CPU in a trial (2.0 and 20.0 ms an image)"
+    )
     assert choose_device("cpu")[0] == "cpu"
     assert choose_device("gpu:dx12")[0] == f"gpu:{OTHER}"
 
@@ -55,7 +59,9 @@ def test_software_is_only_taken_by_name(trials: dict[str, Trial]) -> None:
     trials[CARD] = trials[OTHER] = Trial(1e-6, 0.04, 0.02)
     chosen, why = choose_device("auto")
     assert chosen == "cpu"
-    assert why.startswith(f"Training on the CPU: {CARD} is 2.0 times slower than the CPU in a trial (40.0 and 20.0 ms")
+    assert why.startswith(
+        f"Training on the CPU: {CARD} is 2.0 times slower than the CPU in a trial (40.0 and 20.0 ms"
+    )
     assert choose_device("gpu:llvm")[0] == f"gpu:{SOFTWARE}"
 
 
@@ -73,7 +79,9 @@ def test_names_that_fit_none_or_several(trials: dict[str, Trial]) -> None:
     """Catches an adapter that nobody meant."""
     with pytest.raises(StgaError, match=r"^--device gpu:card: several adapters .*llvmpipe"):
         choose_device("gpu:card")
-    with pytest.raises(StgaError, match=r"^--device gpu:Voodoo: no adapter of that name; there are: Card"):
+    with pytest.raises(
+        StgaError, match=r"^--device gpu:Voodoo: no adapter of that name; there are: Card"
+    ):
         choose_device("gpu:Voodoo")
 
 
@@ -82,7 +90,10 @@ def raises(name: str) -> None:
 
 
 WRONG = {
-    "no package": ((device_module, "find_spec", lambda name: None), "package wgpu .* is not installed"),
+    "no package": (
+        (device_module, "find_spec", lambda name: None),
+        "package wgpu .* is not installed",
+    ),
     "no driver": ((gpu, "adapters", dict), "no graphics driver with Vulkan"),
 }
 
@@ -102,10 +113,14 @@ def test_what_is_wrong_is_said_and_only_auto_falls_back(
     assert "--device" not in why
 
 
-def test_a_driver_that_fails_leaves_the_cpu(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_that_fails_leaves_the_cpu(
+    trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches "auto" that ends in a driver's traceback."""
     works, broken = trial.try_device, {CARD}
-    monkeypatch.setattr(trial, "try_device", lambda name: raises(name) if name in broken else works(name))
+    monkeypatch.setattr(
+        trial, "try_device", lambda name: raises(name) if name in broken else works(name)
+    )
     assert choose_device("auto")[0] == f"gpu:{OTHER}"
     device_module._trial.cache_clear()
     broken.add(OTHER)
@@ -124,7 +139,9 @@ def test_only_software_is_no_gpu(trials: dict[str, Trial], monkeypatch: pytest.M
 def test_what_is_a_device() -> None:
     """Catches a run or a job whose file names nonsense."""
     assert all(map(is_device, ("auto", "cpu", "gpu", "gpu:any name")))
-    assert not any(map(is_device, ("", "gpu:", "cuda", "gpux", None, 3, ["cpu"], "gpu:" + 999 * "x")))
+    assert not any(
+        map(is_device, ("", "gpu:", "cuda", "gpux", None, 3, ["cpu"], "gpu:" + 999 * "x"))
+    )
 
 
 def test_wgpu_is_imported_only_where_it_works() -> None:

@@ -24,7 +24,9 @@ IMAGES = "recording.bin"
 CAMERA = look_at((0, 0, 2), (0, 0, 0), 32, 24, 40.0)
 
 
-def record(folder: Path, output: Path, images: list[list[PosedSplats]], count: int | None = None) -> None:
+def record(
+    folder: Path, output: Path, images: list[list[PosedSplats]], count: int | None = None
+) -> None:
     """Record images and ask for them; count: how many, if others than there are."""
     folder.mkdir()
     recorder = Recorder(folder / IMAGES)
@@ -32,13 +34,19 @@ def record(folder: Path, output: Path, images: list[list[PosedSplats]], count: i
         recorder.add(layers, CAMERA)
     recorder.close()
     background = (1.0, 0.5, 0.0) if len(images) > 1 else None
-    write_request(folder, RenderRecording(folder / IMAGES, output, count or len(images), 25.0, background))
+    write_request(
+        folder, RenderRecording(folder / IMAGES, output, count or len(images), 25.0, background)
+    )
 
 
 def layer(seed: int, to_world: np.ndarray | None = None, count: int = 40) -> PosedSplats:
     rng = np.random.default_rng(seed)
     floats = {"xyz": rng.normal(0, 0.3, (count, 3)), "rotation": rng.normal(size=(count, 4))}
-    floats |= {"log_scale": np.full((count, 3), -2.5), "opacity": np.ones(count), "sh": rng.normal(size=(count, 1, 3))}
+    floats |= {
+        "log_scale": np.full((count, 3), -2.5),
+        "opacity": np.ones(count),
+        "sh": rng.normal(size=(count, 1, 3)),
+    }
     arrays = {name: values.astype(np.float32) for name, values in floats.items()}
     splats = Splats(**arrays, face=np.zeros(count, np.int32), unbound=np.zeros(count, bool))
     return PosedSplats(splats, WORLD, np.eye(4) if to_world is None else to_world)
@@ -51,7 +59,8 @@ def moved(x: float) -> np.ndarray:
 
 
 def test_layers_without_what_the_reader_has() -> None:
-    """Catches splats that are sent again with each image, and others that are taken for those sent before."""
+    """Catches splats that are sent again with each image, and others that are taken for those sent
+    before."""
     before = [layer(0), layer(1)]
     after = [replace(layer(0), to_world=moved(1)), layer(2), layer(3)]
     packed = pack_layers(after, before)
@@ -65,7 +74,8 @@ def test_layers_without_what_the_reader_has() -> None:
 
 
 def test_images_are_those_recorded(tmp_path: Path) -> None:
-    """Catches images of other splats, poses or cameras than recorded, and a recording left on the disk."""
+    """Catches images of other splats, poses or cameras than recorded, and a recording left on the
+    disk."""
     folder, out = tmp_path / "job", tmp_path / "out"
     images = [[layer(0)], [replace(layer(0), to_world=moved(0.3))], [layer(1), layer(0)]]
     record(folder, out, images)
@@ -91,7 +101,9 @@ def test_a_cancelled_video_is_not_written(tmp_path: Path) -> None:
 
 def test_backgrounds() -> None:
     """Catches premultiplied color in a PNG with alpha, and a background in front of the splats."""
-    image = ComposedImage(np.full((3, 1, 1), 0.25, np.float32), np.full((1, 1), 0.5, np.float32), None)
+    image = ComposedImage(
+        np.full((3, 1, 1), 0.25, np.float32), np.full((1, 1), 0.5, np.float32), None
+    )
     assert finished(image, None, opaque=False).tolist() == [[[128, 128, 128, 128]]]
     assert finished(image, None, opaque=True).tolist() == [[[64, 64, 64]]]
     assert finished(image, (1.0, 0.0, 0.5), opaque=True).tolist() == [[[191, 64, 128]]]
@@ -109,7 +121,8 @@ def test_a_truncated_recording(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_a_full_disk_while_recording(tmp_path: Path) -> None:
-    """Catches a recording whose end never reached the disk and that counts as whole, and a traceback."""
+    """Catches a recording whose end never reached the disk and that counts as whole, and a
+    traceback."""
     recorder = Recorder(tmp_path / IMAGES)
     recorder._stream.close()
     recorder._stream = Path("/dev/full").open("wb")  # noqa: SIM115

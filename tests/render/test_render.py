@@ -30,10 +30,13 @@ def one_splat(color: tuple[float, float, float]) -> Splats:
 
 
 def test_the_example_renders_a_ply_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an example that no longer runs, and a picture that does not show the splats where they are."""
+    """Catches an example that no longer runs, and a picture that does not show the splats where
+    they are."""
     monkeypatch.chdir(tmp_path)
     write_ply(Path("splats.ply"), one_splat((0.8, 0.4, 0.1)))
-    example = doctest.DocTestParser().get_doctest(render_module.__doc__ or "", {}, "example", None, 0)
+    example = doctest.DocTestParser().get_doctest(
+        render_module.__doc__ or "", {}, "example", None, 0
+    )
     runner = doctest.DocTestRunner()
     assert len(example.examples) == 9
     assert runner.run(example).failed == 0
@@ -50,16 +53,26 @@ def test_look_at_gives_the_pose_worked_out_by_hand() -> None:
     """
     camera = look_at((3, 2, 0), (1, 2, 0), width=40, height=30, focal_length=50)
     np.testing.assert_allclose(
-        camera.world_to_camera, [[0, 0, -1, 0], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]], atol=1e-15
+        camera.world_to_camera,
+        [[0, 0, -1, 0], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]],
+        atol=1e-15,
     )
     np.testing.assert_allclose(camera.position, [3, 2, 0], atol=1e-15)
-    assert (camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy) == (40, 30, 50, 50, 20, 15)
+    assert (camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy) == (
+        40,
+        30,
+        50,
+        50,
+        20,
+        15,
+    )
     with pytest.raises(ValueError, match="parallel to up"):
         look_at((0, 1, 0), (0, 0, 0), 40, 30, 50)
 
 
 def test_up_is_up_and_right_is_right() -> None:
-    """Catches an image upside down or mirrored: a splat up and to the right of the target is in that quarter."""
+    """Catches an image upside down or mirrored: a splat up and to the right of the target is in
+    that quarter."""
     splats = one_splat((0, 0, 0))
     splats.xyz[0] = [0.1, 0.08, 0]  # seen from +z, +x is to the right
     image = render(splats, look_at((0, 0, 1), (0, 0, 0), 64, 48, 100))

@@ -25,7 +25,8 @@ def images(height: int = 61, width: int = 80, count: int = 10) -> list[np.ndarra
 
 
 def test_a_video_is_what_was_written(tmp_path: Path) -> None:
-    """Catches lost or doubled frames, a wrong rate, and colors converted by one matrix and tagged as another."""
+    """Catches lost or doubled frames, a wrong rate, and colors converted by one matrix and tagged
+    as another."""
     path, written = tmp_path / "a" / "video.mp4", images()
     with video_writer(path, FPS) as write:
         for image in written:
@@ -68,9 +69,15 @@ def test_image_sequence(tmp_path: Path) -> None:
     with sequence_writer(tmp_path / "images") as write:
         for image in written:
             write(image)
-    assert sorted(path.name for path in (tmp_path / "images").glob("*.*g")) == ["0001.png", "0002.png", "0003.png"]
+    assert sorted(path.name for path in (tmp_path / "images").glob("*.*g")) == [
+        "0001.png",
+        "0002.png",
+        "0003.png",
+    ]
     for index, image in enumerate(written):
-        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / f"images/{index + 1:04d}.png")), image)
+        np.testing.assert_array_equal(
+            np.asarray(Image.open(tmp_path / f"images/{index + 1:04d}.png")), image
+        )
 
 
 def write_sequence(folder: Path, count: int) -> None:
@@ -85,7 +92,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("cut_short", [False, True])
 def test_a_sequence_replaces_an_earlier_one(tmp_path: Path, cut_short: bool) -> None:
-    """Catches images of an earlier, longer sequence that play after the new ones, and other files that are removed."""
+    """Catches images of an earlier, longer sequence that play after the new ones, and other files
+    that are removed."""
     write_sequence(tmp_path, 4)
     for name in ("12.png", "texture_0001.png"):
         (tmp_path / name).write_bytes(b"of others")
@@ -93,7 +101,11 @@ def test_a_sequence_replaces_an_earlier_one(tmp_path: Path, cut_short: bool) -> 
         write(images()[0])
         if cut_short:
             raise KeyboardInterrupt
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["0001.png", "12.png", "texture_0001.png"]
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == [
+        "0001.png",
+        "12.png",
+        "texture_0001.png",
+    ]
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "0001.png")), images()[0])
 
 
@@ -108,8 +120,9 @@ def test_a_sequence_without_images_removes_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["0001.png", "0002.png", "0044.png", "0044.PNG"])
 def test_images_of_others_are_kept(tmp_path: Path, name: str) -> None:
-    """Catches footage, retouched images or a camera's capitals, in the folder of an earlier sequence of ours, that a
-    sequence replaces or removes, and a refusal after something was written, recorded or drawn."""
+    """Catches footage, retouched images or a camera's capitals, in the folder of an earlier
+    sequence of ours, that a sequence replaces or removes, and a refusal after something was
+    written, recorded or drawn."""
     write_sequence(tmp_path, 2)
     (tmp_path / name).write_bytes(b"of others")
     before = contents(tmp_path)
@@ -121,7 +134,8 @@ def test_images_of_others_are_kept(tmp_path: Path, name: str) -> None:
 
 
 def test_a_killed_sequence_can_be_rendered_again(tmp_path: Path) -> None:
-    """Catches images of a process that was killed, or whose disk was full, taken for those of somebody else."""
+    """Catches images of a process that was killed, or whose disk was full, taken for those of
+    somebody else."""
     writer = sequence_writer(tmp_path)
     write = writer.__enter__()
     for image in images(count=3):

@@ -12,11 +12,15 @@ from stga_addon.report import run_chart
 
 
 def evaluations(count: int) -> list[dict[str, Any]]:
-    return [{"seconds": 2.0 + n, "psnr": 20.0 + n, "psnr_mask": 18.0, "psnr_moving": 17.0} for n in range(count)]
+    return [
+        {"seconds": 2.0 + n, "psnr": 20.0 + n, "psnr_mask": 18.0, "psnr_moving": 17.0}
+        for n in range(count)
+    ]
 
 
 def test_run_chart_shows_regions_and_the_forecast() -> None:
-    """Catches swapped axes, a missing region, and a forecast that does not start at the latest evaluation."""
+    """Catches swapped axes, a missing region, and a forecast that does not start at the latest
+    evaluation."""
     lines = evaluations(4)
     lines[-1]["forecast"] = {"seconds": 8.0, "psnr": 24.0, "error": 0.5}
     (axes,) = run_chart(lines).axes
@@ -29,8 +33,13 @@ def test_run_chart_shows_regions_and_the_forecast() -> None:
 
 
 def test_a_run_of_any_length_is_rendered() -> None:
-    """Catches a chart that fails before the second evaluation, or on a capture without masks, and an empty picture."""
-    for lines in ([], evaluations(1), [{"seconds": 2.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 21.0}]):
+    """Catches a chart that fails before the second evaluation, or on a capture without masks, and
+    an empty picture."""
+    for lines in (
+        [],
+        evaluations(1),
+        [{"seconds": 2.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 21.0}],
+    ):
         stream = BytesIO()
         run_chart(lines).savefig(stream, format="png")
         picture = Image.open(stream)

@@ -25,13 +25,20 @@ def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_what_is_timed_is_what_will_train(
-    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    toy_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Catches a GPU that is given the minutes of the CPU."""
     timed: list[str] = []
-    monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3)
+    monkeypatch.setattr(
+        preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3
+    )
     for module in ("jobs.analyze", "render.device"):
-        monkeypatch.setattr(f"stga_addon.{module}.choose_device", lambda wanted: ("gpu:Card", "why"))
+        monkeypatch.setattr(
+            f"stga_addon.{module}.choose_device", lambda wanted: ("gpu:Card", "why")
+        )
     device = ["--device", "gpu"]
     assert main(["presets", str(toy_root), *device]) == 0
     assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
@@ -39,7 +46,10 @@ def test_what_is_timed_is_what_will_train(
 
 
 def test_a_preset_brings_its_iterations(
-    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    toy_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Catches a preset that changes nothing, and one that cannot be overruled."""
     train = ["train", str(toy_root), "--out"]
@@ -49,7 +59,12 @@ def test_a_preset_brings_its_iterations(
     assert "5 dB was reached" in out
     assert "held-out views: " in out
     settings = read_run(tmp_path / "preset").settings
-    assert (settings.preset, settings.iterations, settings.lattice, settings.target_psnr) == ("draft", 800, 1, 5.0)
+    assert (settings.preset, settings.iterations, settings.lattice, settings.target_psnr) == (
+        "draft",
+        800,
+        1,
+        5.0,
+    )
     assert main([*train, str(tmp_path / "counted"), "--preset", "final", "--iterations", "3"]) == 0
     settings = read_run(tmp_path / "counted").settings
     assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)

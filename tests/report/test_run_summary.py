@@ -38,7 +38,10 @@ def test_summary_of_a_run() -> None:
         "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference 0.0323, after 20 s"
         " (the saved avatar)"
     )
-    assert lines[-1] == "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB"
+    assert (
+        lines[-1]
+        == "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB"
+    )
     assert len(lines) == 2
     assert summarize_run([], None) == []
 
@@ -56,11 +59,13 @@ def test_summary_of_a_continuation() -> None:
 
 
 def test_fitted_exposure_is_said() -> None:
-    """Catches a PSNR that six numbers a view were fitted for, shown like one without: in the summary, beside the
-    target, in the forecast and in the panel."""
+    """Catches a PSNR that six numbers a view were fitted for, shown like one without: in the
+    summary, beside the target, in the forecast and in the panel."""
     values = metrics([20.0, 31.0, 30.0], psnr_unmatched=25.0)
     summary = summarize_run(values, 30.5)
-    assert summary[0].startswith("held-out views: 31.00 dB (exposure fitted; 25.00 dB without), SSIM")
+    assert summary[0].startswith(
+        "held-out views: 31.00 dB (exposure fitted; 25.00 dB without), SSIM"
+    )
     assert summary[1] == "30.5 dB was reached (exposure fitted)"
     assert "(exposure fitted)" in summarize_run(values, 40.0)[1]
     rising = metrics([20.0, 25.0, 27.0, 28.0, 28.5], psnr_unmatched=25.0)
@@ -76,7 +81,9 @@ def test_targets_and_plateaus() -> None:
     """Catches a target that is reached and said to be missed, or the other way round."""
     assert "30 dB was reached" in summarize_run(metrics([20.0, 31.0, 29.0]), 30.0)
     missed = summarize_run(metrics([20.0, 25.0, 27.0, 28.0]), 30.0)[1]
-    assert missed.startswith("30 dB was not reached (best 28.00 dB): extrapolating the curve, it would take about")
+    assert missed.startswith(
+        "30 dB was not reached (best 28.00 dB): extrapolating the curve, it would take about"
+    )
     level = summarize_run(metrics([20.0, 25.0, *[24.0] * 10]), 30.0)
     assert "nothing was gained after 20 s, so more time would not help" in level[1]
     assert "nothing was gained after 20 s" in level[2]
@@ -87,23 +94,33 @@ def test_targets_and_plateaus() -> None:
 
 def test_report_of_a_finished_run(toy: Capture, tmp_path: Path) -> None:
     """Catches metrics that a run writes and the summary cannot read, and a missing picture."""
-    train(toy, tmp_path, Run(toy.root, None, "vhap", make_settings(iterations=12, hull_points=False, lattice=0)))
+    train(
+        toy,
+        tmp_path,
+        Run(toy.root, None, "vhap", make_settings(iterations=12, hull_points=False, lattice=0)),
+    )
     assert report_run(tmp_path)[0].startswith("held-out views: ")
     assert (tmp_path / CURVE).stat().st_size > 1000
 
 
-def test_the_reason_for_no_curve(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_for_no_curve(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a missing library blamed where there was nothing to draw, and the other way round."""
     run = Run(toy.root, None, "vhap", make_settings(iterations=3, hull_points=False, lattice=0))
     train(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)
-    assert report_run(tmp_path / "bare")[-1] == f"{CURVE} was not drawn: no held-out views (split 'val') were evaluated"
+    assert (
+        report_run(tmp_path / "bare")[-1]
+        == f"{CURVE} was not drawn: no held-out views (split 'val') were evaluated"
+    )
     train(toy, tmp_path / "run", run)
     monkeypatch.setattr(report, "find_spec", lambda name: None)
     assert report_run(tmp_path / "run")[-1] == f"{CURVE} was not drawn: matplotlib is not installed"
 
 
 def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a picture that comes only at the end, is drawn again without need, or takes more than its share."""
+    """Catches a picture that comes only at the end, is drawn again without need, or takes more than
+    its share."""
     now, drawn = [0.0], []
 
     def draw(folder: Path) -> None:

@@ -1,6 +1,8 @@
-"""Trains on a disk of its own until it is full, then on one that cannot be written; run by test_disks.py.
+"""Trains on a disk of its own until it is full, then on one that cannot be written; run by
+test_disks.py.
 
-`disk_driver.py DISK CAPTURE` prints one JSON object. DISK must be a small mount that nobody else sees.
+`disk_driver.py DISK CAPTURE` prints one JSON object. DISK must be a small mount that nobody else
+sees.
 """
 
 import json
@@ -47,9 +49,14 @@ def main(disk: Path, root: Path) -> dict[str, Any]:
             return str(error)
         return ""
 
-    found: dict[str, Any] = {"full": message(fill), "kept": checkpoints.read_checkpoint(out).iteration}
+    found: dict[str, Any] = {
+        "full": message(fill),
+        "kept": checkpoints.read_checkpoint(out).iteration,
+    }
     found["avatar"] = len(read_avatar(out / "avatar.npz").splats)
-    found["litter"] = [path.name for path in out.glob(".*")] + [path.name for path in out.glob("run.lock")]
+    found["litter"] = [path.name for path in out.glob(".*")] + [
+        path.name for path in out.glob("run.lock")
+    ]
     found["still full"] = message(resume=True)
     filler.unlink()
     remount = ["mount", "-o", "remount,{}", str(disk)]

@@ -1,8 +1,9 @@
 """Trains, is killed, and trains on, again and again; run by test_kills.py in a process of its own.
 
-`kill_driver.py FOLDER KILLS` prints one JSON object: what was found after each kill. Children are forked from a
-process that has compiled everything, so that a kill costs a fraction of a second; each opens the capture with which
-the process began and trains into the newest run folder with or without --resume, as a person would.
+`kill_driver.py FOLDER KILLS` prints one JSON object: what was found after each kill. Children are
+forked from a process that has compiled everything, so that a kill costs a fraction of a second;
+each opens the capture with which the process began and trains into the newest run folder with or
+without --resume, as a person would.
 """
 
 import contextlib
@@ -43,7 +44,9 @@ LONGEST_S = 0.3  # until a kill
 class Driver:
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.capture = open_capture(factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4)))
+        self.capture = open_capture(
+            factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4))
+        )
         busy = {
             "density_interval": 5,
             "density_span": (0.0, 1.0),
@@ -51,7 +54,9 @@ class Driver:
             "stray_limit": 0.3,
             "lattice": 1,
         }
-        self.run = Run(self.capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, **busy))
+        self.run = Run(
+            self.capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, **busy)
+        )
         self.reached = mmap.mmap(-1, 8)  # the child's last iteration, readable after its death
 
     def train(self, out: Path, resume: bool) -> None:
@@ -94,7 +99,8 @@ class Driver:
 
 
 def opened(out: Path, faces: int) -> dict[str, Any]:
-    """Read everything that a run folder may hold; "error" where something that exists cannot be read."""
+    """Read everything that a run folder may hold; "error" where something that exists cannot be
+    read."""
     found: dict[str, Any] = {"iteration": 0, "error": None}
     try:
         if (out / "run.json").exists():
@@ -111,8 +117,12 @@ def opened(out: Path, faces: int) -> dict[str, Any]:
 
 
 def same_bits(out: Path, expected: Path) -> bool:
-    ours, theirs = (arrays_of(checkpoints.read_checkpoint(folder).state) for folder in (out, expected))
-    return all(np.array_equal(ours[name].view(np.uint8), theirs[name].view(np.uint8)) for name in theirs)
+    ours, theirs = (
+        arrays_of(checkpoints.read_checkpoint(folder).state) for folder in (out, expected)
+    )
+    return all(
+        np.array_equal(ours[name].view(np.uint8), theirs[name].view(np.uint8)) for name in theirs
+    )
 
 
 def main(root: Path, kills: int) -> dict[str, Any]:
@@ -137,7 +147,9 @@ def main(root: Path, kills: int) -> dict[str, Any]:
     if out.exists() and not records[-1]["error"]:
         os.waitpid(driver.spawn(out, (out / "run.json").exists()), 0)
         finished.append(same_bits(out, whole))
-    litter = [path.name for path in root.glob("run*/.*")] + [path.name for path in root.glob("run*/run.lock")]
+    litter = [path.name for path in root.glob("run*/.*")] + [
+        path.name for path in root.glob("run*/run.lock")
+    ]
     return {"records": records, "finished": finished, "litter": litter}
 
 

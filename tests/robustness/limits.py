@@ -1,4 +1,5 @@
-"""What a reader may do with a file that is not for it: load it, or raise StgaError, quickly and in little memory."""
+"""What a reader may do with a file that is not for it: load it, or raise StgaError, quickly and in
+little memory."""
 
 import os
 import time
@@ -16,13 +17,15 @@ GIGA = 10**9
 
 
 def behaves(read: Callable[[], Any], folder: Path) -> str:
-    """The error's message, or "" where `read` loads. Fails on anything else, on a reader that takes more than a
-    second or 200 MB beyond the file itself, and on one that adds files to `folder` or beside it, or removes some."""
+    """The error's message, or "" where `read` loads. Fails on anything else, on a reader that takes
+    more than a second or 200 MB beyond the file itself, and on one that adds files to `folder` or
+    beside it, or removes some."""
     before = _listing(folder)
     begin = time.perf_counter()
     message = _message(read)
     seconds = time.perf_counter() - begin
-    # A busy machine may have stopped the process for a while: only a reader that is slow twice is slow.
+    # A busy machine may have stopped the process for a while: only a reader that is slow twice is
+    # slow.
     if seconds > SECONDS:
         begin = time.perf_counter()
         _message(read)
@@ -52,6 +55,11 @@ def _message(read: Callable[[], Any]) -> str:
 
 
 def _listing(folder: Path) -> list[str]:
-    """What is in a folder, at any depth, and what is beside it; the folders there are those of all other tests."""
-    inside = [os.path.join(base, name) for base, dirs, files in os.walk(folder) for name in (*dirs, *files)]
+    """What is in a folder, at any depth, and what is beside it; the folders there are those of all
+    other tests."""
+    inside = [
+        os.path.join(base, name)
+        for base, dirs, files in os.walk(folder)
+        for name in (*dirs, *files)
+    ]
     return sorted([*inside, *os.listdir(folder.parent)])

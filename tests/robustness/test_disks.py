@@ -37,19 +37,34 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def can_mount() -> bool:
     try:
-        return subprocess.run([*PRIVATE, "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True).returncode == 0
+        return (
+            subprocess.run(
+                [*PRIVATE, "mount", "-t", "tmpfs", "none", "/mnt"], capture_output=True
+            ).returncode
+            == 0
+        )
     except OSError:
         return False
 
 
 @pytest.mark.slow
 def test_a_full_and_a_read_only_disk(root: Path, tmp_path: Path) -> None:
-    """Catches a checkpoint destroyed by the one that did not fit, a traceback, and a run that cannot go on when there
-    is room again; on a real file system of 3 MB."""
+    """Catches a checkpoint destroyed by the one that did not fit, a traceback, and a run that
+    cannot go on when there is room again; on a real file system of 3 MB."""
     if not can_mount():
         pytest.skip("private mounts (unshare -rm) are not available")
     driver = str(Path(__file__).with_name("disk_driver.py"))
-    command = [*PRIVATE, "sh", "-c", SMALL_DISK, "sh", str(tmp_path), sys.executable, driver, str(root)]
+    command = [
+        *PRIVATE,
+        "sh",
+        "-c",
+        SMALL_DISK,
+        "sh",
+        str(tmp_path),
+        sys.executable,
+        driver,
+        str(root),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
@@ -65,8 +80,11 @@ def test_a_full_and_a_read_only_disk(root: Path, tmp_path: Path) -> None:
     assert (found["resumed"], found["end"]) == ("", ITERATIONS)
 
 
-def test_no_room_for_a_checkpoint(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches the same where no disk can be mounted: the system refuses every file above a size from one moment on."""
+def test_no_room_for_a_checkpoint(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches the same where no disk can be mounted: the system refuses every file above a size
+    from one moment on."""
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(run_module, "CHECKPOINT_S", 0.0)
     capture = open_capture(root)
@@ -79,7 +97,9 @@ def test_no_room_for_a_checkpoint(root: Path, tmp_path: Path, monkeypatch: pytes
         return False
 
     try:
-        with pytest.raises(StgaError, match=r"checkpoint\.npz: cannot be written \(File too large\)"):
+        with pytest.raises(
+            StgaError, match=r"checkpoint\.npz: cannot be written \(File too large\)"
+        ):
             train(capture, tmp_path, run, report=no_more)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -90,8 +110,11 @@ def test_no_room_for_a_checkpoint(root: Path, tmp_path: Path, monkeypatch: pytes
     assert read_checkpoint(tmp_path).iteration == ITERATIONS
 
 
-def test_an_error_when_the_data_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a rename before the data is known to be on the disk: network drives report a full one only then."""
+def test_an_error_when_the_data_reaches_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a rename before the data is known to be on the disk: network drives report a full one
+    only then."""
     write_json(tmp_path / "a.json", [1])
 
     def full(descriptor: int) -> None:
@@ -141,11 +164,15 @@ print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that start within a microsecond")
+@pytest.mark.skipif(
+    not hasattr(os, "fork"), reason="needs processes that start within a microsecond"
+)
 def test_never_two_in_one_folder(tmp_path: Path) -> None:
     """Catches two runs that both take over the lock of a third at the same moment."""
     with locked(tmp_path):
         pass
     (tmp_path / "run.lock").write_text("999999999")
-    done = subprocess.run([sys.executable, "-c", CROWD, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", CROWD, str(tmp_path)], capture_output=True, text=True, timeout=60
+    )
     assert done.stdout.strip() == str([0] * 8), done.stderr

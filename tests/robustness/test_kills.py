@@ -13,7 +13,9 @@ from .kill_driver import INTERVAL
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not hasattr(os, "fork"), reason="children are forked and killed with SIGKILL"),
+    pytest.mark.skipif(
+        not hasattr(os, "fork"), reason="children are forked and killed with SIGKILL"
+    ),
 ]
 KILLS = int(os.environ.get("STGA_KILLS", 32))
 
@@ -28,7 +30,8 @@ def outcome(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def test_the_folder_always_opens(outcome: dict[str, Any]) -> None:
-    """Catches a checkpoint, avatar, selection or metrics file that is half written when the process dies."""
+    """Catches a checkpoint, avatar, selection or metrics file that is half written when the process
+    dies."""
     records = outcome["records"]
     assert [record["error"] for record in records if record["error"]] == []
     assert sum(record["killed"] for record in records) == KILLS
@@ -39,7 +42,8 @@ def test_the_folder_always_opens(outcome: dict[str, Any]) -> None:
 def test_resuming_continues(outcome: dict[str, Any]) -> None:
     """Catches a folder that a kill leaves locked or unusable, and a run that loses its place.
 
-    Every run that came to its end in spite of the kills must hold the bits of one that nobody disturbed.
+    Every run that came to its end in spite of the kills must hold the bits of one that nobody
+    disturbed.
     """
     assert [record["code"] for record in outcome["records"] if record["code"]] == []
     assert outcome["finished"]
@@ -47,7 +51,8 @@ def test_resuming_continues(outcome: dict[str, Any]) -> None:
 
 
 def test_at_most_one_interval_is_lost(outcome: dict[str, Any]) -> None:
-    """Catches checkpoints that come late, and a new checkpoint that destroys the last one before it is whole."""
+    """Catches checkpoints that come late, and a new checkpoint that destroys the last one before it
+    is whole."""
     held: dict[int, int] = {}
     for record in outcome["records"]:
         # A step takes one second of the run's own clock.
@@ -57,5 +62,6 @@ def test_at_most_one_interval_is_lost(outcome: dict[str, Any]) -> None:
 
 
 def test_a_kill_leaves_no_litter_for_ever(outcome: dict[str, Any]) -> None:
-    """Catches half-written files that pile up, one a kill, until the disk is full; and a lock nobody holds."""
+    """Catches half-written files that pile up, one a kill, until the disk is full; and a lock
+    nobody holds."""
     assert outcome["litter"] == []

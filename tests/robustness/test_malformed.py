@@ -1,6 +1,8 @@
-"""Files made to break readers, beyond those of each reader's own tests: lies about size, impossible values.
+"""Files made to break readers, beyond those of each reader's own tests: lies about size, impossible
+values.
 
-Every case either loads or raises StgaError, in under a second and 200 MB, executes nothing and writes nothing.
+Every case either loads or raises StgaError, in under a second and 200 MB, executes nothing and
+writes nothing.
 """
 
 import json
@@ -65,7 +67,8 @@ LYING_ARRAYS = {
 
 @pytest.mark.parametrize("lie", LYING_ARRAYS)
 def test_arrays_that_lie(tmp_path: Path, lie: str) -> None:
-    """Catches memory allocated on the word of a header, and header parsers that fail with errors of their own."""
+    """Catches memory allocated on the word of a header, and header parsers that fail with errors of
+    their own."""
     path = archive(tmp_path / "a.npz", {"a.npy": LYING_ARRAYS[lie]})
     assert "a.npz: is not a readable npz" in behaves(lambda: read_npz(path), tmp_path)
     path = tmp_path / "a.npy"
@@ -87,7 +90,9 @@ def test_names_that_lead_outside(tmp_path: Path) -> None:
     """Catches an archive unpacked to disk by the names that its entries have."""
     inner = tmp_path / "inner"
     inner.mkdir()
-    path = archive(inner / "a.npz", {"../outside.npy": npy(shape=(1,), data=bytes(4)), "/tmp/x.npy": b""})
+    path = archive(
+        inner / "a.npz", {"../outside.npy": npy(shape=(1,), data=bytes(4)), "/tmp/x.npy": b""}
+    )
     behaves(lambda: read_npz(path), inner)
 
 
@@ -122,11 +127,14 @@ def view_of(path: Path, width: int, height: int) -> View:
     return View(0, 0, Camera(width, height, 10.0, 10.0, 2.0, 2.0, np.eye(4)), path.name, path)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs links, pipes and devices of a POSIX system")
+@pytest.mark.skipif(
+    sys.platform == "win32", reason="needs links, pipes and devices of a POSIX system"
+)
 @pytest.mark.parametrize("make", [link_to_itself, pipe, device, Path.mkdir])
 @pytest.mark.parametrize("reader", READERS)
 def test_what_is_no_file(tmp_path: Path, reader: str, make: Callable[[Path], None]) -> None:
-    """Catches readers that wait for ever on a pipe, fill the memory from a device, or trip over a link to itself."""
+    """Catches readers that wait for ever on a pipe, fill the memory from a device, or trip over a
+    link to itself."""
     name, read = READERS[reader]
     make(tmp_path / name)
     message = behaves(lambda: read(tmp_path / name), tmp_path)
@@ -134,7 +142,8 @@ def test_what_is_no_file(tmp_path: Path, reader: str, make: Callable[[Path], Non
 
 
 @pytest.mark.parametrize(
-    "reader", [name for name in READERS if name not in ("run", "checkpoint", "selection", "metrics")]
+    "reader",
+    [name for name in READERS if name not in ("run", "checkpoint", "selection", "metrics")],
 )
 @pytest.mark.parametrize("stem", ["nul\0byte", "\ud800", "x" * 5000])
 def test_names_no_file_can_have(tmp_path: Path, reader: str, stem: str) -> None:
@@ -191,20 +200,27 @@ FRAME_VALUES: dict[str, Any] = {
 
 @pytest.mark.parametrize("name", FRAME_VALUES)
 def test_frames(tmp_path: Path, name: str) -> None:
-    """Catches values that are valid JSON and nonsense: numbers beyond floats, paths beyond names, jumps in time."""
-    root = capture_with(tmp_path / "capture", lambda document: document["frames"][0].update(FRAME_VALUES[name]))
+    """Catches values that are valid JSON and nonsense: numbers beyond floats, paths beyond names,
+    jumps in time."""
+    root = capture_with(
+        tmp_path / "capture", lambda document: document["frames"][0].update(FRAME_VALUES[name])
+    )
     behaves(lambda: summarize_capture(open_capture(root)), tmp_path)
 
 
 @pytest.mark.parametrize("key", ["canonical_mesh_path", "regions_path"])
-@pytest.mark.parametrize("value", ["a\0b", "\ud800.obj", "x" * 5000 + ".obj", "../..", "/etc/passwd", ".", 3, ["a"]])
+@pytest.mark.parametrize(
+    "value", ["a\0b", "\ud800.obj", "x" * 5000 + ".obj", "../..", "/etc/passwd", ".", 3, ["a"]]
+)
 def test_files_of_the_top_level(tmp_path: Path, key: str, value: Any) -> None:
     """Catches the same in the paths that are not a frame's."""
     root = capture_with(tmp_path / "capture", lambda document: document.update({key: value}))
     assert behaves(lambda: open_capture(root), tmp_path)
 
 
-@pytest.mark.parametrize("name", ["images/00000_00.png", "meshes/00000.obj", "meshes/neutral.obj", "regions.json"])
+@pytest.mark.parametrize(
+    "name", ["images/00000_00.png", "meshes/00000.obj", "meshes/neutral.obj", "regions.json"]
+)
 def test_pipes_in_a_capture(tmp_path: Path, name: str) -> None:
     """Catches a capture that is never opened because it waits for a pipe."""
     root = factory.write_mesh_capture(tmp_path / "capture", (0, 1), (0, 1))
@@ -214,7 +230,8 @@ def test_pipes_in_a_capture(tmp_path: Path, name: str) -> None:
 
 
 def test_view_names_hold_no_backslashes(tmp_path: Path) -> None:
-    """Catches a rendering, named after its view, written outside its folder on Windows, where these are paths."""
+    """Catches a rendering, named after its view, written outside its folder on Windows, where these
+    are paths."""
     change = {"file_path": "a\\..\\images\\00000_00.png"}
     root = capture_with(tmp_path / "capture", lambda document: document["frames"][0].update(change))
     assert "\\" not in open_capture(root).views["train"][0].name
@@ -228,7 +245,9 @@ def test_view_names_hold_no_backslashes(tmp_path: Path) -> None:
 def test_splats_of_absurd_number(tmp_path: Path, count: str, layout: str) -> None:
     """Catches memory allocated for a billion splats that the file does not have."""
     path = tmp_path / "a.ply"
-    path.write_text(f"ply\nformat {layout} 1.0\nelement vertex {count}\nproperty float x\nend_header\n0 0 0\n")
+    path.write_text(
+        f"ply\nformat {layout} 1.0\nelement vertex {count}\nproperty float x\nend_header\n0 0 0\n"
+    )
     assert behaves(lambda: read_ply(path), tmp_path)
 
 
@@ -245,21 +264,29 @@ META_VALUES: dict[str, Any] = {
 
 @pytest.mark.parametrize("key", META_VALUES)
 def test_checkpoints_of_wrong_kinds(tmp_path: Path, key: str) -> None:
-    """Catches a checkpoint that loads and then fails, or trains for ever, in the middle of the resumed run."""
+    """Catches a checkpoint that loads and then fails, or trains for ever, in the middle of the
+    resumed run."""
     checkpoints.write_checkpoint(tmp_path, make_checkpoint())
     arrays = read_npz(tmp_path / "checkpoint.npz")
     for value in META_VALUES[key]:
         meta = {**json.loads(arrays["meta"].tobytes()), key: value}
-        np.savez(tmp_path / "checkpoint.npz", **{**arrays, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
+        np.savez(
+            tmp_path / "checkpoint.npz",
+            **{**arrays, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)},
+        )
         message = behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
         assert "checkpoint.npz: " in message, (key, value)
 
 
 @pytest.mark.parametrize("text", ['"text"', "3", "[]", "[" * 100_000, "null"])
 def test_meta_that_is_no_object(tmp_path: Path, text: str) -> None:
-    """Catches AttributeError and RecursionError where the header of a checkpoint is other JSON than an object."""
+    """Catches AttributeError and RecursionError where the header of a checkpoint is other JSON than
+    an object."""
     checkpoints.write_checkpoint(tmp_path, make_checkpoint())
-    arrays = {**read_npz(tmp_path / "checkpoint.npz"), "meta": np.frombuffer(text.encode(), np.uint8)}
+    arrays = {
+        **read_npz(tmp_path / "checkpoint.npz"),
+        "meta": np.frombuffer(text.encode(), np.uint8),
+    }
     np.savez(tmp_path / "checkpoint.npz", **arrays)
     assert "checkpoint.npz: " in behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
 
@@ -281,7 +308,11 @@ def test_a_checkpoint_of_an_odd_number_of_coefficients(tmp_path: Path) -> None:
     checkpoint = make_checkpoint()
     for part in ("parameters", "gradients", "first", "second"):
         old = getattr(checkpoint.state, part)
-        setattr(checkpoint.state, part, old._replace(sh=np.zeros((len(checkpoint.state), 7, 3), np.float32)))
+        setattr(
+            checkpoint.state,
+            part,
+            old._replace(sh=np.zeros((len(checkpoint.state), 7, 3), np.float32)),
+        )
     checkpoints.write_checkpoint(tmp_path, checkpoint)
     assert "7 coefficients" in behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
 
@@ -296,9 +327,12 @@ def test_selections_of_odd_timesteps(tmp_path: Path, name: str) -> None:
         assert behaves(lambda: checkpoints.read_selection(tmp_path, 5), tmp_path)
 
 
-@pytest.mark.parametrize("change", [{"lattice": 10**9}, {"views_per_visit": -1}, {"sh_steps": [[]]}], ids=repr)
+@pytest.mark.parametrize(
+    "change", [{"lattice": 10**9}, {"views_per_visit": -1}, {"sh_steps": [[]]}], ids=repr
+)
 def test_runs_with_impossible_settings(tmp_path: Path, change: dict[str, Any]) -> None:
-    """Catches a run.json whose numbers would fill the memory, read past an array's end or train for ever."""
+    """Catches a run.json whose numbers would fill the memory, read past an array's end or train for
+    ever."""
     run_folder.write_run(tmp_path, make_run())
     document = json.loads((tmp_path / "run.json").read_text())
     document["settings"].update(change)
@@ -312,7 +346,8 @@ LINE = {"seconds": 1.0, "splats": 80, "evaluation_s": 0.1, "wall_s": 1.0}
 
 @pytest.mark.parametrize("damage", METRICS)
 def test_metrics_after_a_power_cut(tmp_path: Path, damage: bytes) -> None:
-    """Catches a run that cannot be resumed because of a line of its log: what was whole before it stays."""
+    """Catches a run that cannot be resumed because of a line of its log: what was whole before it
+    stays."""
     metrics_log.append_metrics(tmp_path, {"iteration": 10, **LINE})
     with (tmp_path / "metrics.jsonl").open("ab") as out:
         out.write(damage)

@@ -1,4 +1,5 @@
-"""Pickles of FLAME models made to break their reader: lies about size, code that must not be executed."""
+"""Pickles of FLAME models made to break their reader: lies about size, code that must not be
+executed."""
 
 import pickle
 import struct
@@ -78,7 +79,8 @@ def test_shapes_that_are_none(tmp_path: Path, shape: tuple[Any, ...]) -> None:
 
 
 def test_a_pickle_leaves_nothing_behind(tmp_path: Path) -> None:
-    """Catches a file that changes how later files are read: pickles may set attributes of functions they name."""
+    """Catches a file that changes how later files are read: pickles may set attributes of functions
+    they name."""
     good, bad = tmp_path / "good.pkl", tmp_path / "bad.pkl"
     good.write_bytes(pickle.dumps(random_arrays(), 2))
     bad.write_bytes(PICKLES["changes a function"])

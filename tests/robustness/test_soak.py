@@ -1,4 +1,5 @@
-"""A long run at toy size with everything on: what only breaks after thousands of steps. STGA_SOAK sets how many."""
+"""A long run at toy size with everything on: what only breaks after thousands of steps. STGA_SOAK
+sets how many."""
 
 import hashlib
 import os
@@ -26,7 +27,8 @@ RSS_GROWTH = 24 << 20
 
 @dataclass
 class Soak:
-    """What a run left behind: fingerprints every MARK iterations, losses of global ones, and what was checked."""
+    """What a run left behind: fingerprints every MARK iterations, losses of global ones, and what
+    was checked."""
 
     marks: list[str] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
@@ -39,7 +41,9 @@ class Soak:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return open_capture(factory.write_mesh_capture(tmp_path_factory.mktemp("soak"), (0, 1, 3), range(4)))
+    return open_capture(
+        factory.write_mesh_capture(tmp_path_factory.mktemp("soak"), (0, 1, 3), range(4))
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -56,7 +60,8 @@ def resident() -> int:
 
 
 def soak(capture: Capture, until: int, on: int, seed: int = 0) -> Soak:
-    """Train `until` of ITERATIONS steps, each with another view and another random choice of triangles."""
+    """Train `until` of ITERATIONS steps, each with another view and another random choice of
+    triangles."""
     set_threads(on)
     settings = quick_settings(
         "selective", iterations=ITERATIONS, seed=seed, lattice=1, warm_up_share=0.02,
@@ -94,12 +99,16 @@ def _step(trainer: Trainer, view, image: np.ndarray, iteration: int, found: Soak
 
 def _mark(trainer: Trainer, found: Soak) -> None:
     state = bits(trainer.state)
-    found.marks.append(hashlib.sha256(b"".join(state[name].tobytes() for name in sorted(state))).hexdigest())
+    found.marks.append(
+        hashlib.sha256(b"".join(state[name].tobytes() for name in sorted(state))).hexdigest()
+    )
     found.memory.append(resident())
     found.counts.append(len(trainer.state))
     for part in ("parameters", "first", "second"):
         arrays = getattr(trainer.state, part)._asdict()
-        found.broken += [f"{part}/{name}" for name, array in arrays.items() if not np.isfinite(array).all()]
+        found.broken += [
+            f"{part}/{name}" for name, array in arrays.items() if not np.isfinite(array).all()
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +118,8 @@ def long(capture: Capture) -> Soak:
 
 
 def test_everything_was_on(long: Soak) -> None:
-    """Catches a soak that tests nothing: local and global steps, growth and pruning must all have happened."""
+    """Catches a soak that tests nothing: local and global steps, growth and pruning must all have
+    happened."""
     assert long.local > ITERATIONS // 3
     assert len(long.losses) > ITERATIONS // 4
     assert len(set(long.counts)) > 1
@@ -122,19 +132,23 @@ def test_numbers_stay_finite(long: Soak) -> None:
 
 
 def test_frozen_rows_stay_frozen(long: Soak) -> None:
-    """Catches a row that a local iteration changed though its triangle was not selected, by any bit, at any time."""
+    """Catches a row that a local iteration changed though its triangle was not selected, by any
+    bit, at any time."""
     assert long.thawed == []
 
 
 def test_the_loss_does_not_diverge(long: Soak) -> None:
-    """Catches training that gets worse: each tenth is no worse than a quarter above the best one before it."""
+    """Catches training that gets worse: each tenth is no worse than a quarter above the best one
+    before it."""
     tenths = [float(np.mean(part)) for part in np.array_split(long.losses, 10)]
     assert tenths[-1] < 0.5 * tenths[0]
     for n in range(1, 10):
         assert tenths[n] < 1.25 * min(tenths[:n]) + 1e-3
 
 
-@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="resident memory is read from /proc")
+@pytest.mark.skipif(
+    not os.path.exists("/proc/self/statm"), reason="resident memory is read from /proc"
+)
 def test_memory_is_flat(long: Soak) -> None:
     """Catches a buffer that grows with the number of steps; the first quarter may fill pools."""
     settled = long.memory[len(long.memory) // 4 :]
@@ -142,7 +156,8 @@ def test_memory_is_flat(long: Soak) -> None:
 
 
 def test_same_seed_same_bits_with_one_thread(capture: Capture, long: Soak) -> None:
-    """Catches sums whose order depends on threads, and random numbers that do not come from the seed."""
+    """Catches sums whose order depends on threads, and random numbers that do not come from the
+    seed."""
     third = ITERATIONS // 3 // MARK * MARK
     assert soak(capture, third, on=1).marks == long.marks[: third // MARK]
     assert soak(capture, MARK, on=3).marks == long.marks[:1]

@@ -17,6 +17,8 @@ def write_head_video(path: Path, frames: int, size: int = 256) -> None:
     center = model.v_template.mean(axis=0)
     with video_writer(path, 25) as write:
         for turn in np.radians(np.linspace(-20, 20, frames)):
-            about = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+            about = np.array(
+                [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+            )
             turned = (model.v_template - center) @ about.T + center
             write(shaded_image(turned, model.faces, front.scaled(size / front.width)))

@@ -28,22 +28,41 @@ def write_footage(folder, cameras, timesteps, picture):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(picture(camera, timestep)).save(folder / name)
             entry = {"file_path": name, "timestep_index": timestep, "camera_id": f"cam{number}"}
-            intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.height - camera.cy}
-            pose = {"transform_matrix": camera.camera_to_world_gl.tolist(), "w": camera.width, "h": camera.height}
+            intrinsics = {
+                "fl_x": camera.fl_x,
+                "fl_y": camera.fl_y,
+                "cx": camera.cx,
+                "cy": camera.height - camera.cy,
+            }
+            pose = {
+                "transform_matrix": camera.camera_to_world_gl.tolist(),
+                "w": camera.width,
+                "h": camera.height,
+            }
             frames.append({**entry, **intrinsics, **pose})
     write_json(folder / "transforms.json", {"frames": frames})
     return folder
 
 
-def record(folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8), timesteps=5):
-    """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2; returns its meshes.
+def record(
+    folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8), timesteps=5
+):
+    """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2;
+    returns its meshes.
 
     picture(mesh, camera) gives the pixels.
     """
     cameras, places = rig(), places_on(head, LANDMARKS)
     shape = np.zeros(head.model.n_identity)
-    meshes = [flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(timesteps)]
-    write_footage(folder / "footage", cameras, timesteps, lambda camera, timestep: picture(meshes[timestep], camera))
+    meshes = [
+        flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(timesteps)
+    ]
+    write_footage(
+        folder / "footage",
+        cameras,
+        timesteps,
+        lambda camera, timestep: picture(meshes[timestep], camera),
+    )
     write_flame(head.model, folder / "head.npz")
     write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
     for number, camera in enumerate(cameras):

@@ -10,7 +10,10 @@ WIDTH, HEIGHT = 40, 30
 
 def rig(count=3, width=WIDTH, height=HEIGHT):
     """Cameras on an arc about the origin."""
-    return [look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), width, height, 50.0) for a in 0.4 * np.arange(count)]
+    return [
+        look_at((np.sin(a), 0.2, np.cos(a)), (0, 0, 0), width, height, 50.0)
+        for a in 0.4 * np.arange(count)
+    ]
 
 
 def write_image(path, value=128, size=(WIDTH, HEIGHT)):
@@ -19,15 +22,20 @@ def write_image(path, value=128, size=(WIDTH, HEIGHT)):
 
 
 def write_video(path, values, size=(WIDTH, HEIGHT), rate=25, gop=5):
-    """A video whose frames are gray of the given values; every fifth is a key frame, and some refer to later ones."""
+    """A video whose frames are gray of the given values; every fifth is a key frame, and some refer
+    to later ones."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=rate, options={"g": str(gop), "bf": "2", "crf": "10"})
+        stream = container.add_stream(
+            "libx264", rate=rate, options={"g": str(gop), "bf": "2", "crf": "10"}
+        )
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         for value in values:
-            frame = av.VideoFrame.from_ndarray(np.full((size[1], size[0], 3), value, np.uint8), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(
+                np.full((size[1], size[0], 3), value, np.uint8), format="rgb24"
+            )
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
@@ -41,13 +49,19 @@ def quaternion(rotation):
 
 
 def write_colmap_text(folder, cameras, names, model="PINHOLE", parameters=None):
-    """A COLMAP model in text, one camera an image, as COLMAP writes it (comments, lines of points)."""
+    """A COLMAP model in text, one camera an image, as COLMAP writes it (comments, lines of
+    points)."""
     folder.mkdir(parents=True, exist_ok=True)
     lines, images = ["# Camera list"], ["# Image list with two lines of data per image:"]
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
         values = parameters or (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
-        lines.append(f"{number} {model} {camera.width} {camera.height} {' '.join(map(repr, map(float, values)))}")
+        lines.append(
+            f"{number} {model} {camera.width} {camera.height} {' '.join(map(repr, map(float, values)))}"
+        )
         pose = *quaternion(camera.world_to_camera[:3, :3]), *camera.world_to_camera[:3, 3]
-        images += [f"{number} {' '.join(map(repr, map(float, pose)))} {number} {name}", "1.5 2.5 -1" * (number % 2)]
+        images += [
+            f"{number} {' '.join(map(repr, map(float, pose)))} {number} {name}",
+            "1.5 2.5 -1" * (number % 2),
+        ]
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     (folder / "images.txt").write_text("\n".join(images) + "\n", encoding="utf-8")

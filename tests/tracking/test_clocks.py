@@ -19,11 +19,14 @@ def scene(seed, seconds=12.0):
     """Sound (N,) of speech-like bursts, and a gray level per 1/FPS second."""
     rng = np.random.default_rng(seed)
     loudness = np.repeat(rng.random(round(seconds * 12)) ** 4, SOUND_HZ // 12)
-    return loudness * rng.normal(0, 0.3, len(loudness)), np.round(rng.uniform(30, 220, round(seconds * FPS)))
+    return loudness * rng.normal(0, 0.3, len(loudness)), np.round(
+        rng.uniform(30, 220, round(seconds * FPS))
+    )
 
 
 def write_camera(path, sound, levels, start, seed, codec="pcm_s16le"):
-    """A recording of FRAMES frames from frame `start` of the scene on, with noise of its own; sound None: silent."""
+    """A recording of FRAMES frames from frame `start` of the scene on, with noise of its own; sound
+    None: silent."""
     rng = np.random.default_rng(seed)
     with av.open(str(path), "w") as container:
         video = container.add_stream("libx264", rate=FPS, options={"crf": "16"})
@@ -51,18 +54,34 @@ def footage(folder, starts, silent=(), codec="pcm_s16le", suffix=".mkv", seeds=(
     names = "abc"[: len(starts)]
     for number, (name, start) in enumerate(zip(names, starts, strict=True)):
         sound, levels = scene(seeds[number])
-        write_camera(folder / f"{name}{suffix}", None if name in silent else sound, levels, start, number, codec)
-    write_colmap_text(folder / "sparse/0", rig(len(starts), SIZE, SIZE), [f"{name}.png" for name in names])
+        write_camera(
+            folder / f"{name}{suffix}",
+            None if name in silent else sound,
+            levels,
+            start,
+            number,
+            codec,
+        )
+    write_colmap_text(
+        folder / "sparse/0", rig(len(starts), SIZE, SIZE), [f"{name}.png" for name in names]
+    )
     return folder
 
 
 @pytest.mark.parametrize(
     ("silent", "sync", "codec", "suffix"),
-    [((), "sound", "pcm_s16le", ".mkv"), ((), "auto", "aac", ".mp4"), (("b",), "auto", "pcm_s16le", ".mkv")],
+    [
+        ((), "sound", "pcm_s16le", ".mkv"),
+        ((), "auto", "aac", ".mp4"),
+        (("b",), "auto", "pcm_s16le", ".mkv"),
+    ],
 )
 def test_clocks_that_differ(tmp_path, silent, sync, codec, suffix):
-    """Catches an offset with the wrong sign, one that ignores where sound begins, and silence that stops it."""
-    found = open_footage(footage(tmp_path, (20, 33, 9), silent, codec, suffix), frames=FrameRange(sync=sync))
+    """Catches an offset with the wrong sign, one that ignores where sound begins, and silence that
+    stops it."""
+    found = open_footage(
+        footage(tmp_path, (20, 33, 9), silent, codec, suffix), frames=FrameRange(sync=sync)
+    )
     for camera, start in zip(found.cameras, (20, 33, 9), strict=True):
         assert camera.frames.numbers[found.timesteps[0]] + start == 33
     by = "motion" if silent else "sound"
@@ -74,12 +93,15 @@ def test_recordings_that_share_nothing(tmp_path):
     """Catches an offset that is made up."""
     footage(tmp_path, (20, 20), seeds=(5, 6))
     for sync in ("sound", "motion"):
-        with pytest.raises(StgaError, match=rf"b.mkv: its {sync} does not say when camera a recorded the same"):
+        with pytest.raises(
+            StgaError, match=rf"b.mkv: its {sync} does not say when camera a recorded the same"
+        ):
             open_footage(tmp_path, frames=FrameRange(sync=sync))
 
 
 def test_sound_that_is_asked_for_and_missing(tmp_path):
-    """Catches a traceback, motion used where sound was asked for, and a given offset that is replaced."""
+    """Catches a traceback, motion used where sound was asked for, and a given offset that is
+    replaced."""
     footage(tmp_path, (20, 33), silent="b")
     with pytest.raises(StgaError, match=r"b.mkv: has no sound; expected it for --sync sound"):
         open_footage(tmp_path, frames=FrameRange(sync="sound"))

@@ -27,21 +27,28 @@ def reconstruction():
         found.add_camera_with_trivial_rig(camera)
         pose = np.r_[RANDOM.standard_normal(4), RANDOM.standard_normal(3)]
         rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
-        points = pycolmap.Point2DList([pycolmap.Point2D(RANDOM.uniform(0, 400, 2)) for _ in range(number % 3)])
-        image = pycolmap.Image(name=f"cam {name}.jpg", image_id=number, camera_id=number, points2D=points)
+        points = pycolmap.Point2DList(
+            [pycolmap.Point2D(RANDOM.uniform(0, 400, 2)) for _ in range(number % 3)]
+        )
+        image = pycolmap.Image(
+            name=f"cam {name}.jpg", image_id=number, camera_id=number, points2D=points
+        )
         found.add_image_with_trivial_frame(image, rigid)
     return found
 
 
 @pytest.mark.parametrize("kind", ["text", "binary"])
 def test_projections_are_colmaps(tmp_path, kind):
-    """Catches any model, text or binary, whose coefficients, pose or principal point are read as another's."""
+    """Catches any model, text or binary, whose coefficients, pose or principal point are read as
+    another's."""
     model = reconstruction()
     getattr(model, f"write_{kind}")(str(tmp_path))
     shots = read_colmap(tmp_path)
     assert [shot.label for shot in shots] == sorted(f"cam {name}.jpg" for name in LENSES)
     local = np.c_[RANDOM.uniform(-0.5, 0.5, (20, 2)), np.ones(20)] * RANDOM.uniform(1, 3, (20, 1))
-    for shot, image in zip(shots, sorted(model.images.values(), key=lambda image: image.name), strict=True):
+    for shot, image in zip(
+        shots, sorted(model.images.values(), key=lambda image: image.name), strict=True
+    ):
         pose = image.cam_from_world().matrix()
         world = (local - pose[:, 3]) @ pose[:, :3]
         expected = image.camera.img_from_cam(local)
@@ -53,7 +60,8 @@ def test_projections_are_colmaps(tmp_path, kind):
 
 
 def test_model_beside_the_images(tmp_path):
-    """Catches COLMAP's usual folders not being found, and images without points that shift the lines after them."""
+    """Catches COLMAP's usual folders not being found, and images without points that shift the
+    lines after them."""
     names = ["left.png", "middle.png", "right.png"]
     write_colmap_text(tmp_path / "sparse/0", rig(), names)
     for number, name in enumerate(names):
@@ -62,7 +70,9 @@ def test_model_beside_the_images(tmp_path):
     assert [camera.name for camera in footage.cameras] == ["left", "middle", "right"]
     assert [camera.image(0)[0, 0, 0] for camera in footage.cameras] == [0, 50, 100]
     for camera, expected in zip(footage.cameras, rig(), strict=True):
-        np.testing.assert_allclose(camera.camera.world_to_camera, expected.world_to_camera, atol=1e-9)
+        np.testing.assert_allclose(
+            camera.camera.world_to_camera, expected.world_to_camera, atol=1e-9
+        )
 
 
 DIGITS = "9" * 5000
@@ -72,21 +82,86 @@ DEPTH = repr(float(rig(1)[0].world_to_camera[2, 3]))
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
-        ("cameras", "PINHOLE", "EQUIRECTANGULAR", r"cameras.txt: camera 1: model 'EQUIRECTANGULAR' is not one of"),
-        ("cameras", "PINHOLE", "OPENCV", r"cameras.txt: camera 1: expected 8 parameters of OPENCV, not 4"),
+        (
+            "cameras",
+            "PINHOLE",
+            "EQUIRECTANGULAR",
+            r"cameras.txt: camera 1: model 'EQUIRECTANGULAR' is not one of",
+        ),
+        (
+            "cameras",
+            "PINHOLE",
+            "OPENCV",
+            r"cameras.txt: camera 1: expected 8 parameters of OPENCV, not 4",
+        ),
         ("cameras", "50.0", "nan", r"cameras.txt: line 2: expected finite numbers"),
-        ("cameras", "50.0", "0", r"image 'left.png': expected a focal length of 1 to 1e7 pixels, not 0, 0"),
-        ("cameras", f" {WIDTH} {HEIGHT} ", " 0 30 ", r"image 'left.png': expected an image size in pixels, not 0 x 30"),
-        ("images", " 2 right.png", " 7 right.png", r"image 'right.png': names camera 7, which .*cameras.txt does not"),
+        (
+            "cameras",
+            "50.0",
+            "0",
+            r"image 'left.png': expected a focal length of 1 to 1e7 pixels, not 0, 0",
+        ),
+        (
+            "cameras",
+            f" {WIDTH} {HEIGHT} ",
+            " 0 30 ",
+            r"image 'left.png': expected an image size in pixels, not 0 x 30",
+        ),
+        (
+            "images",
+            " 2 right.png",
+            " 7 right.png",
+            r"image 'right.png': names camera 7, which .*cameras.txt does not",
+        ),
         ("images", " 2 right.png", " 2 left.png", r"image 'left.png': two cameras are named left"),
-        ("images", " 1 left.png", " 1 gone.png", r"has no image, folder or video of the name 'gone.png'"),
-        ("images", " 1 left.png", "", r"images.txt: line 2: expected number, quaternion, translation, camera and name"),
-        ("images", " 1 left.png", f" 1 {DIGITS}.png", r"has no image, folder or video of the name '999"),
-        ("images", " 1 left.png", f" 1 {'a/' * 30000}.png", r"has no image, folder or video of the name 'a/a/"),
-        ("images", " 1 left.png", f" {DIGITS} left.png", r"images.txt: line 2: expected a whole number, not '999"),
-        ("cameras", "1 PINHOLE", f"{DIGITS} PINHOLE", r"cameras.txt: line 2: expected a whole number, not '999"),
-        ("images", DEPTH, "1e308", r"image 'left.png': expected a camera within 1e\+12 units of the origin"),
-        ("cameras", " 20.0", " 1e308", r"image 'left.png': expected a principal point within 1e\+07 pixels"),
+        (
+            "images",
+            " 1 left.png",
+            " 1 gone.png",
+            r"has no image, folder or video of the name 'gone.png'",
+        ),
+        (
+            "images",
+            " 1 left.png",
+            "",
+            r"images.txt: line 2: expected number, quaternion, translation, camera and name",
+        ),
+        (
+            "images",
+            " 1 left.png",
+            f" 1 {DIGITS}.png",
+            r"has no image, folder or video of the name '999",
+        ),
+        (
+            "images",
+            " 1 left.png",
+            f" 1 {'a/' * 30000}.png",
+            r"has no image, folder or video of the name 'a/a/",
+        ),
+        (
+            "images",
+            " 1 left.png",
+            f" {DIGITS} left.png",
+            r"images.txt: line 2: expected a whole number, not '999",
+        ),
+        (
+            "cameras",
+            "1 PINHOLE",
+            f"{DIGITS} PINHOLE",
+            r"cameras.txt: line 2: expected a whole number, not '999",
+        ),
+        (
+            "images",
+            DEPTH,
+            "1e308",
+            r"image 'left.png': expected a camera within 1e\+12 units of the origin",
+        ),
+        (
+            "cameras",
+            " 20.0",
+            " 1e308",
+            r"image 'left.png': expected a principal point within 1e\+07 pixels",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -109,7 +184,11 @@ def test_binary_files_cut_short(tmp_path, file):
     reconstruction().write_binary(str(tmp_path))
     data = (tmp_path / file).read_bytes()
     huge = data[:-8] + b"\xff" * 8  # the last number of points, where it is one
-    for cut in [*(data[:length] for length in range(0, 60, 7)), data[:-9], *([huge] if file == "images.bin" else [])]:
+    for cut in [
+        *(data[:length] for length in range(0, 60, 7)),
+        data[:-9],
+        *([huge] if file == "images.bin" else []),
+    ]:
         (tmp_path / file).write_bytes(cut)
         with pytest.raises(StgaError, match=re.escape(f"{tmp_path / file}: ")):
             read_colmap(tmp_path)

@@ -19,17 +19,23 @@ def textures():
 
     random, walls = np.random.default_rng(1), []
     for _ in range(3):
-        layers = [cv2.resize(random.normal(size=(n, n)), (TEXELS, TEXELS)) for n in (8, 32, 128, 512)]
+        layers = [
+            cv2.resize(random.normal(size=(n, n)), (TEXELS, TEXELS)) for n in (8, 32, 128, 512)
+        ]
         total = sum(layers)
         walls.append(((total - total.min()) / np.ptp(total) * 255).astype(np.float32))
     return walls
 
 
 def rendered(camera, rays, walls):
-    """Gray image (H, W) of a room's corner (x = -1, y = -1, z = -1), seen along rays (H, W, 2), (x, y) / depth."""
+    """Gray image (H, W) of a room's corner (x = -1, y = -1, z = -1), seen along rays (H, W, 2), (x,
+    y) / depth."""
     import cv2
 
-    directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1) @ camera.world_to_camera[:3, :3]
+    directions = (
+        np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+        @ camera.world_to_camera[:3, :3]
+    )
     with np.errstate(divide="ignore"):
         reach = (-1 - camera.position) / directions
     reach[reach <= 0] = np.inf
@@ -37,7 +43,9 @@ def rendered(camera, rays, walls):
     points = camera.position + directions * reach.min(axis=-1)[..., None]
     image = np.zeros(rays.shape[:2], np.float32)
     for wall, texture in enumerate(walls):
-        u, v = np.moveaxis((np.delete(points, wall, axis=-1) + 1.0) / 3 * TEXELS, -1, 0).astype(np.float32)
+        u, v = np.moveaxis((np.delete(points, wall, axis=-1) + 1.0) / 3 * TEXELS, -1, 0).astype(
+            np.float32
+        )
         image = np.where(nearest == wall, cv2.remap(texture, u, v, cv2.INTER_LINEAR), image)
     return image
 
@@ -68,7 +76,8 @@ def similarity(source, target):
 
 @pytest.mark.slow
 def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
-    """Catches any step from COLMAP's files to pinhole images that is off: pose, lens, principal point, resampling."""
+    """Catches any step from COLMAP's files to pinhole images that is off: pose, lens, principal
+    point, resampling."""
     pytest.importorskip("cv2")
     pycolmap = pytest.importorskip("pycolmap")
     walls = textures()
@@ -84,17 +93,24 @@ def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
     database = str(tmp_path / "database.db")
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
     pycolmap.extract_features(
-        database, str(tmp_path / "images"), camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader
+        database,
+        str(tmp_path / "images"),
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
     )
     pycolmap.match_exhaustive(database)
     (tmp_path / "sparse").mkdir()
-    models = pycolmap.incremental_mapping(database, str(tmp_path / "images"), str(tmp_path / "sparse"))
+    models = pycolmap.incremental_mapping(
+        database, str(tmp_path / "images"), str(tmp_path / "sparse")
+    )
     assert len(models) == 1
 
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == [str(n) for n in range(len(truth))]
     positions = np.array([camera.camera.position for camera in footage.cameras])
-    scale, rotation, translation = similarity(positions, np.array([camera.position for camera in truth]))
+    scale, rotation, translation = similarity(
+        positions, np.array([camera.position for camera in truth])
+    )
     for found, expected in zip(footage.cameras, truth, strict=True):
         aligned = scale * rotation @ found.camera.position + translation
         np.testing.assert_allclose(aligned, expected.position, atol=0.02)

@@ -23,18 +23,26 @@ def ball(timestep):
 
 
 def footage(folder, cameras, timesteps):
-    """Images in which the ball is white on black, by its exact outline; red says the camera, green the timestep."""
+    """Images in which the ball is white on black, by its exact outline; red says the camera, green
+    the timestep."""
     found = []
     for number in range(cameras):
         camera = look_at((0.2 * number, 0.1, 1.0), (0, 0, 0), SIZE, SIZE, 400.0)
         views = {}
         for t in range(timesteps):
             y, x = np.mgrid[:SIZE, :SIZE] + 0.5
-            rays = np.stack([(x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y, np.ones_like(x)], axis=-1)
-            center = camera.world_to_camera[:3, :3] @ [0.02 * t, 0, 0] + camera.world_to_camera[:3, 3]
+            rays = np.stack(
+                [(x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y, np.ones_like(x)],
+                axis=-1,
+            )
+            center = (
+                camera.world_to_camera[:3, :3] @ [0.02 * t, 0, 0] + camera.world_to_camera[:3, 3]
+            )
             along = rays @ center / np.linalg.norm(rays, axis=-1)
             covered = center @ center - along**2 < 0.1**2
-            image = np.where(covered[..., None], 255, np.array([20 * number, 20 * t, 0])).astype(np.uint8)
+            image = np.where(covered[..., None], 255, np.array([20 * number, 20 * t, 0])).astype(
+                np.uint8
+            )
             path = folder / f"{number}_{t}.png"
             Image.fromarray(image).save(path)
             views[t] = View(t, number, camera, path.name, path)
@@ -49,7 +57,8 @@ def write(folder, take, errors, misfit=None):
 
 
 def pictures(sheet, count):
-    """The pictures of each view: as recorded, and with the mesh, from the positions of the tiles."""
+    """The pictures of each view: as recorded, and with the mesh, from the positions of the
+    tiles."""
     width, height = PICTURE
     top = sheet.shape[0] - 12 - (-(-count // COLUMNS)) * (height + 18 + 8)
     for number in range(count):
@@ -59,7 +68,8 @@ def pictures(sheet, count):
 
 
 def test_worst_views_first(tmp_path):
-    """Catches views in the order of cameras, or the best ones, and a picture of another timestep."""
+    """Catches views in the order of cameras, or the best ones, and a picture of another
+    timestep."""
     take = footage(tmp_path, 2, 3)
     errors = {"cam0": {0: 1.0, 2: 5.0}, "cam1": {0: 2.0, 1: 9.0, 2: 0.5}}
     sheet = write(tmp_path, take, errors)
@@ -68,13 +78,20 @@ def test_worst_views_first(tmp_path):
 
 
 def test_what_images_do_not_explain_counts_beside_landmarks(tmp_path):
-    """Catches a sheet that hides the timesteps at which landmarks and head agree on what the images do not show."""
+    """Catches a sheet that hides the timesteps at which landmarks and head agree on what the images
+    do not show."""
     take = footage(tmp_path, 1, 4)
     errors = {"cam0": {0: 1.0, 1: 1.3, 2: 1.0, 3: 1.0}}
-    sheet = write(tmp_path, take, errors, {"mouth": {0: 0.1, 1: 0.1, 2: 0.4, 3: 0.1}, "eyes": {0: 0.05, 3: 0.15}})
+    sheet = write(
+        tmp_path,
+        take,
+        errors,
+        {"mouth": {0: 0.1, 1: 0.1, 2: 0.4, 3: 0.1}, "eyes": {0: 0.05, 3: 0.15}},
+    )
     corners = [plain[3, 3, 1] for plain, _ in pictures(sheet, 4)]
     assert corners == [40, 60, 20, 0]
-    assert len(sheet) == len(write(tmp_path, take, errors)) + 2 * 12  # a row of the chart for each region
+    # a row of the chart for each region
+    assert len(sheet) == len(write(tmp_path, take, errors)) + 2 * 12
 
 
 def test_mesh_lies_on_the_head(tmp_path):
@@ -82,12 +99,19 @@ def test_mesh_lies_on_the_head(tmp_path):
     take = footage(tmp_path, 2, 2)
     sheet = write(tmp_path, take, {"cam0": {1: 1.0}, "cam1": {0: 2.0}})
     for plain, drawn in pictures(sheet, 2):
-        head, changed = plain.min(axis=2) > 128, np.abs(plain - drawn).max(axis=2) > 255 * MESH_OPACITY / 8
+        head, changed = (
+            plain.min(axis=2) > 128,
+            np.abs(plain - drawn).max(axis=2) > 255 * MESH_OPACITY / 8,
+        )
         assert head.mean() > 0.3
         assert (head ^ changed)[:, :190].mean() < 0.02
         y, x = (int(np.mean(axis)) for axis in np.nonzero(head))
-        assert drawn[y, x, 2] > drawn[y, x, 0]  # where the surface faces the camera, its color is blue
-        assert drawn[head.any(axis=1).argmax() + 12, x, 1] > drawn[y + (y - head.any(axis=1).argmax()) - 12, x, 1]
+        # where the surface faces the camera, its color is blue
+        assert drawn[y, x, 2] > drawn[y, x, 0]
+        assert (
+            drawn[head.any(axis=1).argmax() + 12, x, 1]
+            > drawn[y + (y - head.any(axis=1).argmax()) - 12, x, 1]
+        )
 
 
 def test_what_a_matte_leaves_out_is_green(tmp_path):
@@ -97,7 +121,10 @@ def test_what_a_matte_leaves_out_is_green(tmp_path):
     half[:, : SIZE // 2] = 255
     Image.fromarray(half).save(tmp_path / "matte.png")
     matted = replace(take, cameras=(replace(take.cameras[0], mattes={0: tmp_path / "matte.png"}),))
-    plain, shown = (next(iter(pictures(write(tmp_path, each, {"cam0": {0: 1.0}}), 1)))[0] for each in (take, matted))
+    plain, shown = (
+        next(iter(pictures(write(tmp_path, each, {"cam0": {0: 1.0}}), 1)))[0]
+        for each in (take, matted)
+    )
     np.testing.assert_array_equal(shown[:180, :85], plain[:180, :85])
     assert (shown[:180, 115:190, 1] > shown[:180, 115:190, 0] + 40).all()
 

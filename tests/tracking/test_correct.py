@@ -42,7 +42,8 @@ def correct(keys, span=5, seen=None):
 
 
 def test_a_key_moves_its_neighbors_and_nothing_else():
-    """Catches a correction that pops for one frame, spreads over the take, or is pulled back by the landmarks."""
+    """Catches a correction that pops for one frame, spreads over the take, or is pulled back by the
+    landmarks."""
     change = correct({12: opened(12, 0.3)}) - TAKE
     np.testing.assert_allclose(change[12], np.eye(TAKE.shape[1])[JAW] * 0.3, atol=1e-12)
     np.testing.assert_array_equal(change[:7], 0)
@@ -63,10 +64,12 @@ def test_frames_without_landmarks_follow_more():
 
 
 @pytest.mark.parametrize(
-    "keys", [{0: 0.2}, {29: 0.2}, {10: 0.2, 11: -0.1}, {3: 0.1, 25: 0.2}, dict.fromkeys(range(30), 0.1)]
+    "keys",
+    [{0: 0.2}, {29: 0.2}, {10: 0.2, 11: -0.1}, {3: 0.1, 25: 0.2}, dict.fromkeys(range(30), 0.1)],
 )
 def test_keys_anywhere(keys):
-    """Catches ends of the take, neighboring keys and keys everywhere, where there is nothing left to solve."""
+    """Catches ends of the take, neighboring keys and keys everywhere, where there is nothing left
+    to solve."""
     given = {timestep: opened(timestep, angle) for timestep, angle in keys.items()}
     found = correct(given)
     for timestep, values in given.items():
@@ -94,19 +97,24 @@ def parameters_in(out, model):
 
 
 def test_a_corrected_capture_shows_the_key(tracked):
-    """Catches a key in other units or order than the files, and a report that is still that of before."""
+    """Catches a key in other units or order than the files, and a report that is still that of
+    before."""
     out, model, before = tracked
     report = read_json(out / "tracking.json")
     key = before[1].copy()
     key[HEAD.model.n_expression + 1] += 0.3  # turns the head
     correct_capture(out, model, {1: key}, span=1)
     capture = open_capture(out, model)
-    expected = flame_forward(capture.flame.model, capture.flame.shape, frame_of(key), capture.flame.static_offset)
+    expected = flame_forward(
+        capture.flame.model, capture.flame.shape, frame_of(key), capture.flame.static_offset
+    )
     np.testing.assert_allclose(capture.mesh(1), expected, atol=1e-6)
     np.testing.assert_allclose(parameters_in(out, model)[3:], before[3:], atol=1e-7)
     after = read_json(out / "tracking.json")
     assert after["reprojection_px"]["cam0"]["1"] > report["reprojection_px"]["cam0"]["1"] + 0.5
-    assert abs(after["reprojection_px"]["cam0"]["4"] - report["reprojection_px"]["cam0"]["4"]) < 0.02
+    assert (
+        abs(after["reprojection_px"]["cam0"]["4"] - report["reprojection_px"]["cam0"]["4"]) < 0.02
+    )
     correct_capture(out, model, {})
     np.testing.assert_allclose(parameters_in(out, model), before, atol=1e-7)
 
@@ -158,25 +166,77 @@ DAMAGES = {
     "interpolated number": (changed(REPORT_FILE, interpolated=3), REPORT_FILE, INTERPOLATED),
     "interpolated lists": (changed(REPORT_FILE, interpolated=[[1]]), REPORT_FILE, INTERPOLATED),
     "interpolated texts": (changed(REPORT_FILE, interpolated=["2"]), REPORT_FILE, INTERPOLATED),
-    "misfit of lists": (changed(REPORT_FILE, image_misfit={"lower face": [0.1]}), REPORT_FILE, MISFIT),
-    "misfit of texts": (changed(REPORT_FILE, image_misfit={"lower face": {"0": "much"}}), REPORT_FILE, MISFIT),
-    "interpolated not a number": (changed(REPORT_FILE, interpolated=[float("nan")]), REPORT_FILE, INTERPOLATED),
+    "misfit of lists": (
+        changed(REPORT_FILE, image_misfit={"lower face": [0.1]}),
+        REPORT_FILE,
+        MISFIT,
+    ),
+    "misfit of texts": (
+        changed(REPORT_FILE, image_misfit={"lower face": {"0": "much"}}),
+        REPORT_FILE,
+        MISFIT,
+    ),
+    "interpolated not a number": (
+        changed(REPORT_FILE, interpolated=[float("nan")]),
+        REPORT_FILE,
+        INTERPOLATED,
+    ),
     "solved empty": (replaced(SOLVED_FILE, b""), SOLVED_FILE, "is not a readable npz"),
-    "solved folder": (lambda out: (out / SOLVED_FILE).mkdir(), SOLVED_FILE, "is not a regular file"),
+    "solved folder": (
+        lambda out: (out / SOLVED_FILE).mkdir(),
+        SOLVED_FILE,
+        "is not a regular file",
+    ),
     **{
-        f"solved {name}": (lambda out, arrays=arrays: write_npz(out / SOLVED_FILE, arrays), SOLVED_FILE, message)
+        f"solved {name}": (
+            lambda out, arrays=arrays: write_npz(out / SOLVED_FILE, arrays),
+            SOLVED_FILE,
+            message,
+        )
         for name, arrays, message in (
             ("without parameters", {"timesteps": np.arange(5)}, PARAMETERS),
             ("of fewer timesteps", {"timesteps": np.arange(5), "parameters": TAKE[:4]}, PARAMETERS),
             ("flat", {"timesteps": np.arange(5), "parameters": TAKE[:5].ravel()}, PARAMETERS),
-            ("as text", {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(str)}, PARAMETERS),
-            ("as complex", {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(complex)}, PARAMETERS),
-            ("not a number", {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.nan)}, PARAMETERS),
-            ("infinite", {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.inf, "f4")}, PARAMETERS),
-            ("astronomic", {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), 1e300)}, PARAMETERS),
-            ("without timesteps", {"parameters": TAKE[:5]}, "timesteps: expected those of the capture"),
-            ("of others", {"timesteps": np.arange(5) + 7, "parameters": TAKE[:5]}, "timesteps: expected those"),
-            ("of names", {"timesteps": np.array(list("01234")), "parameters": TAKE[:5]}, "timesteps: expected those"),
+            (
+                "as text",
+                {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(str)},
+                PARAMETERS,
+            ),
+            (
+                "as complex",
+                {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(complex)},
+                PARAMETERS,
+            ),
+            (
+                "not a number",
+                {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.nan)},
+                PARAMETERS,
+            ),
+            (
+                "infinite",
+                {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.inf, "f4")},
+                PARAMETERS,
+            ),
+            (
+                "astronomic",
+                {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), 1e300)},
+                PARAMETERS,
+            ),
+            (
+                "without timesteps",
+                {"parameters": TAKE[:5]},
+                "timesteps: expected those of the capture",
+            ),
+            (
+                "of others",
+                {"timesteps": np.arange(5) + 7, "parameters": TAKE[:5]},
+                "timesteps: expected those",
+            ),
+            (
+                "of names",
+                {"timesteps": np.array(list("01234")), "parameters": TAKE[:5]},
+                "timesteps: expected those",
+            ),
         )
     },
     "no landmark counts": (unconfident, LANDMARKS_FOLDER, "has no landmarks of a face"),
@@ -185,7 +245,8 @@ DAMAGES = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_capture_is_named(tracked, tmp_path, capsys, name):
-    """Catches a traceback, a warning of NumPy's, or heads that are overwritten from damaged files."""
+    """Catches a traceback, a warning of NumPy's, or heads that are overwritten from damaged
+    files."""
     out, model, before = tracked
     damage, file, message = DAMAGES[name]
     shutil.copytree(out, tmp_path / "out")
@@ -199,11 +260,15 @@ def test_a_damaged_capture_is_named(tracked, tmp_path, capsys, name):
     np.testing.assert_array_equal(parameters_in(tmp_path / "out", model), before)
 
 
-@pytest.mark.parametrize("key", [np.zeros(3), np.full(SIZE, np.nan), np.full(SIZE, 1e300), np.full(SIZE, "x")])
+@pytest.mark.parametrize(
+    "key", [np.zeros(3), np.full(SIZE, np.nan), np.full(SIZE, 1e300), np.full(SIZE, "x")]
+)
 def test_a_key_that_is_none_is_named(tracked, tmp_path, capsys, key):
     """Catches heads that are written from a request whose arrays are damaged."""
     out, model, before = tracked
     write_request(tmp_path / "job", SolveAgain(out, model, {1: key}))
     assert main(["perform", str(tmp_path / "job")]) == 2
-    assert re.search(rf"key at timestep 1: expected \({SIZE},\) finite numbers", capsys.readouterr().err)
+    assert re.search(
+        rf"key at timestep 1: expected \({SIZE},\) finite numbers", capsys.readouterr().err
+    )
     np.testing.assert_array_equal(parameters_in(out, model), before)

@@ -1,4 +1,5 @@
-"""Dense tracking against a generated take whose meshes are known, with landmarks that fail where a detector's do."""
+"""Dense tracking against a generated take whose meshes are known, with landmarks that fail where a
+detector's do."""
 
 from dataclasses import dataclass, replace
 
@@ -57,15 +58,24 @@ def frame_at(opening, timestep):
     expr[timestep % 3] = 0.3
     turn = np.array([0.03 * np.sin(timestep), 0.15 * np.sin(0.8 * timestep), 0.0])
     return FlameFrame(
-        expr, turn, np.zeros(3), np.array([opening, 0, 0]), np.array([0.004, 0, 0]) * timestep, np.zeros(6)
+        expr,
+        turn,
+        np.zeros(3),
+        np.array([opening, 0, 0]),
+        np.array([0.004, 0, 0]) * timestep,
+        np.zeros(6),
     )
 
 
 def skin_texture(rest):
-    """(V, 1) factor of skin's colors: waves of 6 to 30 mm, since the small head's painted chin is of one color."""
+    """(V, 1) factor of skin's colors: waves of 6 to 30 mm, since the small head's painted chin is
+    of one color."""
     rng = np.random.default_rng(3)
     waves = [(0.006, 0.02), (0.010, 0.03), (0.018, 0.03), (0.03, 0.03)] * 4
-    phase = [np.sin(2 * np.pi * rest @ (rng.normal(size=3) / 1.7) / length + rng.uniform(0, 6)) for length, _ in waves]
+    phase = [
+        np.sin(2 * np.pi * rest @ (rng.normal(size=3) / 1.7) / length + rng.uniform(0, 6))
+        for length, _ in waves
+    ]
     return 1 + sum(amount * own for (_, amount), own in zip(waves, phase, strict=True))[:, None]
 
 
@@ -79,7 +89,10 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
     for t in (3, 6) if brows else ():
         frames[t].expr[BROWS_UP if brows > 0 else BROWS_DOWN] = abs(brows)
     colors = np.clip(tint ** (1 / 1.8) * skin_texture(pictured.v_template), 0, 1)
-    cameras = [look_at((1.1 * np.sin(a), 0.05, 1.1 * np.cos(a)), (0, -0.02, 0), *size, 3.7 * size[0]) for a in eyes]
+    cameras = [
+        look_at((1.1 * np.sin(a), 0.05, 1.1 * np.cos(a)), (0, -0.02, 0), *size, 3.7 * size[0])
+        for a in eyes
+    ]
     meshes, landmarks, pictures = [], {}, {}
     places = places_on(head, 300)
     wrong = rng.normal(0, 0.001, (300, 3))
@@ -91,7 +104,11 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
         meshes.append(mesh)
         landmarks[t] = seen(cameras, points, noise=0.4, seed=t)
         pictures[t] = [(c, shaded_image(fine, pictured.faces, c, colors)) for c in cameras]
-    return Scene(head, meshes, RecordedTake(places, np.ones(300, bool), landmarks, Pictures(pictures), metric=True))
+    return Scene(
+        head,
+        meshes,
+        RecordedTake(places, np.ones(300, bool), landmarks, Pictures(pictures), metric=True),
+    )
 
 
 def jaw_errors(take, fit):
@@ -110,25 +127,31 @@ def errors_of(moved, take, fit):
     world = fit.to_capture
     errors = []
     for t, true in enumerate(take.meshes):
-        found = (posed_mesh(fit, fit.parameters[t]) - world.translation) @ world.rotation / world.scale
+        found = (
+            (posed_mesh(fit, fit.parameters[t]) - world.translation) @ world.rotation / world.scale
+        )
         errors.append(1000 * np.linalg.norm(found[: len(true)] - true, axis=1)[moved].mean())
     return np.array(errors)
 
 
 def test_texture_is_free_of_lighting_and_distrusts_what_changes():
-    """Catches shading baked into the texture, which a jaw that turns would be compared with, and hands and hair that
-    count like skin."""
+    """Catches shading baked into the texture, which a jaw that turns would be compared with, and
+    hands and hair that count like skin."""
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(400, 3)) * [1, 1, 0.5] + [0, 0, 1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    skin = np.column_stack([120 + rng.normal(0, 12, 400), rng.normal(0, 8, 400), 30 + rng.normal(0, 5, 400)])
+    skin = np.column_stack(
+        [120 + rng.normal(0, 12, 400), rng.normal(0, 8, 400), 30 + rng.normal(0, 5, 400)]
+    )
     found = []
     for view in range(12):
         light = np.array([1.0, 0.3 * (-1) ** view, 0.05 * view, 0.2, 0, 0, 0, 0, 0])
         values = skin * (light_basis(normals) @ light)[:, None]
         values[:20] = rng.uniform(0, 255, (20, 3))  # hair
         values[20 + 20 * view : 40 + 20 * view] = 10  # a hand that moves
-        found.append(Sample(b"ab"[view % 2 : view % 2 + 1], [values], light_basis(normals), np.ones(400)))
+        found.append(
+            Sample(b"ab"[view % 2 : view % 2 + 1], [values], light_basis(normals), np.ones(400))
+        )
     texture = average_texture(found)
     own = texture.values[b"a"][0]
     scale = np.median(own[20:, 0] / skin[20:, 0])
@@ -149,15 +172,19 @@ def test_projection_derivative_agrees_with_differences():
 
 
 def test_smoothing_stays_at_the_solution_of_its_own_terms():
-    """Catches terms that are changed while they are used, or a right-hand side of the wrong sign."""
+    """Catches terms that are changed while they are used, or a right-hand side of the wrong
+    sign."""
     head = HeadModel(small_head(0), "flame")
     one = person(head, np.zeros(head.model.n_identity))
     places = places_on(head, 60)
     meshes = [flame_forward(head.model, np.zeros(10), frame_at(0.1, t)) for t in range(4)]
     observed = [
-        Observation(places.on(mesh, head.model.faces), np.tile(np.eye(3), (60, 1, 1)), np.ones(60)) for mesh in meshes
+        Observation(places.on(mesh, head.model.faces), np.tile(np.eye(3), (60, 1, 1)), np.ones(60))
+        for mesh in meshes
     ]
-    solved = solve_take(one, places, observed, np.zeros((4, one.model.n_expression + 18)), ordered=True)
+    solved = solve_take(
+        one, places, observed, np.zeros((4, one.model.n_expression + 18)), ordered=True
+    )
     points = PosedPoints(one.model, places)
     terms = [normal_equations(points, row, own) for row, own in zip(solved, observed, strict=True)]
     np.testing.assert_allclose(smooth_take(one, solved, terms, ordered=True), solved, atol=5e-3)
@@ -165,16 +192,20 @@ def test_smoothing_stays_at_the_solution_of_its_own_terms():
 
 def test_a_short_take_is_left_to_landmarks_and_surface():
     """Catches a texture averaged over the very frames that it judges."""
-    take = RecordedTake(None, None, dict.fromkeys(range(5)), lambda t: pytest.fail("no image is needed"))
+    take = RecordedTake(
+        None, None, dict.fromkeys(range(5)), lambda t: pytest.fail("no image is needed")
+    )
     assert fit_dense(None, take, Helpers(1)) is None
 
 
 @pytest.mark.slow
 def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
-    """Catches tracking that follows landmarks where they fail: they leave the jaw open by two thirds. Three cameras 60
-    degrees apart, and a surface whose poses are worse."""
+    """Catches tracking that follows landmarks where they fail: they leave the jaw open by two
+    thirds. Three cameras 60 degrees apart, and a surface whose poses are worse."""
     take = scene(np.radians([-60, 0, 60]))
-    first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
+    first = fit_head(
+        take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True
+    )
     found, misfit = by_images(take.head, first, take.take, Helpers(1))
     wide = np.argsort(OPENINGS)[-3:]
     before, after = jaw_errors(take, first), jaw_errors(take, found)
@@ -187,12 +218,14 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
 
 @pytest.mark.slow
 def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeypatch):
-    """Catches parts that are put together in another order, what one part leaves behind for the next, and an
-    interrupted take that begins anew or ends otherwise."""
+    """Catches parts that are put together in another order, what one part leaves behind for the
+    next, and an interrupted take that begins anew or ends otherwise."""
     monkeypatch.setattr(dense, "PART_TIMESTEPS", 3)
     monkeypatch.setattr(dense, "TEXTURE_PART_TIMESTEPS", 3)
     take = scene(np.radians([-40, 40]), openings=OPENINGS[:6], size=(115, 150))
-    first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
+    first = fit_head(
+        take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True
+    )
     alone = fit_dense(first, take.take, Helpers(1))
 
     def interrupt(stage, done, total):
@@ -207,22 +240,30 @@ def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeyp
     assert len(list(tmp_path.iterdir())) == 2
     for timestep, parameters in alone.fit.parameters.items():
         np.testing.assert_array_equal(together.fit.parameters[timestep], parameters)
-        np.testing.assert_array_equal(together.landmarks[timestep].points, alone.landmarks[timestep].points)
+        np.testing.assert_array_equal(
+            together.landmarks[timestep].points, alone.landmarks[timestep].points
+        )
         np.testing.assert_array_equal(together.misfit[timestep], alone.misfit[timestep])
 
 
 @pytest.mark.slow
 def test_raised_brows_are_not_lowered_by_images_that_prove_little():
-    """Catches images that are believed against the landmarks of a region because they look a little more like another
+    """Catches images that are believed against the landmarks of a region because they look a little
+    more like another
     pose: here, more of a picture shows lowered brows than raised ones."""
     eyes, still = np.radians([-50, 0, 50]), [0.0] * 8
     take, lowered = (scene(eyes, still, brows=brows) for brows in (1.5, -1.5))
 
     def images(timestep, most=None):
         pairs = zip(take.take.images(timestep), lowered.take.images(timestep), strict=True)
-        return [(camera, (0.4 * raised + 0.6 * low).astype(np.uint8)) for (camera, raised), (_, low) in pairs]
+        return [
+            (camera, (0.4 * raised + 0.6 * low).astype(np.uint8))
+            for (camera, raised), (_, low) in pairs
+        ]
 
-    first = fit_head(take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True)
+    first = fit_head(
+        take.head, take.take.places, take.take.reliable, take.take.landmarks, metric=True
+    )
     found = fit_dense(first, replace(take.take, images=images), Helpers(1))
     assert brow_errors(take, first).max() < 1
     assert brow_errors(take, found.fit).max() < 3

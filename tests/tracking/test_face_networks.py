@@ -15,12 +15,14 @@ from stga_addon.tracking.mesh_image import shaded_image
 cv2 = pytest.importorskip("cv2")
 
 REFERENCE = Path(__file__).with_name("mediapipe.npz")
-"""Of mediapipe 0.10.21's Tasks, image mode, on `pictures`: landmarks (3, 478, 2) and scores (3, 52)."""
+"""Of mediapipe 0.10.21's Tasks, image mode, on `pictures`: landmarks (3, 478, 2) and scores (3,
+52)."""
 
 
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:
-    """From the front, from the side, and turned in the image's plane before a wide dark background."""
+    """From the front, from the side, and turned in the image's plane before a wide dark
+    background."""
     model = small_head(0)
     mesh, faces = model.v_template, model.faces
     cameras = picture_cameras(mesh)
@@ -31,10 +33,12 @@ def pictures() -> list[np.ndarray]:
 
 
 def test_landmarks_and_scores_are_mediapipes(pictures):
-    """Catches anchors, crop, rotation, resampling or an order of inputs that are not those that the networks were
-    trained with."""
+    """Catches anchors, crop, rotation, resampling or an order of inputs that are not those that the
+    networks were trained with."""
     reference = np.load(REFERENCE)
-    for image, points, scores in zip(pictures, reference["points"], reference["scores"], strict=True):
+    for image, points, scores in zip(
+        pictures, reference["points"], reference["scores"], strict=True
+    ):
         (found,) = FaceNetworks().detect(image)
         assert np.median(np.linalg.norm(found - points, axis=1)) < 0.1  # of 512 pixels
         weights = FaceNetworks().score(image).weights
@@ -42,7 +46,8 @@ def test_landmarks_and_scores_are_mediapipes(pictures):
 
 
 def test_two_faces_and_none(pictures):
-    """Catches a second face that is not reported, one face that is found twice, and faces on a wall."""
+    """Catches a second face that is not reported, one face that is found twice, and faces on a
+    wall."""
     front = pictures[0]
     assert len(FaceNetworks().detect(np.concatenate([front, front], axis=1))) == 2
     assert len(FaceNetworks().detect(front)) == 1
@@ -51,8 +56,9 @@ def test_two_faces_and_none(pictures):
 
 
 def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():
-    """Catches the lower lip's landmarks on the upper lip, which they touch while the mouth is closed, and those of lids
-    on the eyeballs: an open mouth would be tracked as closed, and a blink as half of one."""
+    """Catches the lower lip's landmarks on the upper lip, which they touch while the mouth is
+    closed, and those of lids on the eyeballs: an open mouth would be tracked as closed, and a blink
+    as half of one."""
     model = flame_model(None)
     places, _ = calibrate(model, FaceNetworks(), "head")
 
@@ -60,7 +66,10 @@ def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():
         shape = model.shapedirs[:, :, model.n_identity + model.expression_names.index(name)]
         return np.linalg.norm(places.on(shape, model.faces), axis=1)
 
-    upper, lower = moved("jawOpen")[[80, 82, 13, 312, 310]], moved("jawOpen")[[88, 87, 14, 317, 318]]
+    upper, lower = (
+        moved("jawOpen")[[80, 82, 13, 312, 310]],
+        moved("jawOpen")[[88, 87, 14, 317, 318]],
+    )
     assert upper.max() < 0.01 < 0.025 < lower.min()
     on_eyeballs = (model.weights[model.faces, 3:] > EYEBALL_WEIGHT).any((1, 2))[places.face]
     assert np.flatnonzero(on_eyeballs).tolist() == sorted(IRIS_CENTERS)

@@ -60,7 +60,9 @@ def frame_at(head, timestep):
     turn = 0.25 * np.sin(timestep / 5)
     jaw = np.array([0.1 + 0.1 * np.cos(timestep / 6), 0, 0])
     zero = np.zeros(3)
-    return FlameFrame(expr, np.array([0.05, turn, 0.02]), zero, jaw, np.array([0.01, turn / 50, 0.0]), np.zeros(6))
+    return FlameFrame(
+        expr, np.array([0.05, turn, 0.02]), zero, jaw, np.array([0.01, turn / 50, 0.0]), np.zeros(6)
+    )
 
 
 def cameras(count):
@@ -80,11 +82,14 @@ def seen(rig, points, noise=0.0, seed=0):
     """Landmarks of points (N, 3) in every camera."""
     rng = np.random.default_rng(seed)
     pixels = np.stack([camera.project(points)[0] for camera in rig])
-    return TimestepLandmarks(tuple(rig), pixels + rng.normal(0, noise, pixels.shape), np.ones(pixels.shape[:2]))
+    return TimestepLandmarks(
+        tuple(rig), pixels + rng.normal(0, noise, pixels.shape), np.ones(pixels.shape[:2])
+    )
 
 
 def test_points_agree_with_the_forward_pass_and_their_derivatives_with_differences():
-    """Catches a joint, corrective or shape that moves landmarks otherwise than FLAME's own forward pass."""
+    """Catches a joint, corrective or shape that moves landmarks otherwise than FLAME's own forward
+    pass."""
     head = HeadModel(random_flame(), "flame")
     frame = random_frame(3, head.model.n_expression)
     shape = np.random.default_rng(1).normal(size=head.model.n_identity)
@@ -139,21 +144,31 @@ def test_one_camera_gives_the_pose_of_a_rigid_head(angle):
     """Catches a mirrored or collapsed pose of the only start that one camera has."""
     camera = look_at((np.sin(angle), 0.2, np.cos(angle)), (0, 0, 0), 800, 800, 1000)
     points = np.random.default_rng(0).normal(0, 0.05, (30, 3))
-    np.testing.assert_allclose(pose_from_one_camera(camera, camera.project(points)[0], points), points, atol=1e-5)
+    np.testing.assert_allclose(
+        pose_from_one_camera(camera, camera.project(points)[0], points), points, atol=1e-5
+    )
 
 
 def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
-    """Catches an error in scale, orientation, identity or expression: vertices would be millimeters off."""
+    """Catches an error in scale, orientation, identity or expression: vertices would be millimeters
+    off."""
     shape = np.random.default_rng(5).normal(0, 0.7, head.model.n_identity)
     world, places = moved_world(), places_on(head, 100)
     rig = cameras(5)
-    foreign = [Similarity(world.scale, world.rotation, world.translation).camera(camera) for camera in rig]
+    foreign = [
+        Similarity(world.scale, world.rotation, world.translation).camera(camera) for camera in rig
+    ]
     take = {}
     for timestep in range(12):
         mesh = flame_forward(head.model, shape, frame_at(head, timestep))
-        take[timestep] = seen(foreign, world.apply(places.on(mesh, head.model.faces)), noise=0.3, seed=timestep)
+        take[timestep] = seen(
+            foreign, world.apply(places.on(mesh, head.model.faces)), noise=0.3, seed=timestep
+        )
     take[7] = replace(
-        take[7], cameras=take[7].cameras[:1], points=take[7].points[:1], confidence=take[7].confidence[:1]
+        take[7],
+        cameras=take[7].cameras[:1],
+        points=take[7].points[:1],
+        confidence=take[7].confidence[:1],
     )
     fit = fit_head(head, places, np.ones(100, bool), take)
     assert fit.to_capture.scale == pytest.approx(1 / world.scale, rel=0.03)
@@ -169,7 +184,9 @@ def test_jumps_are_not_smoothed(head):
     """Catches smoothing across cuts: a capture of single expressions would lose all of them."""
     places, rig = places_on(head, 100), cameras(4)
     strong = np.eye(head.model.n_expression)
-    frames = [replace(frame_at(head, 0), expr=strong[k % head.model.n_expression]) for k in range(6)]
+    frames = [
+        replace(frame_at(head, 0), expr=strong[k % head.model.n_expression]) for k in range(6)
+    ]
     meshes = [flame_forward(head.model, np.zeros(head.model.n_identity), frame) for frame in frames]
     take = {k: seen(rig, places.on(mesh, head.model.faces)) for k, mesh in enumerate(meshes)}
     fit = fit_head(head, places, np.ones(100, bool), take)
@@ -180,7 +197,8 @@ def test_jumps_are_not_smoothed(head):
 
 
 def amounts_and_observations(head, amounts, noise):
-    """A person without identity, and what is known of 100 landmarks at each timestep of one moving expression."""
+    """A person without identity, and what is known of 100 landmarks at each timestep of one moving
+    expression."""
     one, places = person(head, np.zeros(head.model.n_identity)), places_on(head, 100)
     rng, observed = np.random.default_rng(3), []
     for amount in amounts:
@@ -192,12 +210,15 @@ def amounts_and_observations(head, amounts, noise):
 
 
 def test_expressions_in_no_order_are_not_smoothed(head):
-    """Catches brows that are raised at every third timestep and tracked at rest: beside surface points, landmarks count
-    little, and less than smoothness over timesteps that do not follow each other."""
+    """Catches brows that are raised at every third timestep and tracked at rest: beside surface
+    points, landmarks count little, and less than smoothness over timesteps that do not follow each
+    other."""
     amounts = np.array([0, 0.5, 0, 0, 0.4, 0, 0.5, 0, 0, 0.5, 0, 0.4])
     one, places, observed = amounts_and_observations(head, amounts, 0.0003)
     start = np.zeros((len(amounts), one.model.n_expression + 18))
-    ordered = in_order(one, places, observed, solve_take(one, places, observed, start, ordered=False))
+    ordered = in_order(
+        one, places, observed, solve_take(one, places, observed, start, ordered=False)
+    )
     assert not ordered
     weak = [replace(own, weight=0.05 * own.weight) for own in observed]
     found = solve_take(one, places, weak, start, ordered)[:, 0]
@@ -205,10 +226,13 @@ def test_expressions_in_no_order_are_not_smoothed(head):
 
 
 def test_expressions_in_order_are_smoothed(head):
-    """Catches noise of landmarks that is taken for expressions in no order: a take would tremble."""
+    """Catches noise of landmarks that is taken for expressions in no order: a take would
+    tremble."""
     amounts = 0.5 * np.sin(np.arange(24) / 4)
     one, places, observed = amounts_and_observations(head, amounts, 0.002)
-    alone = solve_take(one, places, observed, np.zeros((24, one.model.n_expression + 18)), ordered=False)
+    alone = solve_take(
+        one, places, observed, np.zeros((24, one.model.n_expression + 18)), ordered=False
+    )
     assert in_order(one, places, observed, alone)
     smooth = solve_take(one, places, observed, alone, ordered=True)
     error, unsmoothed = (np.abs(values[:, 0] - amounts).mean() for values in (smooth, alone))
@@ -229,10 +253,11 @@ def test_one_camera_follows_a_head(head):
 
 
 def test_one_camera_keeps_the_size_of_the_head(head):
-    """Catches a world that is scaled up without end: the smaller the head, the nearer it passes to rays that no head
-    meets all of, as those of a real person's landmarks."""
+    """Catches a world that is scaled up without end: the smaller the head, the nearer it passes to
+    rays that no head meets all of, as those of a real person's landmarks."""
     places, rig = places_on(head, 100), cameras(1)
-    wrong = places.on(head.model.v_template, head.model.faces) * [1.25, 0.8, 1.0]  # a face that the model has not
+    # a face that the model has not
+    wrong = places.on(head.model.v_template, head.model.faces) * [1.25, 0.8, 1.0]
     take = {t: seen(rig, wrong, noise=4.0, seed=t) for t in range(8)}
     fit = fit_head(head, places, np.ones(100, bool), take)
     assert fit.to_capture.scale == pytest.approx(1, abs=0.1)
@@ -245,12 +270,16 @@ def test_one_camera_keeps_the_size_of_the_head(head):
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_landmarks_of_no_weight_stay_unknown(head, count):
-    """Catches 0 / 0 and NaN from landmarks that no camera sees, in a world whose origin is a camera.
+    """Catches 0 / 0 and NaN from landmarks that no camera sees, in a world whose origin is a
+    camera.
 
     Whether NumPy raises an error for eigenvalues of NaN depends on the processor.
     """
     places, rig = places_on(head, 100), cameras(count)
-    meshes = [flame_forward(head.model, np.zeros(head.model.n_identity), frame_at(head, t)) for t in range(3)]
+    meshes = [
+        flame_forward(head.model, np.zeros(head.model.n_identity), frame_at(head, t))
+        for t in range(3)
+    ]
     take = {t: seen(rig, places.on(mesh, head.model.faces)) for t, mesh in enumerate(meshes)}
     first = np.linalg.inv(rig[0].world_to_camera)
     own = tuple(replace(camera, world_to_camera=camera.world_to_camera @ first) for camera in rig)
@@ -261,7 +290,9 @@ def test_landmarks_of_no_weight_stay_unknown(head, count):
         landmarks.points[:, timestep::7] = 0
     reliable = np.arange(100) % 9 != 4
     with np.errstate(all="raise"):
-        found = triangulated(take[0], reliable, places.on(head.model.v_template, head.model.faces), 1.0)
+        found = triangulated(
+            take[0], reliable, places.on(head.model.v_template, head.model.faces), 1.0
+        )
         fit = fit_head(head, places, reliable, take)
     for values in (found.position, found.information, found.residual, *fit.parameters.values()):
         assert np.isfinite(values).all()
@@ -273,7 +304,8 @@ def test_landmarks_of_no_weight_stay_unknown(head, count):
 
 
 def test_rays_that_all_miss_give_a_start(head):
-    """Catches weights that vanish, and the mean of no points, where no two cameras agree about any landmark."""
+    """Catches weights that vanish, and the mean of no points, where no two cameras agree about any
+    landmark."""
     rig, rng = cameras(3), np.random.default_rng(0)
     points = rng.normal(0, 0.05, (30, 3))
     landmarks = seen(rig, points, noise=100.0)
@@ -291,7 +323,11 @@ def test_a_linear_model_without_joints_moves_rigidly():
     """Catches rotation about joints that a plain shape-key head does not have."""
     rng = np.random.default_rng(0)
     faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7]])
-    arrays = {"mean": rng.normal(0, 0.1, (8, 3)), "faces": faces, "expression": rng.normal(0, 0.01, (8, 3, 2))}
+    arrays = {
+        "mean": rng.normal(0, 0.1, (8, 3)),
+        "faces": faces,
+        "expression": rng.normal(0, 0.01, (8, 3, 2)),
+    }
     head = HeadModel(linear_model(None, arrays), "mesh")
     assert head.joints == (True, False, False, False, False)
     fit = np.concatenate([[0.5, -1.0], [0.3, 0.2, 0.1], np.zeros(12), [0.1, 0.2, 0.3]])
@@ -321,8 +357,9 @@ def test_nearest_points_of_a_mesh(head):
 
 
 def test_prior_keeps_weights_between_0_and_1():
-    """Catches a pull of the wrong sign or size, one on models whose coefficients are no weights, and lids that close
-    beyond each other: the right-hand side is minus the slope of the penalty, by differences."""
+    """Catches a pull of the wrong sign or size, one on models whose coefficients are no weights,
+    and lids that close beyond each other: the right-hand side is minus the slope of the penalty, by
+    differences."""
     named = HeadModel(flame_model(None), "flame")
     lids = [[named.model.expression_names.index(name) for name in lid] for lid in LID_SHAPES]
     count, rng = named.model.n_expression, np.random.default_rng(0)

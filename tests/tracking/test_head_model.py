@@ -1,4 +1,5 @@
-"""Head models from GLB files, against trimesh, Blender's exporter and the model that they were made from."""
+"""Head models from GLB files, against trimesh, Blender's exporter and the model that they were made
+from."""
 
 import json
 import struct
@@ -23,7 +24,13 @@ def glb(document, data):
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
-    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return (
+        head
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(data), b"BIN\0")
+        + data
+    )
 
 
 def simple(**changes):
@@ -31,7 +38,9 @@ def simple(**changes):
     corners, moved = np.eye(3, dtype="<f4"), 0.1 * np.ones((3, 3), "<f4")
     data = corners.tobytes() + moved.tobytes()
     views = [{"buffer": 0, "byteOffset": 36 * k, "byteLength": 36} for k in range(2)]
-    accessors = [{"bufferView": k, "componentType": 5126, "count": 3, "type": "VEC3"} for k in range(2)]
+    accessors = [
+        {"bufferView": k, "componentType": 5126, "count": 3, "type": "VEC3"} for k in range(2)
+    ]
     document = {
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}]}],
@@ -55,14 +64,19 @@ def blender_head(mesh, faces, names, shapes):
     """A mesh object with shape keys, in Blender's axes, of a model with y up."""
     bpy = pytest.importorskip("bpy", reason="bpy is not installed")
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    turned = [array[:, [0, 2, 1]] * [1, -1, 1] for array in (mesh, *(mesh + s for s in np.moveaxis(shapes, 2, 0)))]
+    turned = [
+        array[:, [0, 2, 1]] * [1, -1, 1]
+        for array in (mesh, *(mesh + s for s in np.moveaxis(shapes, 2, 0)))
+    ]
     data = bpy.data.meshes.new("Head")
     data.from_pydata(turned[0].tolist(), [], faces.tolist())
     head = bpy.data.objects.new("Head", data)
     bpy.context.scene.collection.objects.link(head)
     bpy.context.view_layer.objects.active = head
     for name, points in zip(("Basis", *names), turned, strict=True):
-        head.shape_key_add(name=name, from_mix=False).data.foreach_set("co", points.astype(np.float32).ravel())
+        head.shape_key_add(name=name, from_mix=False).data.foreach_set(
+            "co", points.astype(np.float32).ravel()
+        )
     return head
 
 
@@ -76,8 +90,11 @@ def assert_same_surface(found, mean, faces, shapes, tolerance=2e-6):
     """The same triangles with the same displacements, in whatever order the vertices are."""
     from scipy.spatial import cKDTree
 
-    expected = np.concatenate([mean[..., None], shapes], axis=2)[faces].mean(1)  # (F, 3, 1 + K) at the centers
-    there = np.concatenate([found.v_template[..., None], found.shapedirs], axis=2)[found.faces].mean(1)
+    # (F, 3, 1 + K) at the centers
+    expected = np.concatenate([mean[..., None], shapes], axis=2)[faces].mean(1)
+    there = np.concatenate([found.v_template[..., None], found.shapedirs], axis=2)[
+        found.faces
+    ].mean(1)
     distance, row = cKDTree(there[..., 0]).query(expected[..., 0])
     assert len(there) == len(expected) == len(set(row.tolist()))
     assert distance.max() < 2 * tolerance
@@ -86,7 +103,8 @@ def assert_same_surface(found, mean, faces, shapes, tolerance=2e-6):
 
 @pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
 def test_a_glb_that_blender_exports(tmp_path, sparse):
-    """Catches wrong axes, units or sparse accessors, and vertices that stay split at the seams of normals."""
+    """Catches wrong axes, units or sparse accessors, and vertices that stay split at the seams of
+    normals."""
     head = blender_head(MESH.v_template, MESH.faces, NAMES, SHAPES)
     head.scale = (10, 10, 10)  # the exporter writes it as the node's transform
     head.data.transform(__import__("mathutils").Matrix.Scale(0.1, 4), shape_keys=True)
@@ -109,12 +127,15 @@ def test_a_glb_agrees_with_trimesh(tmp_path):
     scene = trimesh.load(tmp_path / "head.glb", process=False)
     theirs = scene.to_geometry().vertices
     found = read_head_model(tmp_path / "head.glb").model.v_template
-    np.testing.assert_allclose([found.min(0), found.max(0)], [theirs.min(0), theirs.max(0)], atol=1e-6)
+    np.testing.assert_allclose(
+        [found.min(0), found.max(0)], [theirs.min(0), theirs.max(0)], atol=1e-6
+    )
 
 
 @pytest.mark.slow
 def test_a_real_head_with_57_expressions(shared_data, tmp_path):
-    """Catches limits that a model of real size exceeds: ICT-FaceKit's, through Blender's exporter and back."""
+    """Catches limits that a model of real size exceeds: ICT-FaceKit's, through Blender's exporter
+    and back."""
     ict = np.load(shared_data / "ict_facekit_light.npz")
     mean, shapes = 0.01 * ict["neutral"], 0.01 * np.moveaxis(ict["expr"], 0, 2)
     blender_head(mean, ict["tris"], ict["expr_names"].tolist(), shapes)
@@ -131,11 +152,20 @@ def test_seams_are_merged_and_kept_where_a_target_parts_them(tmp_path):
     moved[3:, 1] = [0, -0.1, -0.1]
     data = corners.tobytes() + moved.tobytes()
     views = [{"buffer": 0, "byteOffset": 72 * k, "byteLength": 72} for k in range(2)]
-    accessors = [{"bufferView": k, "componentType": 5126, "count": 6, "type": "VEC3"} for k in range(2)]
+    accessors = [
+        {"bufferView": k, "componentType": 5126, "count": 6, "type": "VEC3"} for k in range(2)
+    ]
     primitive = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}
     meshes = [{"primitives": [primitive], "extras": {"targetNames": ["part"]}}]
-    document = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": meshes, "accessors": accessors}
-    (tmp_path / "a.glb").write_bytes(glb(document | {"bufferViews": views, "buffers": [{"byteLength": 144}]}, data))
+    document = {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": meshes,
+        "accessors": accessors,
+    }
+    (tmp_path / "a.glb").write_bytes(
+        glb(document | {"bufferViews": views, "buffers": [{"byteLength": 144}]}, data)
+    )
     found = read_head_model(tmp_path / "a.glb").model
     assert len(found.v_template) == 5  # the first corner is one, the second parts
     assert found.faces.tolist() == [[0, 1, 2], [0, 3, 4]]
@@ -146,24 +176,56 @@ def test_seams_are_merged_and_kept_where_a_target_parts_them(tmp_path):
     [
         (b"", "is not a readable GLB"),
         (b"glTF" + bytes(40), "is not a readable GLB"),
-        (simple(meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}]), "neither identity nor expression"),
-        (simple(extensionsRequired=["KHR_draco_mesh_compression"]), "export it without compression"),
+        (
+            simple(meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}]),
+            "neither identity nor expression",
+        ),
+        (
+            simple(extensionsRequired=["KHR_draco_mesh_compression"]),
+            "export it without compression",
+        ),
         (simple(buffers=[{"uri": "../../etc/passwd", "byteLength": 72}]), "refers to other files"),
         (simple(scenes=[{"nodes": []}]), "no triangle mesh"),
         (simple(nodes=[{"children": [0]}]), "no triangle mesh"),
         (simple(nodes=[{"mesh": 9}]), "is not a readable GLB"),
         (simple(nodes=[{"mesh": 0, "scale": [99, 99, 99]}]), "measures"),
-        (simple(accessors=[{"componentType": 5126, "count": 1 << 40, "type": "VEC3"}] * 2), "more than the"),
-        (simple(bufferViews=[{"buffer": 0, "byteOffset": 60, "byteLength": 36}] * 2), "beyond the file"),
-        (simple(accessors=[{"componentType": 5126, "count": np.inf, "type": "VEC3"}] * 2), "not a readable GLB"),
+        (
+            simple(accessors=[{"componentType": 5126, "count": 1 << 40, "type": "VEC3"}] * 2),
+            "more than the",
+        ),
+        (
+            simple(bufferViews=[{"buffer": 0, "byteOffset": 60, "byteLength": 36}] * 2),
+            "beyond the file",
+        ),
+        (
+            simple(accessors=[{"componentType": 5126, "count": np.inf, "type": "VEC3"}] * 2),
+            "not a readable GLB",
+        ),
         (simple(nodes=[{"mesh": 0, "scale": [1e308, 1e308, 1e308], "rotation": [1e308] * 4}]), ""),
         (simple(nodes=[{"mesh": 0, "matrix": [1e308] * 16}]), ""),
-        (simple(nodes=[{"mesh": 0, "translation": [1e308, 0, np.nan]}]), "holds values that are not finite"),
-        (simple(meshes=[primitives(400, 2)], accessors=zeros(100_000)), "its meshes hold .* numbers, more than"),
-        (simple(meshes=[primitives(2, 400)], accessors=zeros(100_000)), "its meshes hold .* numbers, more than"),
-        (simple(nodes=[{"mesh": 0}] * 999, scenes=[{"nodes": [*range(999)]}], accessors=zeros(9_000)), "more than"),
+        (
+            simple(nodes=[{"mesh": 0, "translation": [1e308, 0, np.nan]}]),
+            "holds values that are not finite",
+        ),
+        (
+            simple(meshes=[primitives(400, 2)], accessors=zeros(100_000)),
+            "its meshes hold .* numbers, more than",
+        ),
+        (
+            simple(meshes=[primitives(2, 400)], accessors=zeros(100_000)),
+            "its meshes hold .* numbers, more than",
+        ),
+        (
+            simple(
+                nodes=[{"mesh": 0}] * 999, scenes=[{"nodes": [*range(999)]}], accessors=zeros(9_000)
+            ),
+            "more than",
+        ),
         (simple(accessors=zeros(3_000_000)), "its meshes hold .* numbers, more than"),
-        (simple(accessors=zeros(100_000, bufferView=0), bufferViews=[{"byteStride": 0}]), "not a readable GLB"),
+        (
+            simple(accessors=zeros(100_000, bufferView=0), bufferViews=[{"byteStride": 0}]),
+            "not a readable GLB",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -187,7 +249,8 @@ def test_a_small_glb_is_read(tmp_path):
 
 
 def test_shape_keys_become_a_linear_model(tmp_path):
-    """Catches shape keys in Blender's axes or object space, and those relative to others, in the model's file."""
+    """Catches shape keys in Blender's axes or object space, and those relative to others, in the
+    model's file."""
     pytest.importorskip("bpy", reason="bpy is not installed")
     from stga_addon.scene.rig.head import shape_key_model
 
@@ -212,25 +275,64 @@ def test_shape_keys_become_a_linear_model(tmp_path):
 
 def linear(**changes):
     """The arrays of a linear head model of four vertices, and what is changed of them."""
-    return {"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))} | changes
+    return {
+        "mean": np.eye(4, 3),
+        "faces": np.array([[0, 1, 2]]),
+        "identity": np.ones((4, 3, 1)),
+    } | changes
 
 
 @pytest.mark.parametrize(
     ("arrays", "expected"),
     [
-        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 2]])}, "neither identity nor expression"),
-        ({"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 9]]), "identity": np.ones((4, 3, 1))}, "names vertices"),
-        ({"mean": np.eye(4, 3) * 30, "faces": np.array([[0, 1, 2]]), "identity": np.ones((4, 3, 1))}, "meters"),
-        ({"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((5, 3, 1))}, "identity has shape"),
+        (
+            {"mean": np.ones((4, 3)), "faces": np.array([[0, 1, 2]])},
+            "neither identity nor expression",
+        ),
+        (
+            {
+                "mean": np.ones((4, 3)),
+                "faces": np.array([[0, 1, 9]]),
+                "identity": np.ones((4, 3, 1)),
+            },
+            "names vertices",
+        ),
+        (
+            {
+                "mean": np.eye(4, 3) * 30,
+                "faces": np.array([[0, 1, 2]]),
+                "identity": np.ones((4, 3, 1)),
+            },
+            "meters",
+        ),
+        (
+            {"mean": np.eye(4, 3), "faces": np.array([[0, 1, 2]]), "identity": np.ones((5, 3, 1))},
+            "identity has shape",
+        ),
         (linear(mean=np.full((4, 3), "x")), "mean holds <U1, expected numbers"),
         (linear(mean=np.eye(4, 3) + 1e200), "mean reaches 1e[+]200, expected at most 100000"),
         (linear(mean=np.eye(4, 3) * 1e308 * [1, -1, 1]), "mean reaches 1e[+]308"),
         (linear(faces=np.full((1, 3), "x")), "faces is <U1"),
-        (linear(identity=np.full((4, 3, 1), 1e300)), "identity reaches 1e[+]300, expected at most 100"),
-        (linear(identity=np.full((4, 3, 1), np.longdouble("1e4000"))), "identity holds values that are not finite"),
-        (linear(expression=np.full((4, 3, 1), np.nan)), "expression holds values that are not finite"),
-        (linear(J_regressor=np.full((5, 4), 1e300), weights=np.eye(4, 5)), "J_regressor reaches 1e[+]300"),
-        (linear(J_regressor=np.ones((5, 4)) / 4, weights=np.full((4, 5), -1e300)), "weights reaches 1e[+]300"),
+        (
+            linear(identity=np.full((4, 3, 1), 1e300)),
+            "identity reaches 1e[+]300, expected at most 100",
+        ),
+        (
+            linear(identity=np.full((4, 3, 1), np.longdouble("1e4000"))),
+            "identity holds values that are not finite",
+        ),
+        (
+            linear(expression=np.full((4, 3, 1), np.nan)),
+            "expression holds values that are not finite",
+        ),
+        (
+            linear(J_regressor=np.full((5, 4), 1e300), weights=np.eye(4, 5)),
+            "J_regressor reaches 1e[+]300",
+        ),
+        (
+            linear(J_regressor=np.ones((5, 4)) / 4, weights=np.full((4, 5), -1e300)),
+            "weights reaches 1e[+]300",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("error::RuntimeWarning")

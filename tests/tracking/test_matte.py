@@ -25,7 +25,8 @@ def room(height=HEIGHT, width=WIDTH, seed=0):
 
 
 def person(softness=3.0):
-    """Coverage (HEIGHT, WIDTH) in 0…1 of a head on shoulders, (H, W) bool of the head alone, and their colors."""
+    """Coverage (HEIGHT, WIDTH) in 0…1 of a head on shoulders, (H, W) bool of the head alone, and
+    their colors."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     head = 1 - np.hypot((x - 100) / 48, (y - 100) / 62)
     body = 1 - np.hypot((x - 100) / 90, (y - 262) / 120)
@@ -55,7 +56,8 @@ def test_an_outline_that_is_off_is_drawn_to_the_person():
 
 
 def test_hair_is_soft():
-    """Catches a hard edge where hair lets the wall through: within the edge, nearer to the truth than a hard mask."""
+    """Catches a hard edge where hair lets the wall through: within the edge, nearer to the truth
+    than a hard mask."""
     coverage, head, colors = person(softness=4.0)
     matte = find_matte(filmed(coverage, colors, room()), coverage.astype(np.float32), head) / 255
     edge = (coverage > 0.1) & (coverage < 0.9)
@@ -67,13 +69,18 @@ def test_clean_plate():
     """Catches a plate that is not used: the matte is found without any network."""
     coverage, head, colors = person()
     wall = room().round().astype(np.uint8)
-    noisy = np.clip(filmed(coverage, colors, wall) + np.random.default_rng(2).normal(0, 2, wall.shape), 0, 255)
+    noisy = np.clip(
+        filmed(coverage, colors, wall) + np.random.default_rng(2).normal(0, 2, wall.shape), 0, 255
+    )
     image = noisy.round().astype(np.uint8)
-    assert overlap(find_matte(image, probability_by_plate(image, wall), head) / 255, coverage) > 0.985
+    assert (
+        overlap(find_matte(image, probability_by_plate(image, wall), head) / 255, coverage) > 0.985
+    )
 
 
 def test_somebody_else_in_the_room():
-    """Catches a second person who becomes part of the first: only what hangs together with the tracked head is kept."""
+    """Catches a second person who becomes part of the first: only what hangs together with the
+    tracked head is kept."""
     coverage, head, colors = person()
     other = np.zeros_like(coverage)
     other[20:70, 4:34] = 1
@@ -87,23 +94,32 @@ def test_somebody_else_in_the_room():
 def test_a_network_that_sees_nobody_or_everybody(likely):
     """Catches an error of GrabCut without one of its two sides; the tracked head stays."""
     coverage, head, colors = person()
-    matte = find_matte(filmed(coverage, colors, room()), np.full((HEIGHT, WIDTH), likely, np.float32), head)
+    matte = find_matte(
+        filmed(coverage, colors, room()), np.full((HEIGHT, WIDTH), likely, np.float32), head
+    )
     assert matte[70:120, 80:120].min() == 255
 
 
 @pytest.mark.slow
 def test_a_rendered_head_before_a_wall(shared_data, tmp_path):
-    """Catches a network that is asked wrongly: true masks of a path-traced head before generated walls."""
+    """Catches a network that is asked wrongly: true masks of a path-traced head before generated
+    walls."""
     capture = open_capture(shared_data / "studio_head")
     network, found = PersonNetwork(), []
     for number, view in enumerate(capture.views["train"][2:80:13]):
         image, mask = with_a_body(read_image(view), read_mask(view))
         alpha = mask[..., None] / 255
         filmed_head = (
-            np.clip(image + (room(*mask.shape, seed=number) - 255) * (1 - alpha), 0, 255).round().astype(np.uint8)
+            np.clip(image + (room(*mask.shape, seed=number) - 255) * (1 - alpha), 0, 255)
+            .round()
+            .astype(np.uint8)
         )
         head = silhouette(np.asarray(capture.mesh(view.timestep)), capture.faces, view.camera)
-        found.append(overlap(find_matte(filmed_head, network.probability(filmed_head), head) / 255, mask / 255))
+        found.append(
+            overlap(
+                find_matte(filmed_head, network.probability(filmed_head), head) / 255, mask / 255
+            )
+        )
     assert np.mean(found) > 0.97, found
 
 

@@ -59,9 +59,12 @@ def silent(stage, done, total):
 
 
 def test_made_once_and_kept(tmp_path, halves):
-    """Catches mattes that an interrupted tracking makes again, and those of another head that are kept."""
+    """Catches mattes that an interrupted tracking makes again, and those of another head that are
+    kept."""
     footage = take(tmp_path)
-    found, warnings = with_mattes(footage, head, tmp_path / "out", {"head": "a"}, Helpers(1), silent)
+    found, warnings = with_mattes(
+        footage, head, tmp_path / "out", {"head": "a"}, Helpers(1), silent
+    )
     assert (halves.asked, warnings) == (3, ())
     files = sorted(path.name for path in (tmp_path / "out/fg_masks").iterdir())
     assert files == ["00000_00.png", "00001_00.png", "00002_00.png"]
@@ -87,12 +90,18 @@ def test_masks_of_the_footage_stay(tmp_path, halves):
 
 
 def test_frames_after_the_first_that_lack_a_mask(tmp_path, halves):
-    """Catches a camera of which only the first frame is asked for its mask, so that the others get no matte."""
+    """Catches a camera of which only the first frame is asked for its mask, so that the others get
+    no matte."""
     for number in (0, 2):
         write_image(tmp_path / f"footage/masks/left/{number:04d}.png", 90)
     footage = take(tmp_path, 4)
     found, warnings = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
-    assert [int(found.cameras[0].mask(timestep).max()) for timestep in range(4)] == [90, 255, 90, 255]
+    assert [int(found.cameras[0].mask(timestep).max()) for timestep in range(4)] == [
+        90,
+        255,
+        90,
+        255,
+    ]
     assert (halves.asked, warnings) == (2, ())
 
 
@@ -129,7 +138,8 @@ def test_a_folder_of_mattes(tmp_path):
 
 
 def test_mattes_of_a_turned_photo(tmp_path):
-    """Catches photos that are turned by EXIF or converted, whose stored pixels are not the frame's, without a matte."""
+    """Catches photos that are turned by EXIF or converted, whose stored pixels are not the frame's,
+    without a matte."""
     exif = Image.Exif()
     exif[274] = 3  # upside down
     for number in range(3):
@@ -151,7 +161,12 @@ def test_mattes_of_a_video(tmp_path):
     for number in range(4):
         write_image(tmp_path / f"mattes/left/{number:05d}.png", 10 * number)
     footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
-    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(4)] == [0, 10, 20, 30]
+    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(4)] == [
+        0,
+        10,
+        20,
+        30,
+    ]
 
 
 def test_a_folder_that_is_none(tmp_path, capsys):
@@ -165,7 +180,8 @@ def test_a_folder_that_is_none(tmp_path, capsys):
 
 
 def test_undistorted_mattes_are_not_undistorted_again(tmp_path, halves):
-    """Catches made mattes, which are of the undistorted frame, that are resampled by the lens once more."""
+    """Catches made mattes, which are of the undistorted frame, that are resampled by the lens once
+    more."""
     footage = take(tmp_path, 1)
 
     def refuse(mask):

@@ -11,7 +11,14 @@ from stga_addon.tracking.footage.open import open_footage
 
 from .scenes import HEIGHT, WIDTH, rig, write_image
 
-COEFFICIENTS = {"k1": -0.0919, "k2": -0.0763, "k3": 0.1163, "k4": -0.0761, "p1": -0.0031, "p2": 0.0012}
+COEFFICIENTS = {
+    "k1": -0.0919,
+    "k2": -0.0763,
+    "k3": 0.1163,
+    "k4": -0.0761,
+    "p1": -0.0031,
+    "p2": 0.0012,
+}
 INTRINSICS = {"f": 50.0, "cx": 1.25, "cy": -2.5, "b1": 0.53, "b2": -0.31, **COEFFICIENTS}
 EXPORT = """<?xml version="1.0" encoding="UTF-8"?>
 <document version="2.0.0">
@@ -54,12 +61,15 @@ def write_export(path, cameras, labels, kind="frame", intrinsics=INTRINSICS):
         matrix = " ".join(map(repr, np.linalg.inv(camera.world_to_camera).ravel().tolist()))
         found.append(CAMERA.format(number=number, label=label, transform=matrix))
     values = "".join(f"<{name}>{value}</{name}>" for name, value in intrinsics.items())
-    text = EXPORT.format(kind=kind, width=WIDTH, height=HEIGHT, intrinsics=values, cameras="".join(found))
+    text = EXPORT.format(
+        kind=kind, width=WIDTH, height=HEIGHT, intrinsics=values, cameras="".join(found)
+    )
     path.write_text(text, encoding="utf-8")
 
 
 def projected(points, angle_of=None):
-    """Pixels of camera-space points by the formulas of Metashape's manual (appendix C), in plain numbers."""
+    """Pixels of camera-space points by the formulas of Metashape's manual (appendix C), in plain
+    numbers."""
     values, found = INTRINSICS, []
     for x, y in points[:, :2] / points[:, 2:]:
         if angle_of:
@@ -71,13 +81,19 @@ def projected(points, angle_of=None):
         u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
         v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
         width, height = WIDTH / 2 + values["cx"], HEIGHT / 2 + values["cy"]
-        found.append((width + u * values["f"] + u * values["b1"] + v * values["b2"], height + v * values["f"]))
+        found.append(
+            (
+                width + u * values["f"] + u * values["b1"] + v * values["b2"],
+                height + v * values["f"],
+            )
+        )
     return np.array(found)
 
 
 @pytest.mark.parametrize(("kind", "angle_of"), [("frame", None), ("fisheye", np.arctan)])
 def test_projections_are_metashapes(tmp_path, kind, angle_of):
-    """Catches swapped tangential coefficients, an affine term in the wrong unit, and the initial calibration."""
+    """Catches swapped tangential coefficients, an affine term in the wrong unit, and the initial
+    calibration."""
     write_export(tmp_path / "cameras.xml", rig(), ["a", "b", "c"], kind)
     shots, left_out = read_metashape(tmp_path / "cameras.xml")
     assert [shot.label for shot in shots] == ["a", "b", "c"]
@@ -87,12 +103,16 @@ def test_projections_are_metashapes(tmp_path, kind, angle_of):
     for shot, expected in zip(shots, rig(), strict=True):
         camera = shot.camera
         np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
-        found = shot.lens.distort(local[:, :2] / local[:, 2:]) * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
+        found = shot.lens.distort(local[:, :2] / local[:, 2:]) * [camera.fl_x, camera.fl_y] + [
+            camera.cx,
+            camera.cy,
+        ]
         np.testing.assert_allclose(found, projected(local, angle_of), atol=1e-9)
 
 
 def test_labels_are_image_names_or_paths(tmp_path):
-    """Catches labels with a suffix, without, and of another computer; and a camera silently left out."""
+    """Catches labels with a suffix, without, and of another computer; and a camera silently left
+    out."""
     pytest.importorskip("cv2")
     labels = ["left", "middle.png", "D:\\shoot\\day 1\\right.png"]
     write_export(tmp_path / "cameras.xml", rig(), labels)
@@ -101,23 +121,49 @@ def test_labels_are_image_names_or_paths(tmp_path):
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["left", "middle", "right"]
     assert [camera.image(0)[15, 20, 0] for camera in footage.cameras] == [0, 50, 100]
-    assert footage.warnings == (f"{tmp_path / 'cameras.xml'}: left out cameras without a pose: spare",)
+    assert footage.warnings == (
+        f"{tmp_path / 'cameras.xml'}: left out cameras without a pose: spare",
+    )
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("</document>", "", r"cameras.xml: is not valid XML"),
-        ("<document ", "<!DOCTYPE a [<!ENTITY b 'c'>]><document ", r"cameras.xml: declares a document type"),
+        (
+            "<document ",
+            "<!DOCTYPE a [<!ENTITY b 'c'>]><document ",
+            r"cameras.xml: declares a document type",
+        ),
         ("<f>50.0</f>", "", r"sensor '0': has no calibration with f"),
         ("<f>50.0</f>", "<f>wide</f>", r"sensor '0': f: expected 1 finite number, not 'wide'"),
-        ('type="frame"', 'type="spherical"', r"sensor '0': type 'spherical' is not one of frame, fisheye"),
-        ('sensor_id="0" component', 'sensor_id="3" component', r"camera 'a': sensor_id '3' is no sensor of the file"),
+        (
+            'type="frame"',
+            'type="spherical"',
+            r"sensor '0': type 'spherical' is not one of frame, fisheye",
+        ),
+        (
+            'sensor_id="0" component',
+            'sensor_id="3" component',
+            r"camera 'a': sensor_id '3' is no sensor of the file",
+        ),
         ("<p1>", "<p3>0.1</p3><p1>", r"sensor '0': p3 and p4 are not supported"),
-        ('component_id="0" label="b"', 'component_id="1" label="b"', r"its cameras are in 2 components"),
+        (
+            'component_id="0" label="b"',
+            'component_id="1" label="b"',
+            r"its cameras are in 2 components",
+        ),
         ('label="b"', 'label="a"', r"camera 'a': two cameras are named a"),
-        ("<transform>", "<transform>-", r"camera 'a': expected a rotation without scale|its axes are mirrored"),
-        ("<f>50.0</f>", "<f>0</f>", r"sensor '0': f: expected a focal length of 1 to 1e7 pixels, not 0"),
+        (
+            "<transform>",
+            "<transform>-",
+            r"camera 'a': expected a rotation without scale|its axes are mirrored",
+        ),
+        (
+            "<f>50.0</f>",
+            "<f>0</f>",
+            r"sensor '0': f: expected a focal length of 1 to 1e7 pixels, not 0",
+        ),
         ("<p1>", "<k1>1e308</k1><p1>", r"camera 'a': the distortion of its lens folds the image"),
         ("<p1>", "<b1>1e308</b1><p1>", r"camera 'a': the distortion of its lens folds the image"),
         ("<transform>", "<transform>1 ", r"camera 'a': transform: expected 16 finite numbers, not"),
@@ -137,12 +183,17 @@ def test_damaged_exports_are_named(tmp_path, old, new, message):
 
 
 def test_mirrored_axes(tmp_path):
-    """Catches an export whose world was mirrored, in which left and right of the face would be swapped."""
+    """Catches an export whose world was mirrored, in which left and right of the face would be
+    swapped."""
     write_export(tmp_path / "cameras.xml", rig(1), ["a"], intrinsics={"f": 50.0})
     write_image(tmp_path / "a.png")
     text = (tmp_path / "cameras.xml").read_text(encoding="utf-8")
     matrix = np.linalg.inv(rig(1)[0].world_to_camera) * [[-1], [1], [1], [1]]
-    text = re.sub("<transform>[^<]{40,}<", f"<transform>{' '.join(map(str, matrix.ravel()))}<", text)
+    text = re.sub(
+        "<transform>[^<]{40,}<", f"<transform>{' '.join(map(str, matrix.ravel()))}<", text
+    )
     (tmp_path / "cameras.xml").write_text(text, encoding="utf-8")
-    with pytest.raises(StgaError, match=r"camera 'a': its axes are mirrored; expected a right-handed rotation"):
+    with pytest.raises(
+        StgaError, match=r"camera 'a': its axes are mirrored; expected a right-handed rotation"
+    ):
         open_footage(tmp_path)

@@ -14,7 +14,14 @@ from .scenes import HEIGHT, rig, write_image
 def entry(camera, path, **values):
     intrinsics = {key: getattr(camera, key) for key in ("fl_x", "fl_y", "cx", "cy")}
     pose = {"transform_matrix": camera.camera_to_world_gl.tolist()}
-    return {"file_path": path, "w": camera.width, "h": camera.height, **intrinsics, **pose, **values}
+    return {
+        "file_path": path,
+        "w": camera.width,
+        "h": camera.height,
+        **intrinsics,
+        **pose,
+        **values,
+    }
 
 
 def write_transforms(folder, frames, name="transforms.json", **top):
@@ -24,9 +31,17 @@ def write_transforms(folder, frames, name="transforms.json", **top):
 
 
 def test_a_capture_is_footage(tmp_path):
-    """Catches frames that belong to another camera or timestep than the file says, and a flipped principal point."""
+    """Catches frames that belong to another camera or timestep than the file says, and a flipped
+    principal point."""
     frames = [
-        entry(camera, f"images/{t:05d}_{c:02d}.png", timestep_index=t, camera_index=c, camera_id=f"cam{c}", cy=12.0)
+        entry(
+            camera,
+            f"images/{t:05d}_{c:02d}.png",
+            timestep_index=t,
+            camera_index=c,
+            camera_id=f"cam{c}",
+            cy=12.0,
+        )
         for t in (0, 3)
         for c, camera in enumerate(rig(2))
     ]
@@ -37,13 +52,18 @@ def test_a_capture_is_footage(tmp_path):
     assert [camera.image(t)[0, 0, 0] for t, camera in footage.views()] == [0, 20, 10, 30]
     assert footage.cameras[1].file(3) == tmp_path / "images/00003_01.png"
     assert footage.cameras[0].camera.cy == HEIGHT - 12.0
-    np.testing.assert_allclose(footage.cameras[1].camera.world_to_camera, rig(2)[1].world_to_camera, atol=1e-9)
+    np.testing.assert_allclose(
+        footage.cameras[1].camera.world_to_camera, rig(2)[1].world_to_camera, atol=1e-9
+    )
 
 
 def test_one_image_per_pose_is_one_timestep(tmp_path):
-    """Catches a nerfstudio file, whose images have no timesteps, taken for a sequence; and its `cy` turned over."""
+    """Catches a nerfstudio file, whose images have no timesteps, taken for a sequence; and its `cy`
+    turned over."""
     write_transforms(
-        tmp_path, [entry(c, f"images/{n}.png", cy=12.0) for n, c in enumerate(rig())], camera_model="OPENCV"
+        tmp_path,
+        [entry(c, f"images/{n}.png", cy=12.0) for n, c in enumerate(rig())],
+        camera_model="OPENCV",
     )
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["0", "1", "2"]
@@ -65,12 +85,18 @@ def test_splits_are_one_rig(tmp_path):
     ("change", "message"),
     [
         ({"k1": "much"}, r"transforms.json: frames\[1\].k1: expected a finite number, not 'much'"),
-        ({"camera_model": "EQUIRECTANGULAR"}, r"frames\[1\].camera_model: 'EQUIRECTANGULAR' is not one of"),
+        (
+            {"camera_model": "EQUIRECTANGULAR"},
+            r"frames\[1\].camera_model: 'EQUIRECTANGULAR' is not one of",
+        ),
         (
             {"file_path": "images/none.png"},
             r"frames\[1\]: .* has no image, folder or video of the name 'images/none.png'",
         ),
-        ({"mask_path": "masks/none.png"}, r"masks/none.png: does not exist, but .*frames\[1\] names it"),
+        (
+            {"mask_path": "masks/none.png"},
+            r"masks/none.png: does not exist, but .*frames\[1\] names it",
+        ),
         ({"k1": -40.0}, r"frames\[1\]: the distortion of its lens folds the image"),
         ({"k1": 1e308, "k2": -1e308}, r"frames\[1\]: the distortion of its lens folds the image"),
         ({"k1": 10**400}, r"frames\[1\].k1: expected a finite number"),
@@ -92,10 +118,13 @@ def test_bad_entries_are_named(tmp_path, change, message):
 
 
 def test_two_images_of_one_moment(tmp_path):
-    """Catches a sequence of a camera that stands still taken for a rig, and a frame that replaces another."""
+    """Catches a sequence of a camera that stands still taken for a rig, and a frame that replaces
+    another."""
     camera = rig(1)[0]
     write_transforms(tmp_path, [entry(camera, "images/0.png"), entry(camera, "images/1.png")])
-    with pytest.raises(StgaError, match=r"frames\[1\]: has the pose of images/0.png; expected a timestep_index"):
+    with pytest.raises(
+        StgaError, match=r"frames\[1\]: has the pose of images/0.png; expected a timestep_index"
+    ):
         open_footage(tmp_path)
     frames = [entry(camera, f"images/{n}.png", timestep_index=4, camera_index=7) for n in range(2)]
     write_transforms(tmp_path, frames)

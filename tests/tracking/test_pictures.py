@@ -16,7 +16,8 @@ pytest.importorskip("av")
 
 
 def test_first_frame_shows_the_head_where_it_is(tmp_path, monkeypatch):
-    """Catches a mesh drawn beside the head, of another frame, or in another part of the image than is shown."""
+    """Catches a mesh drawn beside the head, of another frame, or in another part of the image than
+    is shown."""
     write_head_video(tmp_path / "head.mp4", 2)
     head, networks = read_head_model(None), FaceNetworks()
     places, reliable = calibrate(head.model, networks, "head")

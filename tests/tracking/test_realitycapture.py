@@ -5,7 +5,10 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.realitycapture import read_realitycapture_csv, read_realitycapture_xmp
+from stga_addon.tracking.footage.realitycapture import (
+    read_realitycapture_csv,
+    read_realitycapture_xmp,
+)
 
 from .scenes import HEIGHT, WIDTH, rig, write_image
 
@@ -34,14 +37,19 @@ def write_xmp(path, camera, model="brown4t2", coefficients=COEFFICIENTS, as_attr
     rotation, position = words(camera.world_to_camera[:3, :3]), words(camera.position)
     elements = f"<xcr:Rotation>{rotation}</xcr:Rotation><xcr:Position>{position}</xcr:Position>"
     attributes = f' xcr:Rotation="{rotation}" xcr:Position="{position}"'
-    parts = {"attributes": attributes, "elements": ""} if as_attributes else {"attributes": "", "elements": elements}
+    parts = (
+        {"attributes": attributes, "elements": ""}
+        if as_attributes
+        else {"attributes": "", "elements": elements}
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(XMP.format(model=model, coefficients=coefficients, **parts), encoding="utf-8")
 
 
 @pytest.mark.parametrize("as_attributes", [False, True])
 def test_xmp(tmp_path, as_attributes):
-    """Catches either form of the pose, a focal length not of the longer side, and swapped tangential coefficients."""
+    """Catches either form of the pose, a focal length not of the longer side, and swapped
+    tangential coefficients."""
     camera = rig()[1]
     write_xmp(tmp_path / "b.xmp", camera, as_attributes=as_attributes)
     (shot,), left_out = read_realitycapture_xmp(tmp_path.glob("*.xmp"), lambda label: (30, 40))
@@ -50,11 +58,18 @@ def test_xmp(tmp_path, as_attributes):
     focal = 24.3765359225552 / 36 * 40
     found = shot.camera
     np.testing.assert_allclose(
-        [found.fl_x, found.fl_y, found.cx, found.cy], [focal, focal, 15 - 0.0046 * 40, 20 + 0.0082 * 40]
+        [found.fl_x, found.fl_y, found.cx, found.cy],
+        [focal, focal, 15 - 0.0046 * 40, 20 + 0.0082 * 40],
     )
     x, y = 0.3, -0.2
     r2 = x * x + y * y
-    radial = 1 - 0.124217384759894 * r2 + 0.107339706650415 * r2**2 - 0.0104748224573926 * r2**3 + 0.002 * r2**4
+    radial = (
+        1
+        - 0.124217384759894 * r2
+        + 0.107339706650415 * r2**2
+        - 0.0104748224573926 * r2**3
+        + 0.002 * r2**4
+    )
     expected = (
         x * radial + 0.003 * (r2 + 2 * x * x) + 2 * -0.004 * x * y,
         y * radial - 0.004 * (r2 + 2 * y * y) + 2 * 0.003 * x * y,
@@ -68,23 +83,33 @@ def test_xmp_beside_the_images(tmp_path):
         write_image(tmp_path / f"images/{name}.jpg", 50 * number)
         write_xmp(tmp_path / f"images/{name}.xmp", camera, "perspective", "0 0 0 0 0 0")
     path = tmp_path / "images/c.xmp"
-    path.write_text(path.read_text(encoding="utf-8").replace("xcr:Rotation>", "xcr:Other>"), encoding="utf-8")
+    path.write_text(
+        path.read_text(encoding="utf-8").replace("xcr:Rotation>", "xcr:Other>"), encoding="utf-8"
+    )
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["a", "b"]
     assert footage.warnings == (f"{tmp_path / 'images'}: left out cameras without a pose: c",)
 
 
 def csv_line(name, camera, rest="18,0.01,-0.02,0,0,0,0,0,0"):
-    """Heading, pitch and roll of a camera: z-x-y angles of its pose with OpenGL axes, heading clockwise."""
+    """Heading, pitch and roll of a camera: z-x-y angles of its pose with OpenGL axes, heading
+    clockwise."""
     from scipy.spatial.transform import Rotation
 
-    yaw, pitch, roll = Rotation.from_matrix(camera.camera_to_world_gl[:3, :3]).as_euler("ZXY", degrees=True)
-    return f"{name},{','.join(map(repr, camera.position.tolist()))},{-yaw!r},{pitch!r},{roll!r},{rest}"
+    yaw, pitch, roll = Rotation.from_matrix(camera.camera_to_world_gl[:3, :3]).as_euler(
+        "ZXY", degrees=True
+    )
+    return (
+        f"{name},{','.join(map(repr, camera.position.tolist()))},{-yaw!r},{pitch!r},{roll!r},{rest}"
+    )
 
 
 def test_csv(tmp_path):
     """Catches angles of another order or sense, and a principal point in another unit."""
-    lines = [HEADER, *(csv_line(f"{name}.png", camera) for name, camera in zip("abc", rig(), strict=True))]
+    lines = [
+        HEADER,
+        *(csv_line(f"{name}.png", camera) for name, camera in zip("abc", rig(), strict=True)),
+    ]
     (tmp_path / "cameras.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     for number, name in enumerate("abc"):
         write_image(tmp_path / f"images/{name}.png", 50 * number)
@@ -94,37 +119,61 @@ def test_csv(tmp_path):
         found = camera.camera
         np.testing.assert_allclose(found.world_to_camera, expected.world_to_camera, atol=1e-9)
         center = WIDTH / 2 + 0.01 * WIDTH, HEIGHT / 2 - 0.02 * WIDTH
-        np.testing.assert_allclose([found.fl_x, found.fl_y, found.cx, found.cy], [WIDTH / 2, WIDTH / 2, *center])
+        np.testing.assert_allclose(
+            [found.fl_x, found.fl_y, found.cx, found.cy], [WIDTH / 2, WIDTH / 2, *center]
+        )
 
 
 def test_level_camera_of_a_csv(tmp_path):
-    """Catches the axes: at heading 90° and pitch 90°, a camera looks east, level, with up (z) up in the image."""
-    (tmp_path / "a.csv").write_text(f"{HEADER}\na.png,1,2,3,90,90,0,18,0,0,0,0,0,0,0,0\n", encoding="utf-8")
+    """Catches the axes: at heading 90° and pitch 90°, a camera looks east, level, with up (z) up in
+    the image."""
+    (tmp_path / "a.csv").write_text(
+        f"{HEADER}\na.png,1,2,3,90,90,0,18,0,0,0,0,0,0,0,0\n", encoding="utf-8"
+    )
     (shot,) = read_realitycapture_csv(tmp_path / "a.csv", lambda label: (40, 30))
     right, down, forward = shot.camera.world_to_camera[:3, :3]
-    np.testing.assert_allclose([right, down, forward], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        [right, down, forward], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12
+    )
     np.testing.assert_allclose(shot.camera.position, [1, 2, 3], atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"brown4t2"', '"division"', r"a.xmp: xcr:DistortionModel 'division' is not one of perspective, brown3"),
-        ("<xcr:Rotation>", "<xcr:Rotation>1 ", r"a.xmp: xcr:Rotation: expected 9 finite numbers, not"),
+        (
+            '"brown4t2"',
+            '"division"',
+            r"a.xmp: xcr:DistortionModel 'division' is not one of perspective, brown3",
+        ),
+        (
+            "<xcr:Rotation>",
+            "<xcr:Rotation>1 ",
+            r"a.xmp: xcr:Rotation: expected 9 finite numbers, not",
+        ),
         ('xcr:FocalLength35mm="24.3765359225552"', "", r"a.xmp: xcr:FocalLength35mm is missing"),
-        ("24.3765359225552", "long", r"a.xmp: xcr:FocalLength35mm: expected 1 finite number, not 'long'"),
+        (
+            "24.3765359225552",
+            "long",
+            r"a.xmp: xcr:FocalLength35mm: expected 1 finite number, not 'long'",
+        ),
         ("</x:xmpmeta>", "", r"a.xmp: is not valid XML"),
         ("xcr:Position>", "xcr:Other>", r"has no camera with a pose"),
         ("24.3765359225552", "1e-320", r"a.xmp: expected a focal length of 1 to 1e7 pixels, not "),
         ("24.3765359225552", "1e308", r"a.xmp: expected a focal length of 1 to 1e7 pixels, not "),
-        ('AspectRatio="1"', 'AspectRatio="1e308"', r"a.xmp: expected a focal length of 1 to 1e7 pixels, not "),
+        (
+            'AspectRatio="1"',
+            'AspectRatio="1e308"',
+            r"a.xmp: expected a focal length of 1 to 1e7 pixels, not ",
+        ),
         ("-0.0046", "-1e308", r"a.xmp: expected a principal point within 1e\+07 pixels"),
         (COEFFICIENTS, "1e308 -1e308", r"a.xmp: the distortion of its lens folds the image"),
     ],
 )
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_damaged_xmp_is_named(tmp_path, old, new, message):
-    """Catches a traceback, a message without file and field, and a distortion model read as another."""
+    """Catches a traceback, a message without file and field, and a distortion model read as
+    another."""
     write_xmp(tmp_path / "a.xmp", rig()[0])
     write_image(tmp_path / "a.png")
     text = (tmp_path / "a.xmp").read_text(encoding="utf-8")
@@ -138,12 +187,30 @@ def test_damaged_xmp_is_named(tmp_path, old, new, message):
     ("line", "message"),
     [
         ("a.png,1,2,3,0,0,0", r"cameras.csv: line 2: expected 16 columns, not 7"),
-        ("a.png,1,2,3,0,0,west,18,0,0,0,0,0,0,0,0", r"cameras.csv: line 2: roll: expected 1 finite number, not 'west'"),
-        ("z.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", r"camera z.png: .* has no image, folder or video of the name 'z.png'"),
-        ("a.png,1e308,-1e308,1e308,9,9,9,18,0,0,0,0,0,0,0,0", r"line 2: expected a camera within 1e\+12 units"),
-        ("a.png,1,2,3,1e308,0,0,18,0,0,1e308,-1e308,0,0,0,0", r"line 2: the distortion of its lens folds the image"),
-        ("a" * 200_000 + ".png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", r"cameras.csv: line 2: is not readable CSV"),
-        ("z" * 5000 + ".png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", r"camera zzz.*: .* has no image, folder or video"),
+        (
+            "a.png,1,2,3,0,0,west,18,0,0,0,0,0,0,0,0",
+            r"cameras.csv: line 2: roll: expected 1 finite number, not 'west'",
+        ),
+        (
+            "z.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0",
+            r"camera z.png: .* has no image, folder or video of the name 'z.png'",
+        ),
+        (
+            "a.png,1e308,-1e308,1e308,9,9,9,18,0,0,0,0,0,0,0,0",
+            r"line 2: expected a camera within 1e\+12 units",
+        ),
+        (
+            "a.png,1,2,3,1e308,0,0,18,0,0,1e308,-1e308,0,0,0,0",
+            r"line 2: the distortion of its lens folds the image",
+        ),
+        (
+            "a" * 200_000 + ".png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0",
+            r"cameras.csv: line 2: is not readable CSV",
+        ),
+        (
+            "z" * 5000 + ".png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0",
+            r"camera zzz.*: .* has no image, folder or video",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -158,7 +225,9 @@ def test_damaged_csv_is_named(tmp_path, line, message):
 def test_two_calibrations(tmp_path):
     """Catches one of two exports silently chosen."""
     for name in ("first.csv", "second.csv"):
-        (tmp_path / name).write_text(f"{HEADER}\na.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0\n", encoding="utf-8")
+        (tmp_path / name).write_text(
+            f"{HEADER}\na.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0\n", encoding="utf-8"
+        )
     write_image(tmp_path / "a.png")
     with pytest.raises(StgaError, match=r"first.csv and second.csv are calibrations; choose one"):
         open_footage(tmp_path)

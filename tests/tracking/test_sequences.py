@@ -16,14 +16,19 @@ from .scenes import HEIGHT, WIDTH, rig, write_colmap_text, write_image, write_vi
 def write_folders(root, counts=(6, 6), first=1, parent="images"):
     """Cameras a and b with images numbered from `first`; camera c's red is 10 (c + 1) + number."""
     names = "abcdef"[: len(counts)]
-    write_colmap_text(root / "sparse/0", rig(len(counts)), [f"{name}/frame_1.png" for name in names])
+    write_colmap_text(
+        root / "sparse/0", rig(len(counts)), [f"{name}/frame_1.png" for name in names]
+    )
     for camera, (name, count) in enumerate(zip(names, counts, strict=True)):
         for number in range(first, first + count):
             write_image(root / parent / name / f"frame_{number}.png", 100 * (camera + 1) + number)
 
 
 def red(footage):
-    return {camera.name: [int(camera.image(t)[0, 0, 0]) for t in camera.timesteps] for camera in footage.cameras}
+    return {
+        camera.name: [int(camera.image(t)[0, 0, 0]) for t in camera.timesteps]
+        for camera in footage.cameras
+    }
 
 
 def test_folders_in_natural_order(tmp_path):
@@ -37,7 +42,8 @@ def test_folders_in_natural_order(tmp_path):
 
 
 def test_range_step_and_offset(tmp_path):
-    """Catches an offset of the wrong sign, a range in other units than timesteps, and a lost timestep number."""
+    """Catches an offset of the wrong sign, a range in other units than timesteps, and a lost
+    timestep number."""
     write_folders(tmp_path, (8, 12))
     footage = open_footage(tmp_path, frames=FrameRange(1, 8, 3, {"b": 2}))
     assert footage.timesteps == (1, 4, 7)
@@ -50,9 +56,17 @@ def test_range_step_and_offset(tmp_path):
 @pytest.mark.parametrize(
     ("counts", "frames", "message"),
     [
-        ((6, 5), FrameRange(), r"Camera b has 5 frames and camera a 6; expected recordings of the same length"),
+        (
+            (6, 5),
+            FrameRange(),
+            r"Camera b has 5 frames and camera a 6; expected recordings of the same length",
+        ),
         ((6, 5), FrameRange(0, 6), r"Camera b has 5 frames; expected all up to 6"),
-        ((6, 6), FrameRange(0, 6, 1, {"b": 1}), r"Camera b has 6 frames; expected all up to 6 and its offset"),
+        (
+            (6, 6),
+            FrameRange(0, 6, 1, {"b": 1}),
+            r"Camera b has 6 frames; expected all up to 6 and its offset",
+        ),
         ((6, 6), FrameRange(offsets={"z": 1}), r"Offset for camera z: expected one of a, b"),
         ((6, 6), FrameRange(9), r"Frames from 9 on: the cameras have only 6 in common"),
     ],
@@ -68,7 +82,10 @@ def test_missing_frame_in_one_folder(tmp_path):
     """Catches all later frames of a camera being one too early because one file is missing."""
     write_folders(tmp_path, (7, 6))
     (tmp_path / "images/a/frame_4.png").unlink()
-    with pytest.raises(StgaError, match=r"b/frame_4.png: is 3 frames after the first of camera b, where camera a has"):
+    with pytest.raises(
+        StgaError,
+        match=r"b/frame_4.png: is 3 frames after the first of camera b, where camera a has",
+    ):
         open_footage(tmp_path)
 
 
@@ -77,7 +94,9 @@ def test_camera_without_a_recording(tmp_path):
     write_folders(tmp_path)
     for path in (tmp_path / "images/b").iterdir():
         path.unlink()
-    with pytest.raises(StgaError, match=r"image 'b/frame_1.png': .* has no folder or video of this camera"):
+    with pytest.raises(
+        StgaError, match=r"image 'b/frame_1.png': .* has no folder or video of this camera"
+    ):
         open_footage(tmp_path)
 
 
@@ -86,15 +105,21 @@ def test_other_size_than_calibrated(tmp_path):
     write_folders(tmp_path)
     for path in (tmp_path / "images/b").iterdir():
         write_image(path, size=(20, 15))
-    with pytest.raises(StgaError, match=r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30"):
+    with pytest.raises(
+        StgaError,
+        match=r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30",
+    ):
         open_footage(tmp_path)
 
 
 def test_size_that_changes_in_the_take(tmp_path):
-    """Catches a resolution that was changed while recording, which is noticed only when all cameras have been read."""
+    """Catches a resolution that was changed while recording, which is noticed only when all cameras
+    have been read."""
     write_folders(tmp_path)
     write_image(tmp_path / "images/b/frame_3.png", size=(20, 15))
-    with pytest.raises(StgaError, match=r"frame_3.png: has 20 x 15 pixels at timestep 2, but camera b has 40 x 30"):
+    with pytest.raises(
+        StgaError, match=r"frame_3.png: has 20 x 15 pixels at timestep 2, but camera b has 40 x 30"
+    ):
         open_footage(tmp_path)
 
 
@@ -129,7 +154,12 @@ def write_videos(root, counts=(12, 12), rates=(25, 25), **options):
     names = "ab"[: len(counts)]
     write_colmap_text(root / "calibration", rig(len(counts)), [f"{name}.jpg" for name in names])
     for camera, (name, count, rate) in enumerate(zip(names, counts, rates, strict=False)):
-        write_video(root / f"videos/{name}.mp4", [60 + 10 * n + 5 * camera for n in range(count)], rate=rate, **options)
+        write_video(
+            root / f"videos/{name}.mp4",
+            [60 + 10 * n + 5 * camera for n in range(count)],
+            rate=rate,
+            **options,
+        )
 
 
 @pytest.mark.parametrize("order", [range(12), [11, 3, 4, 5, 0, 10, 2], [6, 6, 5]])
@@ -159,7 +189,9 @@ def test_upright_phone_video(tmp_path):
         container.mux(stream.encode())
     data = bytearray(path.read_bytes())
     matrix = data.index(b"tkhd") + 44  # of the track header, version 0: 16.16 and 2.30 fixed point
-    data[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, HEIGHT << 16, 0, 1 << 30)
+    data[matrix : matrix + 36] = struct.pack(
+        ">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, HEIGHT << 16, 0, 1 << 30
+    )
     path.write_bytes(data)  # a quarter turn clockwise, as players show it
     camera = open_footage(path).cameras[0]
     assert (camera.camera.width, camera.camera.height) == (HEIGHT, WIDTH)
@@ -174,13 +206,17 @@ def test_range_of_videos(tmp_path):
     write_videos(tmp_path, (12, 14))
     footage = open_footage(tmp_path, tmp_path / "calibration", FrameRange(2, 12, 4, {"b": 2}))
     assert footage.timesteps == (2, 6, 10)
-    np.testing.assert_allclose(values_of(footage.cameras[1].image(t) for t in (2, 6, 10)), [105, 145, 185], atol=3)
+    np.testing.assert_allclose(
+        values_of(footage.cameras[1].image(t) for t in (2, 6, 10)), [105, 145, 185], atol=3
+    )
 
 
 def test_videos_of_different_rates(tmp_path):
     """Catches 25 and 30 frames a second paired by number."""
     write_videos(tmp_path, rates=(25, 30))
-    with pytest.raises(StgaError, match=r"camera b has 30 frames a second, that of camera a 25; expected one rate"):
+    with pytest.raises(
+        StgaError, match=r"camera b has 30 frames a second, that of camera a 25; expected one rate"
+    ):
         open_footage(tmp_path, tmp_path / "calibration")
 
 
@@ -220,7 +256,10 @@ def test_two_cameras_without_calibration(tmp_path):
     """Catches a rig without poses taken for one camera."""
     write_image(tmp_path / "a/1.png")
     write_image(tmp_path / "b/1.png")
-    with pytest.raises(StgaError, match=r"has 2 cameras and no calibration; expected transforms.json, a COLMAP model"):
+    with pytest.raises(
+        StgaError,
+        match=r"has 2 cameras and no calibration; expected transforms.json, a COLMAP model",
+    ):
         open_footage(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(StgaError, match=r"has neither images nor videos and no calibration"):
@@ -238,7 +277,9 @@ def test_folders_named_as_calibrations(tmp_path):
 def test_distorted_frames_are_undistorted(tmp_path):
     """Catches frames handed out as recorded beside a pinhole camera that does not show them."""
     pytest.importorskip("cv2")
-    write_colmap_text(tmp_path / "sparse", rig(1), ["a.png"], "SIMPLE_RADIAL", (50.0, WIDTH / 2, HEIGHT / 2, -0.3))
+    write_colmap_text(
+        tmp_path / "sparse", rig(1), ["a.png"], "SIMPLE_RADIAL", (50.0, WIDTH / 2, HEIGHT / 2, -0.3)
+    )
     write_image(tmp_path / "a/1.png", 90)
     write_image(tmp_path / "masks/a/1.png", 255)
     camera = open_footage(tmp_path).cameras[0]

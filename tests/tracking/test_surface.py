@@ -9,7 +9,13 @@ from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.fit import fit_head
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.mesh_image import shaded_image
-from stga_addon.tracking.photo_consistency import Sweep, facing, gray_view, in_sight, surface_offsets
+from stga_addon.tracking.photo_consistency import (
+    Sweep,
+    facing,
+    gray_view,
+    in_sight,
+    surface_offsets,
+)
 from stga_addon.tracking.posed_points import SurfacePoints
 from stga_addon.tracking.seen_surface import RecordedTake, surface_points
 from stga_addon.tracking.smooth_offsets import smooth_offsets
@@ -29,21 +35,30 @@ def head():
 
 
 def rig(count, size=400):
-    eyes = [(np.sin(a), 0.15 * (-1) ** k, np.cos(a)) for k, a in enumerate(np.linspace(-0.5, 0.5, count))]
+    eyes = [
+        (np.sin(a), 0.15 * (-1) ** k, np.cos(a))
+        for k, a in enumerate(np.linspace(-0.5, 0.5, count))
+    ]
     return [look_at(eye, (0, 0, 0), size, size, 3.4 * size) for eye in eyes]
 
 
 def sphere_image(camera, contrast=1.0):
-    """A ball with waves of several lengths on it, seen by intersecting rays with it: no mesh and no rasterizer."""
+    """A ball with waves of several lengths on it, seen by intersecting rays with it: no mesh and no
+    rasterizer."""
     y, x = np.indices((camera.height, camera.width)) + 0.5
-    local = np.stack([(x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y, np.ones(x.shape)], -1)
+    local = np.stack(
+        [(x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y, np.ones(x.shape)], -1
+    )
     rays = local @ camera.world_to_camera[:3, :3]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     middle = -rays @ camera.position
     inside = middle**2 - (camera.position @ camera.position - RADIUS_M**2)
     at = camera.position + (middle - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
     rng = np.random.default_rng(3)
-    level = sum(np.sin(at @ rng.normal(0, 1.5 / length, 3) + rng.uniform(0, 6)) for length in (0.002, 0.003, 0.004) * 4)
+    level = sum(
+        np.sin(at @ rng.normal(0, 1.5 / length, 3) + rng.uniform(0, 6))
+        for length in (0.002, 0.003, 0.004) * 4
+    )
     gray = np.where(inside > 0, 128 + 14 * contrast * level, 255)
     return np.repeat(np.clip(gray, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
@@ -56,10 +71,13 @@ def ball_points():
 
 @pytest.mark.parametrize("offset", [-0.0018, 0.0, 0.0023])
 def test_offsets_lead_to_the_surface_in_the_images(offset):
-    """Catches a wrong sign, a pixel center that is off by half, or a wrong patch: the ball would be missed."""
+    """Catches a wrong sign, a pixel center that is off by half, or a wrong patch: the ball would be
+    missed."""
     cameras, normals = rig(5), ball_points()
     points = (RADIUS_M - offset) * normals
-    views = [gray_view(camera, sphere_image(camera), np.zeros(3), SWEEP.spacing) for camera in cameras]
+    views = [
+        gray_view(camera, sphere_image(camera), np.zeros(3), SWEEP.spacing) for camera in cameras
+    ]
     cosines = np.stack([facing(camera, points, normals) for camera in cameras])
     found, correlation = surface_offsets(views, cosines, points, normals, SWEEP)
     assert (correlation > 0.8).mean() > 0.9
@@ -72,15 +90,20 @@ def test_nothing_is_found_without_texture_or_with_one_camera():
     cameras, normals = rig(5), ball_points()
     points = RADIUS_M * normals
     cosines = np.stack([facing(camera, points, normals) for camera in cameras])
-    plain = [gray_view(camera, sphere_image(camera, 0), np.zeros(3), SWEEP.spacing) for camera in cameras]
+    plain = [
+        gray_view(camera, sphere_image(camera, 0), np.zeros(3), SWEEP.spacing) for camera in cameras
+    ]
     assert not surface_offsets(plain, cosines, points, normals, SWEEP)[1].any()
-    views = [gray_view(camera, sphere_image(camera), np.zeros(3), SWEEP.spacing) for camera in cameras]
+    views = [
+        gray_view(camera, sphere_image(camera), np.zeros(3), SWEEP.spacing) for camera in cameras
+    ]
     alone = cosines * (np.arange(5) == 2)[:, None]
     assert not surface_offsets(views, alone, points, normals, SWEEP)[1].any()
 
 
 def test_large_images_are_reduced_to_the_size_of_a_sample():
-    """Catches a principal point that reduction moves, and samples that skip most pixels of a large image."""
+    """Catches a principal point that reduction moves, and samples that skip most pixels of a large
+    image."""
     camera = look_at((0.2, 0.1, 1.0), (0, 0, 0), 1210, 900, 12000)
     rng = np.random.default_rng(0)
     view = gray_view(camera, rng.integers(0, 255, (900, 1210, 3), np.uint8), np.zeros(3), 0.001)
@@ -88,7 +111,9 @@ def test_large_images_are_reduced_to_the_size_of_a_sample():
     assert factor == 11  # 0.085 mm a pixel
     assert view.image.shape == (81, 110) == (view.camera.height, view.camera.width)
     points = rng.normal(0, 0.02, (9, 3))
-    np.testing.assert_allclose(view.camera.project(points)[0] * factor, camera.project(points)[0], atol=1e-9)
+    np.testing.assert_allclose(
+        view.camera.project(points)[0] * factor, camera.project(points)[0], atol=1e-9
+    )
 
 
 def test_hidden_points_are_not_in_sight(head):
@@ -105,7 +130,9 @@ def test_hidden_points_are_not_in_sight(head):
 def test_surface_points_leave_out_eyeballs_and_teeth(head):
     """Catches points on parts that reflections and lids make look elsewhere."""
     points = surface_points(head, 400)
-    inner = np.concatenate([head.model.masks[name] for name in ("left_eyeball", "right_eyeball", "teeth")])
+    inner = np.concatenate(
+        [head.model.masks[name] for name in ("left_eyeball", "right_eyeball", "teeth")]
+    )
     assert len(points) > 250
     assert not np.isin(head.model.faces[points.face], inner).any()
 
@@ -118,7 +145,11 @@ def test_offsets_are_smooth_robust_and_local(head):
     rng = np.random.default_rng(0)
     true = 0.003 * np.exp(-((at - at[at[:, 2].argmax()]) ** 2).sum(1) / 0.04**2)
     wrong = rng.random(len(at)) < 0.15
-    noisy = true + rng.normal(0, 0.0004, len(at)) + np.where(wrong, rng.uniform(-0.004, 0.004, len(at)), 0)
+    noisy = (
+        true
+        + rng.normal(0, 0.0004, len(at))
+        + np.where(wrong, rng.uniform(-0.004, 0.004, len(at)), 0)
+    )
     front = at[:, 2] > np.median(at[:, 2])
     found = smooth_offsets(vertices, faces, points, noisy, np.where(front, 0.2, 0.0))
     error = points.on(found[:, None], faces)[:, 0] - true
@@ -128,8 +159,8 @@ def test_offsets_are_smooth_robust_and_local(head):
 
 
 def test_offsets_do_not_depend_on_how_the_surface_is_cut_into_triangles():
-    """Catches a Laplacian that counts neighbors: on triangles of many sizes, as the bundled head's, it
-    takes a slope for a bend, and smooths the person away."""
+    """Catches a Laplacian that counts neighbors: on triangles of many sizes, as the bundled head's,
+    it takes a slope for a bend, and smooths the person away."""
     y, x = (0.004 * values.ravel() for values in np.indices((12, 12)))
     flat = np.column_stack([x, y]) + np.random.default_rng(0).uniform(-0.0013, 0.0013, (144, 2))
     vertices = np.column_stack([flat, np.zeros(144)])
@@ -137,7 +168,9 @@ def test_offsets_do_not_depend_on_how_the_surface_is_cut_into_triangles():
     faces = np.concatenate([cell[:, None] + [0, 1, 12], cell[:, None] + [1, 13, 12]])
     points = SurfacePoints(np.arange(len(faces)), np.full((len(faces), 3), 1 / 3))
     slope = 0.001 + 0.05 * flat[:, 0]
-    found = smooth_offsets(vertices, faces, points, points.on(slope[:, None], faces)[:, 0], np.full(len(faces), 0.1))
+    found = smooth_offsets(
+        vertices, faces, points, points.on(slope[:, None], faces)[:, 0], np.full(len(faces), 0.1)
+    )
     assert np.abs(found - slope).max() < 5e-5
 
 
@@ -147,8 +180,8 @@ def painted(head):
 
 
 def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
-    """Catches a surface that does not reach the fit, or the person's own offset that is lost: landmarks alone, wrong by
-    3 mm each, leave errors of millimeters."""
+    """Catches a surface that does not reach the fit, or the person's own offset that is lost:
+    landmarks alone, wrong by 3 mm each, leave errors of millimeters."""
     model, cameras = head.model, rig(5)
     rng = np.random.default_rng(5)
     shape, front = rng.normal(0, 0.7, model.n_identity), model.v_template[:, 2] > 0.04
@@ -156,15 +189,25 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     meshes = [flame_forward(model, shape, frame_at(head, t), bump) for t in (0, 6)]
     places = places_on(head, 150)
     wrong = rng.normal(0, 0.0018, (150, 3))
-    landmarks = {t: seen(cameras, places.on(mesh, model.faces) + wrong) for t, mesh in enumerate(meshes)}
-    pictures = [[(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes]
+    landmarks = {
+        t: seen(cameras, places.on(mesh, model.faces) + wrong) for t, mesh in enumerate(meshes)
+    }
+    pictures = [
+        [(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes
+    ]
     reliable = np.ones(150, bool)
     first = fit_head(head, places, reliable, landmarks)
     fit = fit_surface(
-        head, first, RecordedTake(places, reliable, landmarks, lambda t, most=None: pictures[t]), Helpers(1)
+        head,
+        first,
+        RecordedTake(places, reliable, landmarks, lambda t, most=None: pictures[t]),
+        Helpers(1),
     )
     errors = [
-        [np.median(distances(one, posed_mesh(one, one.parameters[t]), meshes[t], head, front)) for t in (0, 1)]
+        [
+            np.median(distances(one, posed_mesh(one, one.parameters[t]), meshes[t], head, front))
+            for t in (0, 1)
+        ]
         for one in (first, fit)
     ]
     assert np.max(errors[1]) < 0.0006 < np.min(errors[0])
@@ -173,13 +216,19 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
 
     blank = [[(c, np.full_like(image, 90)) for c, image in own] for own in pictures]
     assert (
-        fit_surface(head, first, RecordedTake(places, reliable, landmarks, lambda t, most=None: blank[t]), Helpers(1))
+        fit_surface(
+            head,
+            first,
+            RecordedTake(places, reliable, landmarks, lambda t, most=None: blank[t]),
+            Helpers(1),
+        )
         is first
     )
 
 
 def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
-    """Catches landmarks that count as corrected for the person, although their errors may be the one expression."""
+    """Catches landmarks that count as corrected for the person, although their errors may be the
+    one expression."""
     model, cameras, places, reliable = head.model, rig(5), places_on(head, 150), np.ones(150, bool)
     mesh = flame_forward(model, np.zeros(model.n_identity), frame_at(head, 6))
     wrong = np.random.default_rng(5).normal(0, 0.0018, (150, 3))
@@ -204,16 +253,31 @@ def distances(fit, found, true, head, front):
 
 @pytest.mark.parametrize(("count", "share"), [(5, 0.6), (3, 0.5)])
 def test_skin_slides_as_dense_tracking_has_it(head, count, share):
-    """Catches poses that follow the detector's landmarks where the surface does not tell, or that of three cameras
-    follow the surface: the detector has the lower face 6 mm to one side, at each timestep another."""
+    """Catches poses that follow the detector's landmarks where the surface does not tell, or that
+    of three cameras follow the surface: the detector has the lower face 6 mm to one side, at each
+    timestep another."""
     model, cameras = head.model, rig(count, 280)
-    meshes = [flame_forward(model, np.zeros(model.n_identity), frame_at(head, t)) for t in (0, 3, 6)]
-    places, reliable, front = places_on(head, 150), np.ones(150, bool), model.v_template[:, 2] > 0.04
+    meshes = [
+        flame_forward(model, np.zeros(model.n_identity), frame_at(head, t)) for t in (0, 3, 6)
+    ]
+    places, reliable, front = (
+        places_on(head, 150),
+        np.ones(150, bool),
+        model.v_template[:, 2] > 0.04,
+    )
     lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]
     right = {t: seen(cameras, places.on(mesh, model.faces)) for t, mesh in enumerate(meshes)}
-    wrong = {t: seen(cameras, places.on(mesh, model.faces) + (t - 1) * lower) for t, mesh in enumerate(meshes)}
-    pictures = [[(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes]
-    take, errors = RecordedTake(places, reliable, wrong, lambda t, most=None: pictures[t], metric=True), []
+    wrong = {
+        t: seen(cameras, places.on(mesh, model.faces) + (t - 1) * lower)
+        for t, mesh in enumerate(meshes)
+    }
+    pictures = [
+        [(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes
+    ]
+    take, errors = (
+        RecordedTake(places, reliable, wrong, lambda t, most=None: pictures[t], metric=True),
+        [],
+    )
     for dense, landmarks in ((False, wrong), (True, right)):
         first = fit_head(head, places, reliable, landmarks, metric=True)
         fit = fit_surface(head, first, take, Helpers(1), dense=dense)
@@ -234,5 +298,7 @@ def test_one_camera_leaves_the_fit_as_it_is(head):
     mesh = flame_forward(head.model, np.zeros(head.model.n_identity), frame_at(head, 0))
     landmarks = {0: seen(rig(1), places.on(mesh, head.model.faces))}
     fit = fit_head(head, places, np.ones(100, bool), landmarks)
-    take = RecordedTake(places, np.ones(100, bool), landmarks, lambda t: pytest.fail("no image is needed"))
+    take = RecordedTake(
+        places, np.ones(100, bool), landmarks, lambda t: pytest.fail("no image is needed")
+    )
     assert fit_surface(head, fit, take, Helpers(1)) is fit

@@ -1,4 +1,5 @@
-"""The torso's motion against generated takes in which shoulders are a body of their own, that moves as told."""
+"""The torso's motion against generated takes in which shoulders are a body of their own, that moves
+as told."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +14,13 @@ from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import Similarity, rasterize, weighted_procrustes
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_npz
-from stga_addon.flame.forward import FlameFrame, axis_angle_matrices, flame_forward, frame_of, joint_positions
+from stga_addon.flame.forward import (
+    FlameFrame,
+    axis_angle_matrices,
+    flame_forward,
+    frame_of,
+    joint_positions,
+)
 from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
 from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit
@@ -34,7 +41,15 @@ from stga_addon.tracking.torso_motion import (
     read_torso_motion,
     read_torso_points,
 )
-from stga_addon.tracking.torso_take import NECK, ROOT, BothWays, PosedTorso, TorsoPose, TorsoTake, with_root
+from stga_addon.tracking.torso_take import (
+    NECK,
+    ROOT,
+    BothWays,
+    PosedTorso,
+    TorsoPose,
+    TorsoTake,
+    with_root,
+)
 from stga_addon.tracking.track import track
 from stga_addon.tracking.write_capture import posed_mesh
 from stga_addon.worker.helpers import Helpers
@@ -61,14 +76,24 @@ def quiet(stage, done, total):
 
 def ellipsoid():
     """Shoulders (V, 3), faces (F, 3) and colors (V, 3) of patterned cloth, below the small head."""
-    around, down = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.linspace(0, np.pi, 45), indexing="ij")
-    unit = np.stack([np.sin(down) * np.cos(around), np.cos(down), np.sin(down) * np.sin(around)], -1).reshape(-1, 3)
+    around, down = np.meshgrid(
+        np.linspace(0, 2 * np.pi, 90), np.linspace(0, np.pi, 45), indexing="ij"
+    )
+    unit = np.stack(
+        [np.sin(down) * np.cos(around), np.cos(down), np.sin(down) * np.sin(around)], -1
+    ).reshape(-1, 3)
     vertices = unit * CHEST_SIZE_M + CHEST_CENTER_M
     grid = np.arange(90 * 45).reshape(90, 45)
-    a, b, c, d = (own.ravel() for own in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]))
+    a, b, c, d = (
+        own.ravel() for own in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:])
+    )
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     waves = np.sin(vertices @ np.random.default_rng(1).normal(0, 160, (3, 5)))
-    return vertices, faces, np.clip(0.5 + 0.12 * waves @ np.random.default_rng(2).normal(0, 1, (5, 3)), 0.05, 0.95)
+    return (
+        vertices,
+        faces,
+        np.clip(0.5 + 0.12 * waves @ np.random.default_rng(2).normal(0, 1, (5, 3)), 0.05, 0.95),
+    )
 
 
 @dataclass(frozen=True)
@@ -101,18 +126,24 @@ def fine_head():
 
 
 def take(head, heads, torsos, size=SIZE, shifts=None):
-    """Fit, parameters of a head tracked as one, and footage; heads, torsos (T,): degrees about the vertical axis;
+    """Fit, parameters of a head tracked as one, and footage; heads, torsos (T,): degrees about the
+    vertical axis;
     shifts (T, 3) or (T, V, 3): of the shoulders, or of each of their vertices, in meters."""
     pictured, colors = subdivided(small_head(0), small_head_colors())
     colors = np.clip(colors ** (1 / 1.8), 0, 1)
     cloth, cloth_faces, cloth_colors = ellipsoid()
     faces = np.concatenate([pictured.faces, cloth_faces + len(pictured.v_template)])
-    cameras = [look_at((np.sin(a), 0.0, np.cos(a)), (0, -0.07, 0), *size, 2.6 * size[0]) for a in (-0.6, 0.0, 0.6)]
+    cameras = [
+        look_at((np.sin(a), 0.0, np.cos(a)), (0, -0.07, 0), *size, 2.6 * size[0])
+        for a in (-0.6, 0.0, 0.6)
+    ]
     frames, shape = [Frames() for _ in cameras], np.zeros(pictured.n_identity)
     one = person(head, np.zeros(head.model.n_identity))
     joints = joint_positions(one.model, one.model.v_template)
     parameters = {}
-    for timestep, (turned, carried) in enumerate(zip(np.radians(heads), np.radians(torsos), strict=True)):
+    for timestep, (turned, carried) in enumerate(
+        zip(np.radians(heads), np.radians(torsos), strict=True)
+    ):
         zero = np.zeros(3)
         frame = FlameFrame(
             np.zeros(one.model.n_expression), np.array([0, carried, 0]), np.array([0, turned - carried, 0]),
@@ -123,22 +154,34 @@ def take(head, heads, torsos, size=SIZE, shifts=None):
         shoulders += 0 if shifts is None else shifts[timestep]
         mesh = np.concatenate([flame_forward(pictured, shape, frame), shoulders])
         for camera, own in zip(cameras, frames, strict=True):
-            own.images.append(shaded_image(mesh, faces, camera, np.concatenate([colors, cloth_colors])))
-            own.masks.append(np.where(rasterize(mesh, faces, camera)[0] >= 0, 255, 0).astype(np.uint8))
+            own.images.append(
+                shaded_image(mesh, faces, camera, np.concatenate([colors, cloth_colors]))
+            )
+            own.masks.append(
+                np.where(rasterize(mesh, faces, camera)[0] >= 0, 255, 0).astype(np.uint8)
+            )
         arm = joints[NECK] - joints[ROOT]
-        parameters[timestep] = with_root(frame.parameters, axis_angle_matrices(np.array([[0, turned, 0]]))[0], arm)
+        parameters[timestep] = with_root(
+            frame.parameters, axis_angle_matrices(np.array([[0, turned, 0]]))[0], arm
+        )
     fit = HeadFit(one, np.zeros(0), parameters, Similarity(1.0, np.eye(3), np.zeros(3)))
-    filmed = [FootageCamera(str(n), camera, own) for n, (camera, own) in enumerate(zip(cameras, frames, strict=True))]
+    filmed = [
+        FootageCamera(str(n), camera, own)
+        for n, (camera, own) in enumerate(zip(cameras, frames, strict=True))
+    ]
     return fit, parameters, Footage(Path("take"), tuple(filmed), tuple(range(len(heads))))
 
 
 def torso_angles(fit, parameters, offsets):
-    """(T,) degrees by which the end of the neck, which carries the shoulders, is turned about the vertical axis."""
+    """(T,) degrees by which the end of the neck, which carries the shoulders, is turned about the
+    vertical axis."""
     model = fit.head.model
     used = np.unique(model.faces[torso_faces(model)])
     turns = [
         weighted_procrustes(
-            model.v_template[used], posed_mesh(fit, values, offsets.get(timestep))[used], np.ones(len(used))
+            model.v_template[used],
+            posed_mesh(fit, values, offsets.get(timestep))[used],
+            np.ones(len(used)),
         )[0]
         for timestep, values in parameters.items()
     ]
@@ -146,7 +189,9 @@ def torso_angles(fit, parameters, offsets):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("heads", "torsos", "motions"), [(1, 0, ("still", "own")), (1, 0.5, ("own",))])
+@pytest.mark.parametrize(
+    ("heads", "torsos", "motions"), [(1, 0, ("still", "own")), (1, 0.5, ("own",))]
+)
 def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, motions):
     """Catches shoulders that ride on the head, and a head that is moved to turn them."""
     fit, parameters, footage = take(head, heads * SWING_DEG, torsos * SWING_DEG)
@@ -170,8 +215,9 @@ def lifted(head):
 
 @pytest.mark.slow
 def test_shoulders_that_are_lifted_are_followed(head, lifted):
-    """Catches a torso that is only turned, of which patterned cloth is off by pixels, offsets that FLAME's joints undo,
-    a head that is moved with them, and points that are as deep as the neck instead of on the chest."""
+    """Catches a torso that is only turned, of which patterned cloth is off by pixels, offsets that
+    FLAME's joints undo, a head that is moved with them, and points that are as deep as the neck
+    instead of on the chest."""
     fit, parameters, footage = lifted
     followed = follow_torso(fit, parameters, footage, Helpers(1), quiet)
     found, offsets, torso = followed.parameters, followed.offsets, followed.motion
@@ -193,8 +239,8 @@ def test_shoulders_that_are_lifted_are_followed(head, lifted):
 
 
 def test_the_necks_end_is_drawn_over_the_chest(fine_head):
-    """Catches a mesh that is drawn to the points' mean depth, one that ends at the neck, a throat that is moved, and a
-    back that is made up."""
+    """Catches a mesh that is drawn to the points' mean depth, one that ends at the neck, a throat
+    that is moved, and a back that is made up."""
     cloth, _, _ = ellipsoid()
     sheet = torso_sheet(fine_head.model)
     at, base = fine_head.model.v_template[sheet.vertices], np.array([0.0, -0.14, -0.04])
@@ -213,12 +259,14 @@ def test_the_necks_end_is_drawn_over_the_chest(fine_head):
 
 @pytest.mark.slow
 def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
-    """Catches a torso that only moves as one, flow that is applied in another camera's or the head's axes, and a head
-    that moves with the joint that FLAME finds from the bent vertices."""
+    """Catches a torso that only moves as one, flow that is applied in another camera's or the
+    head's axes, and a head that moves with the joint that FLAME finds from the bent vertices."""
     cloth, _, _ = ellipsoid()
     near = np.exp(-(((cloth - CLOTH_CENTER_M) / CLOTH_SIGMA_M) ** 2).sum(1) / 2)[:, None]
     slides = np.array([slide * near for slide in SLIDE_M])
-    fit, parameters, footage = take(fine_head, 0.5 * SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M[:, None] + slides)
+    fit, parameters, footage = take(
+        fine_head, 0.5 * SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M[:, None] + slides
+    )
     posed = TorsoTake(fit, parameters, footage.cameras, torso_faces(fine_head.model))
     motion = posed.motion({t: TorsoPose(np.eye(3), LIFT_M[t]) for t in parameters}, rigid=True)
     first, moved = 3, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
@@ -231,19 +279,24 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
         meshes[timestep] = posed_mesh(fit, values, offset)
         apart = fine_head.model.weights[:, ROOT] == 0
         assert np.abs(meshes[timestep] - posed_mesh(fit, parameters[timestep]))[apart].max() < 2e-3
-    distance, nearest = cKDTree(cloth + slides[first] + moved[first]).query(meshes[first][bending.vertices])
+    distance, nearest = cKDTree(cloth + slides[first] + moved[first]).query(
+        meshes[first][bending.vertices]
+    )
     on_cloth = (distance < 0.01) & (near[nearest, 0] > 0.5)
     assert on_cloth.sum() > 5
     true = (slides - slides[first])[:, nearest[on_cloth]]
-    found = [meshes[t][bending.vertices] - meshes[first][bending.vertices] - moved[t] + moved[first] for t in meshes]
+    found = [
+        meshes[t][bending.vertices] - meshes[first][bending.vertices] - moved[t] + moved[first]
+        for t in meshes
+    ]
     wrong = np.array(found)[:, on_cloth] - true
     assert np.linalg.norm(wrong, axis=2).mean() < 0.5 * np.linalg.norm(true, axis=2).mean()
 
 
 @pytest.mark.slow
 def test_a_torso_that_rides_on_the_head_changes_nothing(head):
-    """Catches a torso that noise turns: a bust on a turntable, or a studio capture, keeps its parameters bit for
-    bit."""
+    """Catches a torso that noise turns: a bust on a turntable, or a studio capture, keeps its
+    parameters bit for bit."""
     fit, parameters, footage = take(head, SWING_DEG, SWING_DEG)
     followed = follow_torso(fit, parameters, footage, Helpers(1), quiet)
     found, offsets, torso = followed.parameters, followed.offsets, followed.motion
@@ -256,7 +309,9 @@ def test_a_torso_that_rides_on_the_head_changes_nothing(head):
 def test_without_masks_the_torso_is_not_told_from_the_wall(head):
     """Catches shoulders that follow the backdrop."""
     fit, parameters, footage = take(head, [0, 5, 10, 15], [0, 0, 0, 0], (40, 55))
-    bare = tuple(replace(own, frames=replace(own.frames, masks=[None] * 4)) for own in footage.cameras)
+    bare = tuple(
+        replace(own, frames=replace(own.frames, masks=[None] * 4)) for own in footage.cameras
+    )
     followed = follow_torso(fit, parameters, replace(footage, cameras=bare), Helpers(1), quiet)
     found, offsets, torso = followed.parameters, followed.offsets, followed.motion
     assert torso is None
@@ -270,21 +325,24 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
     zero = np.zeros(3)
     frame = FlameFrame(rng.normal(0, 0.3, one.model.n_expression), rng.normal(0, 0.4, 3), rng.normal(0, 0.2, 3),
                        zero, rng.normal(0, 1, 3), np.zeros(6))  # fmt: skip
-    model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))  # the throat's correctives are another thing
+    # the throat's correctives are another thing
+    model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))
     joints = joint_positions(model, model.v_template + model.shapedirs @ frame.expr)
     rotation = axis_angle_matrices(rng.normal(0, 0.5, (1, 3)))[0]
     changed = with_root(frame.parameters, rotation, joints[NECK] - joints[ROOT])
     before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, frame_of(changed)))
     apart = model.weights[:, ROOT] == 0
     np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
-    np.testing.assert_allclose(axis_angle_matrices(frame_of(changed).rotation[None])[0], rotation, atol=1e-12)
+    np.testing.assert_allclose(
+        axis_angle_matrices(frame_of(changed).rotation[None])[0], rotation, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(("earlier", "bends"), [(True, True), (False, True), (True, False)])
 def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_head, earlier, bends):
-    """Catches a drape that offsets repeat, or that template or static offset lack, an earlier static
-    offset that is lost, cloth that does not bend, a head that offsets move, and figures of the
-    report in other units or of another joint."""
+    """Catches a drape that offsets repeat, or that template or static offset lack, an earlier
+    static offset that is lost, cloth that does not bend, a head that offsets move, and figures of
+    the report in other units or of another joint."""
     bare, rng = person(fine_head, np.zeros(fine_head.model.n_identity)), np.random.default_rng(3)
     size = bare.model.v_template.shape
     static = rng.normal(0, 1e-3, size) * earlier
@@ -309,7 +367,9 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
         rest = model.v_template + model.shapedirs @ expression
         turn, joint = Rotation.from_rotvec(pose[:3]).as_matrix(), model.j_regressor[ROOT] @ rest
         rigid = (rest - joint) @ turn.T + joint + pose[-3:] + torso.shift
-        wanted = share * rigid + (1 - share) * flame_forward(model, np.zeros(0), frame_of(torso.parameters))
+        wanted = share * rigid + (1 - share) * flame_forward(
+            model, np.zeros(0), frame_of(torso.parameters)
+        )
         if bends:
             wanted[cloth] += (drape[cloth] + bent[timestep]) @ turn.T
         found = posed_mesh(followed.fit, followed.parameters[timestep], followed.offsets[timestep])
@@ -319,7 +379,9 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     np.testing.assert_allclose(followed.fit.head.model.v_template, template, atol=1e-15)
     motion = followed.motion
     assert motion.misfit == decided.misfit
-    turns = [np.linalg.norm(values[expressions + 3 : expressions + 6]) for values in tracked.values()]
+    turns = [
+        np.linalg.norm(values[expressions + 3 : expressions + 6]) for values in tracked.values()
+    ]
     assert motion.turn_deg == pytest.approx(np.degrees(max(turns)))
     shifts = [1000 * np.linalg.norm(torso.shift) for torso in posed.values()]
     assert motion.shift_mm == pytest.approx(max(shifts))
@@ -329,8 +391,8 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
 
 @pytest.mark.slow
 def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypatch):
-    """Catches a torso that is followed and then not written, or not reported to those who train on the capture; dense
-    tracking that `track` does not run, and a report without it."""
+    """Catches a torso that is followed and then not written, or not reported to those who train on
+    the capture; dense tracking that `track` does not run, and a report without it."""
     # What takes the longest, and changes neither
     monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
     fit, parameters, footage = lifted
@@ -348,16 +410,27 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     for number, camera in enumerate(cameras):
         meshes = [posed_mesh(fit, parameters[timestep]) for timestep in range(TIMESTEPS)]
         points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
-        write_npz(tmp_path / f"points/cam{number}.npz", {"timesteps": np.arange(TIMESTEPS), "points": points})
+        write_npz(
+            tmp_path / f"points/cam{number}.npz",
+            {"timesteps": np.arange(TIMESTEPS), "points": points},
+        )
     out = tmp_path / "out"
-    result = track(open_footage(tmp_path / "footage"), tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
+    result = track(
+        open_footage(tmp_path / "footage"),
+        tmp_path / "head.npz",
+        out,
+        tmp_path / "points",
+        mattes=False,
+    )
     found = read_torso_motion(out)
     assert found == result.torso
     assert found.shift_mm > 5
     assert len(read_torso_points(out).at) > 100
     misfit = read_json(out / REPORT_FILE)["image_misfit"]
     assert list(misfit) == list(REGIONS)
-    assert all(list(own) == [str(timestep) for timestep in range(TIMESTEPS)] for own in misfit.values())
+    assert all(
+        list(own) == [str(timestep) for timestep in range(TIMESTEPS)] for own in misfit.values()
+    )
     assert all(0 < value < 0.5 for own in result.image_misfit.values() for value in own.values())
     capture = open_capture(out, tmp_path / "head.npz")
     sequence, used = capture.flame, np.unique(capture.faces[torso_faces(capture.flame.model)])

@@ -31,7 +31,12 @@ from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.landmarks import CameraLandmarks, detect_landmarks, landmark_file, read_camera
+from stga_addon.tracking.landmarks import (
+    CameraLandmarks,
+    detect_landmarks,
+    landmark_file,
+    read_camera,
+)
 from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
@@ -57,8 +62,8 @@ def take(tmp_path_factory, head):
 
 @pytest.fixture
 def recorded(tmp_path, take, monkeypatch):
-    """A copy of the take that a test may change, and its meshes. Its blank images are not searched for the surface,
-    which would take a third of the time."""
+    """A copy of the take that a test may change, and its meshes. Its blank images are not searched
+    for the surface, which would take a third of the time."""
     monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
     folder, meshes = take
     return shutil.copytree(folder, tmp_path, dirs_exist_ok=True), meshes
@@ -66,21 +71,29 @@ def recorded(tmp_path, take, monkeypatch):
 
 def command(folder, *more):
     out = ["--out", str(folder / "out"), "--landmarks", str(folder / "points")]
-    return main(["track", str(folder / "footage"), "--model", str(folder / "head.npz"), *out, *more])
+    return main(
+        ["track", str(folder / "footage"), "--model", str(folder / "head.npz"), *out, *more]
+    )
 
 
 def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
-    """Catches a default that needs a file, a capture that opens only with one, or with another one that is given, and
-    weights of another scale."""
+    """Catches a default that needs a file, a capture that opens only with one, or with another one
+    that is given, and weights of another scale."""
     monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
     head = HeadModel(flame_model(None), "flame")
     meshes = record(tmp_path, head)
     paths = [str(tmp_path / name) for name in ("footage", "out", "points")]
-    assert main(["track", paths[0], "--out", paths[1], "--landmarks", paths[2], "--mattes", "none"]) == 0
+    assert (
+        main(["track", paths[0], "--out", paths[1], "--landmarks", paths[2], "--mattes", "none"])
+        == 0
+    )
     capture = open_capture(tmp_path / "out", tmp_path / "head.npz")
     assert capture.flame_file == tmp_path / "out/bundled_head.npz"
     assert capture.flame.model.expression_names == head.model.expression_names
-    face, cameras = head.model.masks["nose"], {f"cam{number}": camera for number, camera in enumerate(rig())}
+    face, cameras = (
+        head.model.masks["nose"],
+        {f"cam{number}": camera for number, camera in enumerate(rig())},
+    )
     for view in capture.views["train"]:
         if view.timestep != 2:
             pixels, _ = view.camera.project(capture.mesh(view.timestep)[face])
@@ -89,7 +102,8 @@ def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
 
 
 def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsys, head):
-    """Catches wrong axes, units or a principal point counted from the wrong side in what is written."""
+    """Catches wrong axes, units or a principal point counted from the wrong side in what is
+    written."""
     folder, meshes = recorded
     assert command(folder, "--meshes") == 0
     printed = capsys.readouterr().out
@@ -114,13 +128,18 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsy
 
 @pytest.mark.parametrize(("scale", "arguments"), [(1.06, []), (1000.0, ["--world", "keep"])])
 def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
-    """Catches cameras and head moved, turned or scaled away from the scene that the footage was filmed in.
+    """Catches cameras and head moved, turned or scaled away from the scene that the footage was
+    filmed in.
 
-    Without --world, the calibration says it. The head is 6 % larger than the model's, or in millimeters.
+    Without --world, the calibration says it. The head is 6 % larger than the model's, or in
+    millimeters.
     """
     folder, meshes = recorded
     turn = Rotation.from_euler("xyz", [100, -40, 20], degrees=True).as_matrix()
-    world, path = Similarity(scale, turn, np.array([2.0, -1.0, 0.5]) * scale), folder / "footage/transforms.json"
+    world, path = (
+        Similarity(scale, turn, np.array([2.0, -1.0, 0.5]) * scale),
+        folder / "footage/transforms.json",
+    )
     values = read_json(path)
     for entry in values["frames"]:
         pose = np.array(entry["transform_matrix"])
@@ -129,25 +148,37 @@ def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
     write_json(path, values if arguments else {**values, "world": "keep"})
     assert command(folder, *arguments) == 0
     assert ("is kept but for its scale" in capsys.readouterr().out) == (scale == 1000)
-    capture, kept = open_capture(folder / "out", folder / "head.npz"), read_json(folder / "out/tracking.json")
+    capture, kept = (
+        open_capture(folder / "out", folder / "head.npz"),
+        read_json(folder / "out/tracking.json"),
+    )
     unit = kept["meters_per_unit"]
     assert unit == pytest.approx(1.0 if scale < 2 else 0.001, rel=1e-9 if scale < 2 else 0.03)
     filmed = {camera.name: camera.camera for camera in open_footage(folder / "footage").cameras}
     for view in capture.views["train"]:
         camera = filmed[f"cam{view.camera_index}"]
         np.testing.assert_allclose(view.camera.position, unit * camera.position, atol=1e-6)
-        np.testing.assert_allclose(view.camera.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-9)
+        np.testing.assert_allclose(
+            view.camera.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-9
+        )
     for timestep in (0, 3):
-        missed = (capture.mesh(timestep) - unit * world.apply(meshes[timestep]))[head.model.masks["face"]]
+        missed = (capture.mesh(timestep) - unit * world.apply(meshes[timestep]))[
+            head.model.masks["face"]
+        ]
         assert np.linalg.norm(missed, axis=1).mean() < 2e-3
 
 
 def test_progress_names_step_and_quality(recorded):
-    """Catches a bar that jumps back, a step that it does not know, and a fit of which nobody hears how good it is."""
+    """Catches a bar that jumps back, a step that it does not know, and a fit of which nobody hears
+    how good it is."""
     folder, _ = recorded
     paths = (folder / "footage", folder / "head.npz", folder / "out")
     told = []
-    perform(Track(*paths, landmarks=folder / "points"), lambda progress: bool(told.append(progress)), print)
+    perform(
+        Track(*paths, landmarks=folder / "points"),
+        lambda progress: bool(told.append(progress)),
+        print,
+    )
     shares = [progress.share for progress in told]
     assert shares == sorted(shares)
     assert {progress.stage for progress in told} <= {*STAGES, "Tracked"}
@@ -158,7 +189,8 @@ def test_progress_names_step_and_quality(recorded):
 
 @pytest.mark.parametrize("fps", [None, 60000 / 1001])
 def test_frame_rate_of_the_footage(recorded, fps):
-    """Catches a rate that is read and thrown away, or that a step of the frames makes another one."""
+    """Catches a rate that is read and thrown away, or that a step of the frames makes another
+    one."""
     folder, _ = recorded
     for path in (folder / "points").glob("cam*.npz"):
         write_npz(path, {name: array[::3] for name, array in read_npz(path).items()})
@@ -184,7 +216,10 @@ def test_offsets_that_are_none(recorded, capsys, offset):
 def test_offsets_of_listed_frames(recorded, capsys):
     """Catches an offset that is silently ignored where the calibration lists frames by timestep."""
     assert command(recorded[0], "--offset", "cam1=3") == 2
-    assert "transforms.json: lists images, which offsets do not apply to; expected none" in capsys.readouterr().err
+    assert (
+        "transforms.json: lists images, which offsets do not apply to; expected none"
+        in capsys.readouterr().err
+    )
     assert not (recorded[0] / "out").exists()
 
 
@@ -222,15 +257,21 @@ def test_a_mirrored_rig_is_named(recorded, capsys, head):
     """Catches images that are all mirrored, where no camera stands out from the others."""
     folder, meshes = recorded
     template, faces = head.model.v_template, head.model.faces
-    twins, _ = nearest_points(template, faces, places_on(head, LANDMARKS).on(template, faces) * [-1, 1, 1])
+    twins, _ = nearest_points(
+        template, faces, places_on(head, LANDMARKS).on(template, faces) * [-1, 1, 1]
+    )
     for number, camera in enumerate(rig()):
         path = folder / f"points/cam{number}.npz"
         points = np.stack([camera.project(twins.on(mesh, faces))[0] for mesh in meshes])
-        points[..., 0] = SIZE - points[..., 0]  # a detector calls the left eye of a mirrored face its right one
+        # a detector calls the left eye of a mirrored face its right one
+        points[..., 0] = SIZE - points[..., 0]
         write_npz(path, dict(np.load(path)) | {"points": points})
     assert command(folder) == 2
     message = capsys.readouterr().err
-    assert re.search(r"camera cam\d: .* pixels at timestep \d, and those of the other cameras are too; check", message)
+    assert re.search(
+        r"camera cam\d: .* pixels at timestep \d, and those of the other cameras are too; check",
+        message,
+    )
     assert not (folder / "out/transforms_train.json").exists()
 
 
@@ -242,13 +283,16 @@ def test_a_camera_out_of_step_is_named(recorded, capsys):
     write_npz(folder / "points/cam3.npz", arrays)
     assert command(folder) == 2
     message = capsys.readouterr().err
-    assert re.search(r"camera cam3: .* at timestep \d, .* check its calibration, synchronization", message)
+    assert re.search(
+        r"camera cam3: .* at timestep \d, .* check its calibration, synchronization", message
+    )
     assert not (folder / "out/transforms_train.json").exists()
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.05])
 def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
-    """Catches a camera whose focal length is 5 % off, which moves landmarks less than a detector's own errors."""
+    """Catches a camera whose focal length is 5 % off, which moves landmarks less than a detector's
+    own errors."""
     folder, _ = recorded
     path = folder / "footage/transforms.json"
     written = read_json(path)
@@ -257,11 +301,14 @@ def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
             entry["fl_x"], entry["fl_y"] = factor * entry["fl_x"], factor * entry["fl_y"]
     write_json(path, written)
     assert command(folder) == 0
-    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: camera")]
+    warnings = [
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: camera")
+    ]
     assert len(warnings) == 1
     size = "larger" if factor < 1 else "smaller"
     assert re.search(
-        rf"camera cam1: shows the head [45]\.\d% {size} .* timestep \d; check its focal length", warnings[0]
+        rf"camera cam1: shows the head [45]\.\d% {size} .* timestep \d; check its focal length",
+        warnings[0],
     )
 
 
@@ -271,21 +318,53 @@ def full(value, dtype=None):
 
 def with_first(value, dtype=float):
     """The array with another first element."""
-    return lambda array: np.concatenate([[value], array.ravel()[1:].astype(dtype)]).reshape(array.shape)
+    return lambda array: np.concatenate([[value], array.ravel()[1:].astype(dtype)]).reshape(
+        array.shape
+    )
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     ("file", "field", "change", "expected"),
     [
-        ("cam0", "points", lambda _: np.zeros((5, 3)), "points has shape (5, 3), expected (5, any, 2)"),
+        (
+            "cam0",
+            "points",
+            lambda _: np.zeros((5, 3)),
+            "points has shape (5, 3), expected (5, any, 2)",
+        ),
         ("cam0", "points", full("x"), "points holds <U1, expected floating-point numbers"),
         ("cam0", "points", full(1e300), "points: expected pixels of at most 100000"),
-        ("cam0", "points", full(np.longdouble("1e4000")), "points: expected finite pixels where confidence is not 0"),
-        ("cam0", "points", with_first(np.nan), "points: expected finite pixels where confidence is not 0"),
-        ("cam0", "points", lambda _: np.zeros((5, 7, 2)), "confidence has shape (5, 120), expected (5, 7)"),
-        ("cam0", "timesteps", lambda _: np.array([0, 1, 2, 3, 99]), "timesteps: expected timesteps of camera cam0"),
-        ("cam0", "timesteps", lambda _: np.array([0, 1, 2, 3, 3]), "timesteps: expected timesteps of camera cam0"),
+        (
+            "cam0",
+            "points",
+            full(np.longdouble("1e4000")),
+            "points: expected finite pixels where confidence is not 0",
+        ),
+        (
+            "cam0",
+            "points",
+            with_first(np.nan),
+            "points: expected finite pixels where confidence is not 0",
+        ),
+        (
+            "cam0",
+            "points",
+            lambda _: np.zeros((5, 7, 2)),
+            "confidence has shape (5, 120), expected (5, 7)",
+        ),
+        (
+            "cam0",
+            "timesteps",
+            lambda _: np.array([0, 1, 2, 3, 99]),
+            "timesteps: expected timesteps of camera cam0",
+        ),
+        (
+            "cam0",
+            "timesteps",
+            lambda _: np.array([0, 1, 2, 3, 3]),
+            "timesteps: expected timesteps of camera cam0",
+        ),
         ("cam0", "confidence", full(-1.0), "confidence: expected numbers from 0 to 1e+06"),
         ("cam0", "confidence", full(1e308), "confidence: expected numbers from 0 to 1e+06"),
         ("cam0", "confidence", full(np.nan), "confidence: expected numbers from 0 to 1e+06"),
@@ -294,7 +373,12 @@ def with_first(value, dtype=float):
         ("head_model", "face", full("x"), "face: expected triangles from 0 to"),
         ("head_model", "face", full(10**6), "face: expected triangles from 0 to"),
         ("head_model", "barycentric", full("x"), "barycentric holds <U1, expected numbers"),
-        ("head_model", "barycentric", lambda _: np.ones((7, 3)), "barycentric has shape (7, 3), expected (120, 3)"),
+        (
+            "head_model",
+            "barycentric",
+            lambda _: np.ones((7, 3)),
+            "barycentric has shape (7, 3), expected (120, 3)",
+        ),
         ("head_model", "barycentric", full(np.nan), "barycentric: expected finite numbers"),
         ("head_model", "barycentric", with_first(np.inf), "barycentric: expected finite numbers"),
         ("head_model", "barycentric", full(-1.0), "barycentric: expected numbers from 0 up"),
@@ -302,7 +386,8 @@ def with_first(value, dtype=float):
     ],
 )
 def test_wrong_landmark_files_are_named(recorded, capsys, file, field, change, expected):
-    """Catches landmark files that are read as something else, end in a traceback, or are refused for a wrong reason."""
+    """Catches landmark files that are read as something else, end in a traceback, or are refused
+    for a wrong reason."""
     path = recorded[0] / f"points/{file}.npz"
     arrays = dict(np.load(path))
     if file == "head_model":
@@ -317,14 +402,17 @@ def test_wrong_landmark_files_are_named(recorded, capsys, file, field, change, e
 def test_landmark_files_of_different_detectors(recorded, capsys):
     """Catches landmarks of one camera taken for those of another number."""
     path = recorded[0] / "points/cam0.npz"
-    write_npz(path, dict(np.load(path)) | {"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))})
+    write_npz(
+        path, dict(np.load(path)) | {"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))}
+    )
     assert command(recorded[0]) == 2
     assert "points: the files have different numbers of landmarks" in capsys.readouterr().err
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_timesteps_that_determine_no_pose_are_interpolated(tmp_path, head, capsys):
-    """Catches NaN, or a head at the camera, from landmarks of one timestep that are too few to tell where it is."""
+    """Catches NaN, or a head at the camera, from landmarks of one timestep that are too few to tell
+    where it is."""
     record(tmp_path, head, timesteps=8)
     places = dict(np.load(tmp_path / "points/head_model.npz"))
     places["face"][:7] = -1
@@ -348,7 +436,9 @@ def test_places_in_one_point_are_no_face(recorded, capsys):
     arrays = {"face": np.zeros(LANDMARKS, int), "barycentric": np.full((LANDMARKS, 3), 1 / 3)}
     write_npz(path, arrays)
     assert command(recorded[0]) == 2
-    assert f"{path}: face: its landmarks lie in one point of the head model" in capsys.readouterr().err
+    assert (
+        f"{path}: face: its landmarks lie in one point of the head model" in capsys.readouterr().err
+    )
 
 
 def test_a_resolution_that_changes_is_named(recorded, capsys):
@@ -362,9 +452,12 @@ def test_a_resolution_that_changes_is_named(recorded, capsys):
 
 
 @pytest.mark.parametrize(("side_deg", "is_told"), [(68, False), (45, True)])
-def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(head, side_deg, is_told):
-    """Catches a warning on a sound camera that sees the face nearly in profile, where landmarks are of another size by
-    up to 7 % on the path-traced head; and a wrong focal length at the side that is no longer told."""
+def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
+    head, side_deg, is_told
+):
+    """Catches a warning on a sound camera that sees the face nearly in profile, where landmarks are
+    of another size by up to 7 % on the path-traced head; and a wrong focal length at the side that
+    is no longer told."""
     places, used = places_on(head, LANDMARKS), np.ones(LANDMARKS, bool)
     parameters = {t: np.zeros(head.model.n_expression + RIGID_SIZE) for t in range(3)}
     shape, world = np.zeros(head.model.n_identity), Similarity(1.0, np.eye(3), np.zeros(3))
@@ -372,14 +465,24 @@ def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(h
     at = places.on(head.model.v_template, head.model.faces)
     cameras, found = [], {}
     for number, angle in enumerate(np.radians([-30, -10, 10, 30, side_deg])):
-        camera = look_at(at.mean(0) + 0.9 * np.array([np.sin(angle), 0, np.cos(angle)]), at.mean(0), 200, 200, 500.0)
+        camera = look_at(
+            at.mean(0) + 0.9 * np.array([np.sin(angle), 0, np.cos(angle)]),
+            at.mean(0),
+            200,
+            200,
+            500.0,
+        )
         pixels, _ = camera.project(at)
         size = 0.93 if number == 4 else 1.0
         points = np.stack([pixels.mean(0) + size * (pixels - pixels.mean(0))] * 3)
         found[f"cam{number}"] = CameraLandmarks(np.arange(3), points, np.ones(points.shape[:2]))
         cameras.append(FootageCamera(f"cam{number}", camera, None))
-    warnings = scale_warnings(fit, places, used, Footage(Path("footage"), tuple(cameras), (0, 1, 2)), found)
-    assert [text[:40] for text in warnings] == (["camera cam4: shows the head 7.0% smaller"] if is_told else [])
+    warnings = scale_warnings(
+        fit, places, used, Footage(Path("footage"), tuple(cameras), (0, 1, 2)), found
+    )
+    assert [text[:40] for text in warnings] == (
+        ["camera cam4: shows the head 7.0% smaller"] if is_told else []
+    )
 
 
 def test_footage_without_a_face(recorded, capsys):
@@ -387,7 +490,9 @@ def test_footage_without_a_face(recorded, capsys):
     folder, _ = recorded
     for number in range(5):
         arrays = dict(np.load(folder / f"points/cam{number}.npz"))
-        write_npz(folder / f"points/cam{number}.npz", arrays | {"confidence": np.zeros((5, LANDMARKS))})
+        write_npz(
+            folder / f"points/cam{number}.npz", arrays | {"confidence": np.zeros((5, LANDMARKS))}
+        )
     assert command(folder) == 2
     assert "shows no face, nor does any other of 25 frames" in capsys.readouterr().err
 
@@ -406,7 +511,10 @@ class Counting:
 def test_detection_resumes_camera_by_camera(recorded):
     """Catches a canceled detection that starts from the beginning, or keeps half a camera."""
     folder, _ = recorded
-    footage, detector = open_footage(folder / "footage"), Counting([np.ones((3, 2)), np.ones((3, 2))])
+    footage, detector = (
+        open_footage(folder / "footage"),
+        Counting([np.ones((3, 2)), np.ones((3, 2))]),
+    )
 
     def cancel(stage, done, total):
         if done == 13:
@@ -418,9 +526,12 @@ def test_detection_resumes_camera_by_camera(recorded):
     detector.calls = 0
     found = detect_landmarks(footage, detector, folder / "found", Helpers(1), lambda *_: None)
     assert detector.calls == 15
-    assert all(camera.confidence.all() for camera in found.values())  # the same face twice is one face
+    # the same face twice is one face
+    assert all(camera.confidence.all() for camera in found.values())
     camera = footage.cameras[0]
-    np.testing.assert_array_equal(read_camera(landmark_file(folder / "found", camera.name), camera).points, 1)
+    np.testing.assert_array_equal(
+        read_camera(landmark_file(folder / "found", camera.name), camera).points, 1
+    )
 
 
 class Remembering:
@@ -434,14 +545,21 @@ class Remembering:
 
 
 def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
-    """Catches landmarks in another precision on disk than in memory: the same track, with other numbers."""
+    """Catches landmarks in another precision on disk than in memory: the same track, with other
+    numbers."""
     number = iter(range(25))
-    meshes = record(tmp_path, head, lambda mesh, camera: np.full((SIZE, SIZE, 3), next(number), np.uint8))
+    meshes = record(
+        tmp_path, head, lambda mesh, camera: np.full((SIZE, SIZE, 3), next(number), np.uint8)
+    )
     places, rng = places_on(head, LANDMARKS), np.random.default_rng(0)
-    exact = [camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes]
+    exact = [
+        camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes
+    ]
     detector = Remembering([points + rng.normal(0, 0.1, points.shape) for points in exact])
     monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: detector)
-    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
+    monkeypatch.setattr(
+        "stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool))
+    )
 
     def cancel(stage, done, total):
         if done == 13:
@@ -464,7 +582,8 @@ def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
 
 
 def test_cameras_have_landmark_files_of_their_own(tmp_path):
-    """Catches cameras whose landmarks overwrite each other, or the correspondence of the head model."""
+    """Catches cameras whose landmarks overwrite each other, or the correspondence of the head
+    model."""
     names = ["walk/1", "walk_1", "walk%2F1", "walk 1", "head_model", "kamera-Ä.2", "a\\b", "a:b"]
     files = [landmark_file(tmp_path, name) for name in names]
     assert len({*files, tmp_path / PLACES_FILE}) == len(names) + 1
@@ -480,17 +599,25 @@ def test_the_capture_is_not_written_into_the_footage(tmp_path):
 
 
 def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monkeypatch):
-    """Catches landmarks of a run that was out of step taken for those of the corrected offset, and those of a recording
-    or a head model that was replaced under its name."""
+    """Catches landmarks of a run that was out of step taken for those of the corrected offset, and
+    those of a recording or a head model that was replaced under its name."""
     write_folders(tmp_path / "footage", (6, 8))
     write_flame(head.model, tmp_path / "head.npz")
     places = places_on(head, LANDMARKS)
     monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: Counting([]))
-    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool)))
+    monkeypatch.setattr(
+        "stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool))
+    )
     for name in ("out", "out_0", "out_1"):
         (tmp_path / name).mkdir()  # else nothing is left of footage without a face
-    for offset, message in ((1, "shows no face"), (1, "shows no face"), (2, "holds landmarks of other footage")):
-        footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset}))
+    for offset, message in (
+        (1, "shows no face"),
+        (1, "shows no face"),
+        (2, "holds landmarks of other footage"),
+    ):
+        footage = open_footage(
+            tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset})
+        )
         with pytest.raises(StgaError, match=message):
             track(footage, tmp_path / "head.npz", tmp_path / "out")
     image = sorted((tmp_path / "footage").rglob("*.png"))[3]
@@ -504,13 +631,16 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
 
 
 def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
-    """Catches images and landmarks that stay where the footage is of no use, and a message that does not name it."""
+    """Catches images and landmarks that stay where the footage is of no use, and a message that
+    does not name it."""
     write_video(tmp_path / "landscape.mp4", range(0, 200, 50))
     head = HeadModel(flame_model(None), "flame")
     monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: Counting([]))
     places = places_on(head, LANDMARKS), np.ones(LANDMARKS, bool)
     monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: places)
-    with pytest.raises(StgaError, match=r"landscape.mp4.*: shows no face, nor does any other of 4 frames"):
+    with pytest.raises(
+        StgaError, match=r"landscape.mp4.*: shows no face, nor does any other of 4 frames"
+    ):
         track(open_footage(tmp_path / "landscape.mp4"), None, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -520,20 +650,28 @@ def test_two_faces_are_reported_with_camera_and_frame(recorded):
     folder, _ = recorded
     two = np.array([[0.0, 0.0], [9.0, 9.0]])
     footage, detector = open_footage(folder / "footage"), Counting([two, two + 30])
-    with pytest.raises(StgaError, match=r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"):
+    with pytest.raises(
+        StgaError, match=r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"
+    ):
         detect_landmarks(footage, detector, folder / "found", Helpers(1), lambda *_: None)
 
 
 def test_pictures_of_a_head_are_tracked(tmp_path, head):
-    """Catches a correspondence or a detector's convention that is off: everything from pixels, nothing given."""
+    """Catches a correspondence or a detector's convention that is off: everything from pixels,
+    nothing given."""
     pytest.importorskip("cv2")
     shape = np.random.default_rng(1).normal(0, 0.5, head.model.n_identity)
     meshes = [
-        flame_forward(head.model, shape, replace(frame_at(head, t), expr=np.zeros(head.model.n_expression)))
+        flame_forward(
+            head.model, shape, replace(frame_at(head, t), expr=np.zeros(head.model.n_expression))
+        )
         for t in range(2)
     ]
     footage = write_footage(
-        tmp_path / "footage", rig(5, 256), 2, lambda camera, t: shaded_image(meshes[t], head.model.faces, camera)
+        tmp_path / "footage",
+        rig(5, 256),
+        2,
+        lambda camera, t: shaded_image(meshes[t], head.model.faces, camera),
     )
     write_flame(head.model, tmp_path / "head.npz")
     result = track(open_footage(footage), tmp_path / "head.npz", tmp_path / "out")
@@ -550,8 +688,17 @@ def test_no_face_is_found_on_the_back_of_a_head(recorded, capsys, head):
     """Catches a head model without a face that is fitted all the same."""
     pytest.importorskip("cv2")
     folder, _ = recorded
-    write_flame(replace(head.model, v_template=head.model.v_template * [-1, 1, -1]), folder / "turned.npz")
-    words = ["track", str(folder / "footage"), "--model", str(folder / "turned.npz"), "--out", str(folder / "out")]
+    write_flame(
+        replace(head.model, v_template=head.model.v_template * [-1, 1, -1]), folder / "turned.npz"
+    )
+    words = [
+        "track",
+        str(folder / "footage"),
+        "--model",
+        str(folder / "turned.npz"),
+        "--out",
+        str(folder / "out"),
+    ]
     assert main(words) == 2
     assert re.search(r"turned\.npz: shows a face in . of 9 pictures", capsys.readouterr().err)
     assert not (folder / "out").exists()

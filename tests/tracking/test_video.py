@@ -16,9 +16,18 @@ av = pytest.importorskip("av")
 
 BLOCK, COLUMNS, ROWS = 16, 6, 4
 FRAMES = 52
-X264 = {"bf": "3", "b_strategy": "0", "g": "12", "keyint_min": "12", "sc_threshold": "0", "crf": "12"}
+X264 = {
+    "bf": "3",
+    "b_strategy": "0",
+    "g": "12",
+    "keyint_min": "12",
+    "sc_threshold": "0",
+    "crf": "12",
+}
 OPEN_X264 = X264 | {"x264-params": "open-gop=1:b-adapt=0"}
-OPEN_X265 = {"x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:log-level=0"}
+OPEN_X265 = {
+    "x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:log-level=0"
+}
 MPEG4 = {"g": "12", "bf": "2", "b": "4000000"}
 
 VIDEOS = {
@@ -80,7 +89,8 @@ def write_numbered(path, codec, options, frames=FRAMES, rate=25, durations=None)
 
 
 def copy_packets(source, path, shift=0, first=0, last=None):
-    """Copy the packets from number `first` to before `last`, in the order of decoding, `shift` frames earlier."""
+    """Copy the packets from number `first` to before `last`, in the order of decoding, `shift`
+    frames earlier."""
     with av.open(str(source)) as container, av.open(str(path), "w") as out:
         stream = container.streams.video[0]
         copied = out.add_stream_from_template(stream)
@@ -177,17 +187,21 @@ def test_an_open_video_goes_to_a_helping_process(tmp_path):
 
 
 def test_variable_frame_rate(tmp_path):
-    """Catches frames of a phone played evenly although gaps lie between them: out of step with sound and other cameras,
-    and motion taken for a jump."""
+    """Catches frames of a phone played evenly although gaps lie between them: out of step with
+    sound and other cameras, and motion taken for a jump."""
     durations = [1, 1, 1, 2, 1, 3, 1, 75] * 8
-    write_numbered(tmp_path / "a.mkv", "libx264", X264, len(durations), rate=50, durations=durations)
+    write_numbered(
+        tmp_path / "a.mkv", "libx264", X264, len(durations), rate=50, durations=durations
+    )
     footage = open_footage(tmp_path)
     (warning,) = footage.warnings
     assert "a.mkv: has a variable frame rate (frames last 20 to 1500 ms)" in warning
     assert footage.fps == pytest.approx(50, rel=1e-3)
     times = [sum(durations[:number]) for number in range(len(durations))]
     assert footage.timesteps == tuple(times)
-    assert [shown(footage.cameras[0].image(timestep)) for timestep in times] == list(range(len(durations)))
+    assert [shown(footage.cameras[0].image(timestep)) for timestep in times] == list(
+        range(len(durations))
+    )
 
 
 def test_cameras_whose_rate_varies_apart(tmp_path):
@@ -197,7 +211,9 @@ def test_cameras_whose_rate_varies_apart(tmp_path):
     for name, own in durations.items():
         write_numbered(tmp_path / f"{name}.mkv", "libx264", X264, len(own), rate=50, durations=own)
         times[name] = [sum(own[:number]) for number in range(len(own))]
-    write_colmap_text(tmp_path / "sparse/0", rig(2, COLUMNS * BLOCK, ROWS * BLOCK), ["a.png", "b.png"])
+    write_colmap_text(
+        tmp_path / "sparse/0", rig(2, COLUMNS * BLOCK, ROWS * BLOCK), ["a.png", "b.png"]
+    )
     footage = open_footage(tmp_path)
     assert footage.timesteps == tuple(sorted(set(times["a"]) & set(times["b"])))
     for camera in footage.cameras:
@@ -205,7 +221,8 @@ def test_cameras_whose_rate_varies_apart(tmp_path):
         assert found == [times[camera.name].index(timestep) for timestep in footage.timesteps]
 
 
-# A display matrix in the file's track header, and how a player shows the corners a b / c d of the stored picture.
+# A display matrix in the file's track header, and how a player shows the corners a b / c d of the
+# stored picture.
 TURNS = {
     "as stored": ((1, 0, 0, 1), "ab cd"),
     "mirrored": ((-1, 0, 0, 1), "ba dc"),
@@ -222,7 +239,9 @@ def test_display_matrices(tmp_path, turn):
     """Catches a front camera's video that is shown mirrored, lying or upside down."""
     matrix, expected = TURNS[turn]
     path, levels = tmp_path / "phone.mp4", {"a": 30, "b": 90, "c": 150, "d": 210}
-    image = np.kron([[levels["a"], levels["b"]], [levels["c"], levels["d"]]], np.ones((32, 48))).astype(np.uint8)
+    image = np.kron(
+        [[levels["a"], levels["b"]], [levels["c"], levels["d"]]], np.ones((32, 48))
+    ).astype(np.uint8)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=25, options={"crf": "8"})
         stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
@@ -241,8 +260,9 @@ def test_display_matrices(tmp_path, turn):
     assert " ".join("".join(row) for row in names) == expected
 
 
-# Signals (R, G, B), 0 to 1, of a video, and the sRGB they are to be shown as. Gray card and white: ITU-R BT.2408, table
-# 1 (26 and 203 cd/m²; 26 / 203 is 0.394 in sRGB). sRGB's red in Display P3: CSS Color 4.
+# Signals (R, G, B), 0 to 1, of a video, and the sRGB they are to be shown as. Gray card and white:
+# ITU-R BT.2408, table 1 (26 and 203 cd/m²; 26 / 203 is 0.394 in sRGB). sRGB's red in Display P3:
+# CSS Color 4.
 SIGNALS = {
     "PQ, gray card": ((9, 16, 9), (0.38, 0.38, 0.38), (0.394, 0.394, 0.394)),
     "PQ, white": ((9, 16, 9), (0.58, 0.58, 0.58), (1, 1, 1)),
@@ -271,7 +291,9 @@ def test_colors_of_phones(tmp_path, name):
             primaries, transfer, matrix, 1,
         )  # fmt: skip
         image = np.broadcast_to(np.round(65535 * np.array(signal)), (64, 64, 3)).astype(np.uint16)
-        frame = av.VideoFrame.from_ndarray(image, format="rgb48le").reformat(format=pixels, dst_colorspace=matrix)
+        frame = av.VideoFrame.from_ndarray(image, format="rgb48le").reformat(
+            format=pixels, dst_colorspace=matrix
+        )
         for number in range(4):
             frame.pts = number
             container.mux(stream.encode(frame))
@@ -280,9 +302,12 @@ def test_colors_of_phones(tmp_path, name):
     np.testing.assert_allclose(found, expected, atol=0.025)
 
 
-@pytest.mark.parametrize(("name", "rate"), [("a.mp4", 60), ("a.mkv", 30), ("a.mts", 50), ("a.avi", 25)])
+@pytest.mark.parametrize(
+    ("name", "rate"), [("a.mp4", 60), ("a.mkv", 30), ("a.mts", 50), ("a.avi", 25)]
+)
 def test_constant_frame_rate(tmp_path, name, rate):
-    """Catches times rounded to milliseconds taken for a variable rate, and hidden frames counted into the rate."""
+    """Catches times rounded to milliseconds taken for a variable rate, and hidden frames counted
+    into the rate."""
     write_numbered(tmp_path / name, "libx264", X264, rate=rate)
     footage = open_footage(tmp_path / name)
     assert (footage.fps, footage.warnings) == (rate, ())
@@ -297,7 +322,9 @@ def test_frame_that_the_decoder_leaves_out(tmp_path):
     path = tmp_path / "a.mov"
     write_numbered(path, "libx265", OPEN_X265)
     with av.open(str(path)) as container:
-        packets = sorted((p for p in container.demux(video=0) if p.size), key=lambda packet: packet.pts)
+        packets = sorted(
+            (p for p in container.demux(video=0) if p.size), key=lambda packet: packet.pts
+        )
         begin, end = packets[41].pos, packets[41].pos + packets[41].size
     data = bytearray(path.read_bytes())
     while begin < end:
@@ -308,7 +335,9 @@ def test_frame_that_the_decoder_leaves_out(tmp_path):
     assert shown(camera.image(40)) == 40
     for before in (40, FRAMES - 1):  # in order, and by a seek
         camera.image(before)
-        with pytest.raises(StgaError, match=r"a.mov: frame 41: cannot be decoded \(the decoder gives no picture"):
+        with pytest.raises(
+            StgaError, match=r"a.mov: frame 41: cannot be decoded \(the decoder gives no picture"
+        ):
             camera.image(41)
     assert shown(camera.image(50)) == 50
 
@@ -317,9 +346,13 @@ def test_without_pictures(tmp_path):
     """Catches a message that names an exception instead of what is missing."""
     with av.open(str(tmp_path / "a.mkv"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
-        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame = av.AudioFrame.from_ndarray(
+            np.zeros((1, 800), np.int16), format="s16", layout="mono"
+        )
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    with pytest.raises(StgaError, match=r"a.mkv: is not a readable video \(it has no video stream\)"):
+    with pytest.raises(
+        StgaError, match=r"a.mkv: is not a readable video \(it has no video stream\)"
+    ):
         open_footage(tmp_path)

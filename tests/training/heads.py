@@ -1,4 +1,5 @@
-"""A FLAME capture whose images are drawn from true parameters, and whose tracked parameters are off."""
+"""A FLAME capture whose images are drawn from true parameters, and whose tracked parameters are
+off."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,9 +25,12 @@ NOISE = {"expr": 0.5, "rotation": 0.02, "jaw_pose": 0.04, "translation": 0.002}
 
 
 def write_head(root: Path, error: float = 1.0) -> tuple[Capture, dict[int, np.ndarray]]:
-    """The ball in FLAME's format, painted in smooth colors, and timestep -> mesh (V, 3) that its images show."""
+    """The ball in FLAME's format, painted in smooth colors, and timestep -> mesh (V, 3) that its
+    images show."""
     _, model = factory.write_flame_capture(root, TIMESTEPS, CAMERAS)
-    factory.write_splits(root, [_entry(timestep, camera) for timestep in TIMESTEPS for camera in CAMERAS])
+    factory.write_splits(
+        root, [_entry(timestep, camera) for timestep in TIMESTEPS for camera in CAMERAS]
+    )
     true = open_capture(root, model)
     _paint(true)
     meshes = {timestep: true.mesh(timestep) for timestep in TIMESTEPS}
@@ -37,19 +41,27 @@ def write_head(root: Path, error: float = 1.0) -> tuple[Capture, dict[int, np.nd
 def _entry(timestep: int, camera: int) -> dict[str, Any]:
     pose = factory.pose(PLACES[camera]).tolist()
     return factory.frame(
-        timestep, camera, flame_param_path=f"flame_param/{timestep:05d}.npz", transform_matrix=pose, **LENS
+        timestep,
+        camera,
+        flame_param_path=f"flame_param/{timestep:05d}.npz",
+        transform_matrix=pose,
+        **LENS,
     )
 
 
 def _lose_track(root: Path, error: float) -> None:
     """Disturb what was tracked, but for the test timestep.
 
-    Of an error that all timesteps share nobody could tell whether it is the tracker's or the splats', so there is none.
+    Of an error that all timesteps share nobody could tell whether it is the tracker's or the
+    splats', so there is none.
     """
     rng = np.random.default_rng(0)
     trained = TIMESTEPS[:-1]
     shapes = {name: factory.flame_parameters(0)[name].shape for name in NOISE}
-    away = {name: rng.normal(0, error * size, (len(trained), *shapes[name])) for name, size in NOISE.items()}
+    away = {
+        name: rng.normal(0, error * size, (len(trained), *shapes[name]))
+        for name, size in NOISE.items()
+    }
     for row, timestep in enumerate(trained):
         tracked = factory.flame_parameters(timestep)
         for name, steps in away.items():
@@ -67,7 +79,9 @@ def _paint(capture: Capture) -> None:
     blank = replace(splats, sh=np.full_like(shown.sh, 9.0))
     for view in (view for views in capture.views.values() for view in views):
         frames = face_frames(capture.mesh(view.timestep), capture.faces, capture.neutral)
-        Image.fromarray(to_uint8(render(shown, view.camera, (1.0, 1.0, 1.0), frames))).save(view.image)
+        Image.fromarray(to_uint8(render(shown, view.camera, (1.0, 1.0, 1.0), frames))).save(
+            view.image
+        )
         alpha = to_uint8(render(blank, view.camera, (0.0, 0.0, 0.0), frames))[..., 0]
         assert view.mask is not None
         Image.fromarray(np.where(alpha > 127, 255, 0).astype(np.uint8)).save(view.mask)

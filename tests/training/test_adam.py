@@ -1,4 +1,5 @@
-"""Adam with true freezing against torch's Adam, which counts steps per tensor: here one tensor a row."""
+"""Adam with true freezing against torch's Adam, which counts steps per tensor: here one tensor a
+row."""
 
 import numpy as np
 import pytest
@@ -25,7 +26,10 @@ def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
     """Each row's parameters as float64 tensors of their own; the view-dependent color apart."""
     rows = []
     for n in range(len(state)):
-        row = {name: torch.tensor(a[n], dtype=torch.float64) for name, a in state.parameters._asdict().items()}
+        row = {
+            name: torch.tensor(a[n], dtype=torch.float64)
+            for name, a in state.parameters._asdict().items()
+        }
         row["sh"], row["sh_rest"] = row["sh"][:1].clone(), row["sh"][1:].clone()
         rows.append({name: value.requires_grad_() for name, value in row.items()})
     return rows
@@ -33,8 +37,9 @@ def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
 
 @pytest.mark.parametrize(("seed", "degree"), [(0, 1), (1, 1), (2, 3), (3, 0)])
 def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) -> None:
-    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a misplaced ε, and a
-    running average that begins with the initial value, or goes on while its row is frozen.
+    """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a
+    misplaced ε, and a running average that begins with the initial value, or goes on while its row
+    is frozen.
 
     With constant color, other parameters have more columns than `sh`.
     """
@@ -50,7 +55,9 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
         set_gradients(state, rng, 10 ** rng.uniform(-8, 0))
         for n, row in enumerate(rows):
             for name, value in row.items():
-                gradient = torch.tensor(getattr(state.gradients, name.removesuffix("_rest"))[n], dtype=torch.float64)
+                gradient = torch.tensor(
+                    getattr(state.gradients, name.removesuffix("_rest"))[n], dtype=torch.float64
+                )
                 if name.startswith("sh"):
                     gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
                 value.grad = gradient.clone() if n in listed else None
@@ -62,19 +69,27 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
         average = torch.tensor(state.parameters.xyz[n], dtype=torch.float64)
         for count, value in enumerate(values, 1):
             average = average.lerp(value, max(0.2, 4 / (count + 3)))
-        np.testing.assert_allclose(state.average.xyz[n], average, rtol=1e-5, atol=25 * RATES["xyz"] * 1e-5)
+        np.testing.assert_allclose(
+            state.average.xyz[n], average, rtol=1e-5, atol=25 * RATES["xyz"] * 1e-5
+        )
     for n, row in enumerate(rows):
         for name in ("xyz", "rotation", "log_scale", "opacity", "strain_color"):
             # 25 float32 steps of at most the rate each
             np.testing.assert_allclose(
-                getattr(state.parameters, name)[n], row[name].detach(), rtol=1e-5, atol=25 * RATES[name] * 1e-5
+                getattr(state.parameters, name)[n],
+                row[name].detach(),
+                rtol=1e-5,
+                atol=25 * RATES[name] * 1e-5,
             )
         color = torch.cat([row["sh"], row["sh_rest"]]).detach()
-        np.testing.assert_allclose(state.parameters.sh[n], color, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5)
+        np.testing.assert_allclose(
+            state.parameters.sh[n], color, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5
+        )
 
 
 def test_frozen_rows_keep_every_bit() -> None:
-    """Catches anything at all happening to rows that are not listed, also where their gradients are large or NaN."""
+    """Catches anything at all happening to rows that are not listed, also where their gradients are
+    large or NaN."""
     state = random_state(40, 7)
     state.gradients.xyz[3] = np.nan
     state.parameters.xyz[5] = [np.nan, -0.0, 1e-42]
@@ -86,14 +101,17 @@ def test_frozen_rows_keep_every_bit() -> None:
     frozen = np.setdiff1d(np.arange(40), listed)
     for name in before:
         np.testing.assert_array_equal(after[name][frozen], before[name][frozen], err_msg=name)
-    moved = [name for name in before if (after[name][listed] != before[name][listed]).any(axis=1).all()]
+    moved = [
+        name for name in before if (after[name][listed] != before[name][listed]).any(axis=1).all()
+    ]
     parts = ("parameters", "average", "first", "second")
     trained = [f"{part}/{name}" for part in parts for name in state.parameters._fields]
     assert set(trained) | {"steps"} == set(moved)
 
 
 def test_first_step_after_the_others_many() -> None:
-    """Catches bias correction by a common count: Adam's first step is the rate exactly, however late it comes."""
+    """Catches bias correction by a common count: Adam's first step is the rate exactly, however
+    late it comes."""
     state = new_state(random_splats(2, 4))
     rng = np.random.default_rng(0)
     others = np.array([0], np.int32)
@@ -112,14 +130,23 @@ def test_first_step_after_the_others_many() -> None:
     np.testing.assert_allclose(
         (state.parameters.sh - before["sh"])[1], -rate * np.sign(state.gradients.sh[1]), rtol=1e-3
     )
-    # Row 0 has no history but zeros and a full count: (0.1·g) / (√0.001·|g|), corrected by 10,001 steps.
-    expected = -RATES["opacity"] * 0.1 / np.sqrt(0.001 / (1 - 0.999**10_001)) * np.sign(state.gradients.opacity[0])
-    assert float(state.parameters.opacity[0] - before["opacity"][0]) == pytest.approx(expected, rel=1e-3)
+    # Row 0 has no history but zeros and a full count: (0.1·g) / (√0.001·|g|), corrected by 10,001
+    # steps.
+    expected = (
+        -RATES["opacity"]
+        * 0.1
+        / np.sqrt(0.001 / (1 - 0.999**10_001))
+        * np.sign(state.gradients.opacity[0])
+    )
+    assert float(state.parameters.opacity[0] - before["opacity"][0]) == pytest.approx(
+        expected, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
-    """Catches one NaN from a degenerate view spreading into parameters or moments, where it would stay for ever."""
+    """Catches one NaN from a degenerate view spreading into parameters or moments, where it would
+    stay for ever."""
     state = random_state(4, 3)
     before = bits(state)
     state.gradients.log_scale[1, 2] = bad
@@ -132,7 +159,11 @@ def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
         np.testing.assert_array_equal(after[f"{part}/sh"][2, rest], before[f"{part}/sh"][2, rest])
         for row in (0, 2, 3):
             assert (after[f"{part}/log_scale"][row] != before[f"{part}/log_scale"][row]).any()
-    assert all(np.isfinite(array).all() for p in (state.parameters, state.first, state.second) for array in p)
+    assert all(
+        np.isfinite(array).all()
+        for p in (state.parameters, state.first, state.second)
+        for array in p
+    )
 
 
 def test_no_rows() -> None:
@@ -145,7 +176,8 @@ def test_no_rows() -> None:
 
 
 def test_many_rows() -> None:
-    """Catches rows that take their neighbours' step counts where the work is cut into blocks for the threads."""
+    """Catches rows that take their neighbours' step counts where the work is cut into blocks for
+    the threads."""
     state = random_state(1500, 7)
     rng = np.random.default_rng(0)
     state.steps[:] = rng.integers(0, 50, 1500)
@@ -169,7 +201,8 @@ def test_many_rows() -> None:
         if name == "sh":
             rate[1:] = RATES["sh_rest"]
         step = rate * mean / np.sqrt(square)
-        # Where the random second moment is near zero a step is many rates long, and rounded in proportion.
+        # Where the random second moment is near zero a step is many rates long, and rounded in
+        # proportion.
         error = np.abs(getattr(state.parameters, name)[rows] - (value - step))
         assert (error <= 1e-6 + 1e-5 * np.abs(step) + 1e-6 * np.abs(value)).all(), name
 

@@ -1,4 +1,5 @@
-"""A head tracked by its own avatar, finished or in training: the gradient, what it brings, and who gets to see it."""
+"""A head tracked by its own avatar, finished or in training: the gradient, what it brings, and who
+gets to see it."""
 
 import shutil
 from collections.abc import Callable
@@ -24,7 +25,11 @@ from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
 from stga_addon.progress import Cancelled
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.evaluate.metrics import evaluate_avatar
-from stga_addon.training.optimize.avatar_tracking import AvatarTracking, RefinedTracking, track_by_avatar
+from stga_addon.training.optimize.avatar_tracking import (
+    AvatarTracking,
+    RefinedTracking,
+    track_by_avatar,
+)
 from stga_addon.training.optimize.cpu_backend import frame_gradient
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
@@ -56,7 +61,10 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> Made:
 @pytest.fixture(scope="module")
 def person(right: Made) -> tuple[Avatar, TrainingSettings]:
     """An avatar whose training saw the right meshes."""
-    capture, settings = right[0], quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=())
+    capture, settings = (
+        right[0],
+        quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=()),
+    )
     trainer = Trainer(capture, settings, {})
     views = capture.views["train"]
     ready = {view.name: read_view(view) for view in views}
@@ -73,9 +81,11 @@ def millimeters(capture: Capture, true: dict[int, np.ndarray]) -> np.ndarray:
     return 1000 * np.linalg.norm(away, axis=-1).mean(1)
 
 
-def test_a_finished_avatar_finds_the_head(person: tuple[Avatar, TrainingSettings], lost: Made) -> None:
-    """Catches a gradient or a preconditioner with a wrong sign, axis or joint, steps that stop too early, and a drift
-    of the last timestep, which is tracked right already."""
+def test_a_finished_avatar_finds_the_head(
+    person: tuple[Avatar, TrainingSettings], lost: Made
+) -> None:
+    """Catches a gradient or a preconditioner with a wrong sign, axis or joint, steps that stop too
+    early, and a drift of the last timestep, which is tracked right already."""
     capture, true = lost
     tracking, stages = RefinedTracking(capture, "stga"), list[tuple[int, int]]()
 
@@ -105,7 +115,9 @@ def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
     np.testing.assert_allclose((tracking.parameters - tracking.tracked)[:, 0], [1, 2, 3, 4, 0])
 
 
-def differences(tracking: RefinedTracking, timestep: int, loss: Callable[[], float], step: float) -> np.ndarray:
+def differences(
+    tracking: RefinedTracking, timestep: int, loss: Callable[[], float], step: float
+) -> np.ndarray:
     """(P,) central differences of a loss; step: meters by which vertices move, about."""
     row, before = tracking.sequence.timesteps.index(timestep), tracking.parameters.copy()
     sizes = step * np.repeat([250.0, 10.0, 1.0], [2, 15, 3])
@@ -122,8 +134,9 @@ def differences(tracking: RefinedTracking, timestep: int, loss: Callable[[], flo
 
 
 def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
-    """Catches a sign, a transposed rotation, a joint or a component taken for another, and what turns or grows a splat
-    left out: against differences of a made-up loss of where splats are and how they lie."""
+    """Catches a sign, a transposed rotation, a joint or a component taken for another, and what
+    turns or grows a splat left out: against differences of a made-up loss of where splats are and
+    how they lie."""
     capture, _ = lost
     tracking = RefinedTracking(capture, "stga")
     generator = torch.Generator().manual_seed(0)
@@ -132,7 +145,10 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
         torch.randn(len(face), size, generator=generator, dtype=torch.float64) * spread
         for size, spread in ((3, 0.01), (4, 1.0), (3, 0.5))
     )
-    toward, along = (torch.randn(len(face), 3, *more, generator=generator, dtype=torch.float64) for more in ((), (3,)))
+    toward, along = (
+        torch.randn(len(face), 3, *more, generator=generator, dtype=torch.float64)
+        for more in ((), (3,))
+    )
 
     def frames() -> FaceFrames:
         return face_frames(tracking.mesh(3), capture.faces, capture.neutral)
@@ -151,7 +167,9 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
 
     leaves = [tensor.requires_grad_() for tensor in (xyz, rotation, log_scale)]
     gradients = torch.autograd.grad(loss(), leaves)
-    splats, asked = (Parameters(*(t.detach().numpy() for t in ts), None, None) for ts in (leaves, gradients))
+    splats, asked = (
+        Parameters(*(t.detach().numpy() for t in ts), None, None) for ts in (leaves, gradients)
+    )
     parts = frame_gradient(splats, face, asked, np.arange(len(face)), frames())
     by_vertex = frame_backward(tracking.mesh(3), capture.faces, frames(), *parts)
     assert capture.flame is not None
@@ -169,41 +187,59 @@ def run_folder(lost: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_run(capture: Capture, **changes: Any) -> Run:
-    ours = {"iterations": 40, "lattice": 1, "tracking": True, "driven_offsets": ("strain_position",)}
+    ours = {
+        "iterations": 40,
+        "lattice": 1,
+        "tracking": True,
+        "driven_offsets": ("strain_position",),
+    }
     settings = quick_settings("global", **{**ours, **changes})
     return Run(capture.root, capture.root / "model.npz", "vhap", settings)
 
 
 def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
-    """Catches a training that goes on with the meshes of before, and tracking that leads nowhere: meshes come closer to
-    where they should be, and so do pictures of an unseen view."""
+    """Catches a training that goes on with the meshes of before, and tracking that leads nowhere:
+    meshes come closer to where they should be, and so do pictures of an unseen view."""
     capture, true = lost
     quality = {}
     for on in (True, False):
         train(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
         quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
-    before, after = millimeters(capture, true), millimeters(with_refined_tracking(capture, tmp_path / "True"), true)
+    before, after = (
+        millimeters(capture, true),
+        millimeters(with_refined_tracking(capture, tmp_path / "True"), true),
+    )
     assert np.median(after[:-1] / before[:-1]) < 0.6
     assert quality[True] > quality[False] + 1.0
 
 
-def test_stopped_and_resumed_is_the_unbroken_run(lost: Made, run_folder: Path, tmp_path: Path) -> None:
+def test_stopped_and_resumed_is_the_unbroken_run(
+    lost: Made, run_folder: Path, tmp_path: Path
+) -> None:
     """Catches anything of the tracking that a step depends on and a checkpoint does not hold."""
     capture, _ = lost
-    train(capture, tmp_path, make_run(capture), report=lambda progress: progress.figures().get("iteration", 0) >= 31)
+    train(
+        capture,
+        tmp_path,
+        make_run(capture),
+        report=lambda progress: progress.figures().get("iteration", 0) >= 31,
+    )
     assert read_checkpoint(tmp_path).rounds == 1
     train(capture, tmp_path, make_run(capture), resume=True)
     ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))
     assert ours.rounds == theirs.rounds == 2
     np.testing.assert_array_equal(ours.tracking, theirs.tracking)
     np.testing.assert_array_equal(ours.state.parameters.xyz, theirs.state.parameters.xyz)
-    moved, expected = (checkpoint.state.driven_offsets["strain_position"] for checkpoint in (ours, theirs))
+    moved, expected = (
+        checkpoint.state.driven_offsets["strain_position"] for checkpoint in (ours, theirs)
+    )
     assert np.abs(expected.value).max() > 0
     np.testing.assert_array_equal(moved.value, expected.value)
 
 
 def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_path: Path) -> None:
-    """Catches a run that continues with the tracked meshes after having been trained on refined ones."""
+    """Catches a run that continues with the tracked meshes after having been trained on refined
+    ones."""
     run = shutil.copytree(run_folder, tmp_path / "run")
     with pytest.raises(StgaError, match="was begun with other settings"):
         train(lost[0], run, make_run(lost[0], tracking=False), resume=True)
@@ -218,11 +254,17 @@ def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_p
     ("name", "value", "says"),
     [
         ("parameters", np.zeros(20), "a field is missing or malformed"),
-        ("parameters", np.full((5, 20), np.nan), "tracking/parameters holds a value that is not finite"),
+        (
+            "parameters",
+            np.full((5, 20), np.nan),
+            "tracking/parameters holds a value that is not finite",
+        ),
         ("change", np.zeros(20), r"as version 0\.2\.0 did"),
     ],
 )
-def test_damaged_checkpoints(run_folder: Path, tmp_path: Path, name: str, value: np.ndarray, says: str) -> None:
+def test_damaged_checkpoints(
+    run_folder: Path, tmp_path: Path, name: str, value: np.ndarray, says: str
+) -> None:
     """Catches an array that training would go on with to nonsense."""
     arrays = read_npz(run_folder / "checkpoint.npz")
     if name == "change":
@@ -233,7 +275,8 @@ def test_damaged_checkpoints(run_folder: Path, tmp_path: Path, name: str, value:
 
 
 def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_folder: Path) -> None:
-    """Catches a quality measured on other meshes than were trained on, and meshes of another capture's timesteps."""
+    """Catches a quality measured on other meshes than were trained on, and meshes of another
+    capture's timesteps."""
     capture, _ = lost
     checkpoint, tracking = read_checkpoint(run_folder), RefinedTracking(capture, "stga")
     assert checkpoint.tracking is not None
@@ -255,11 +298,16 @@ def test_the_file_is_a_motion(lost: Made, run_folder: Path) -> None:
     shown = with_refined_tracking(capture, run_folder)
     assert motion.timesteps == TIMESTEPS
     for timestep in TIMESTEPS:
-        np.testing.assert_allclose(sequence_mesh(motion, timestep), shown.mesh(timestep), atol=1e-12)
+        np.testing.assert_allclose(
+            sequence_mesh(motion, timestep), shown.mesh(timestep), atol=1e-12
+        )
 
 
 def test_commands_use_the_refined_meshes(
-    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    run_folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Catches a command that opens a run's capture past `refined`."""
     best = max(line["psnr"] for line in read_metrics(run_folder))
@@ -272,16 +320,26 @@ def test_commands_use_the_refined_meshes(
     assert f"as tracked before: PSNR {before:.3f} dB" in capsys.readouterr().out
     cameras = ["--cameras", str(root / "transforms_val.json")]
     assert main(["render", str(run_folder), *cameras, "--out", str(tmp_path / "run")]) == 0
-    avatar = [str(run_folder / "avatar.npz"), "--capture", str(root), "--flame", str(root / "model.npz")]
+    avatar = [
+        str(run_folder / "avatar.npz"),
+        "--capture",
+        str(root),
+        "--flame",
+        str(root / "model.npz"),
+    ]
     assert main(["render", *avatar, *cameras, "--out", str(tmp_path / "tracked")]) == 0
     assert "was trained on refined meshes" in caplog.text
     ours, theirs = (read_bytes(tmp_path / name) for name in ("run", "tracked"))
     assert ours.keys() == theirs.keys()
     assert all(ours[name] != theirs[name] for name in ours)
     motion = ["--motion", str(run_folder / "tracking.npz")]
-    assert main(["render", str(run_folder), *motion, *cameras, "--out", str(tmp_path / "motion")]) == 0
+    assert (
+        main(["render", str(run_folder), *motion, *cameras, "--out", str(tmp_path / "motion")]) == 0
+    )
     for name in ours:
-        played, shown = (np.asarray(Image.open(tmp_path / kind / name)).astype(int) for kind in ("motion", "run"))
+        played, shown = (
+            np.asarray(Image.open(tmp_path / kind / name)).astype(int) for kind in ("motion", "run")
+        )
         assert np.abs(played - shown).max() <= 2  # the avatar's neutral mesh is float32
 
 
@@ -301,8 +359,11 @@ def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
             with_refined_tracking(lost[0], tmp_path)
 
 
-def test_a_run_that_refines_nothing_leaves_nothing(lost: Made, run_folder: Path, tmp_path: Path) -> None:
-    """Catches a file of the run that was there before, which the new one's avatar would be shown with."""
+def test_a_run_that_refines_nothing_leaves_nothing(
+    lost: Made, run_folder: Path, tmp_path: Path
+) -> None:
+    """Catches a file of the run that was there before, which the new one's avatar would be shown
+    with."""
     shutil.copy(run_folder / "tracking.npz", tmp_path)
     train(lost[0], tmp_path, make_run(lost[0], tracking=False, iterations=3))
     assert not (tmp_path / "tracking.npz").exists()
@@ -315,7 +376,8 @@ def test_where_it_cannot_work(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches a traceback where there are no parameters, and a GPU that trains on while nothing is refined."""
+    """Catches a traceback where there are no parameters, and a GPU that trains on while nothing is
+    refined."""
     with pytest.raises(StgaError, match="is not tracked with FLAME"):
         Trainer(toy, quick_settings("global", tracking=True), {})
     with pytest.raises(StgaError, match="needs the embedding convention 'stga'"):
@@ -324,7 +386,16 @@ def test_where_it_cannot_work(
         Trainer(lost[0], quick_settings("global", tracking=True), {}, device="gpu")
     monkeypatch.setattr("stga_addon.jobs.train.choose_device", lambda wanted: ("gpu:Card", "why"))
     root = lost[0].root
-    train_on = ["train", str(root), "--flame", str(root / "model.npz"), "--device", "gpu", "--iterations", "2"]
+    train_on = [
+        "train",
+        str(root),
+        "--flame",
+        str(root / "model.npz"),
+        "--device",
+        "gpu",
+        "--iterations",
+        "2",
+    ]
     assert main([*train_on, "--out", str(tmp_path / "run"), "--effect", "tracking=on"]) == 2
     assert "FLAME's parameters are refined on the CPU only" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

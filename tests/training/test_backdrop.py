@@ -28,14 +28,16 @@ def room() -> np.ndarray:
 
 
 def person() -> tuple[np.ndarray, np.ndarray]:
-    """Levels (SIZE, SIZE, 3), and coverage (SIZE, SIZE) in 0…1 with an edge of six pixels, as hair has."""
+    """Levels (SIZE, SIZE, 3), and coverage (SIZE, SIZE) in 0…1 with an edge of six pixels, as hair
+    has."""
     y, x = np.mgrid[:SIZE, :SIZE]
     distance = np.hypot(x - 38, y - 42)
     return np.stack([70 + x, 40 + 0.5 * y, 30 + 0 * x], -1), np.clip((26 - distance) / 6, 0, 1)
 
 
 def test_soft_edge_keeps_no_wall() -> None:
-    """Catches a rim of the wall's color: compared with the true foreground over the color; plain blending has a rim."""
+    """Catches a rim of the wall's color: compared with the true foreground over the color; plain
+    blending has a rim."""
     colors, cover = person()
     alpha, mask = cover[..., None], (255 * cover).round().astype(np.uint8)
     image = (alpha * colors + (1 - alpha) * room()).round().astype(np.uint8)
@@ -51,12 +53,17 @@ def test_masks_of_one_value(level: int) -> None:
     """Catches a division by zero where a mask shows nothing or everything."""
     image = room().astype(np.uint8)
     expected = image if level else np.broadcast_to(255 * np.array(GREEN), image.shape)
-    np.testing.assert_array_equal(over_color(image, np.full((SIZE, SIZE), level, np.uint8), GREEN), expected)
+    np.testing.assert_array_equal(
+        over_color(image, np.full((SIZE, SIZE), level, np.uint8), GREEN), expected
+    )
 
 
 def same_but_for_the_edge(found: np.ndarray, expected: np.ndarray) -> bool:
     """Whether both are the same but for two pixels outside of the outline, or one inside."""
-    near, core = binary_dilation(expected, np.ones((5, 5))), binary_erosion(expected, np.ones((3, 3)))
+    near, core = (
+        binary_dilation(expected, np.ones((5, 5))),
+        binary_erosion(expected, np.ones((3, 3))),
+    )
     return bool(core.any() and not near.all() and (found <= near).all() and (found >= core).all())
 
 
@@ -73,14 +80,19 @@ def in_a_room(capture: Capture, folder: Path, keeps_masks: bool) -> Capture:
         picture = image - (1 - alpha) * 255 + (1 - alpha) * np.asarray(stripes)
         Image.fromarray(np.clip(picture, 0, 255).round().astype(np.uint8)).save(folder / name)
         Image.fromarray(mask).save(folder / f"mask_{name}")
-        return replace(view, image=folder / name, mask=folder / f"mask_{name}" if keeps_masks else None)
+        return replace(
+            view, image=folder / name, mask=folder / f"mask_{name}" if keeps_masks else None
+        )
 
-    views = {split: tuple(repaint(view) for view in members) for split, members in capture.views.items()}
+    views = {
+        split: tuple(repaint(view) for view in members) for split, members in capture.views.items()
+    }
     return replace(capture, views=views)
 
 
 def test_what_is_trained_and_evaluated_is_what_masks_show(toy: Capture, tmp_path: Path) -> None:
-    """Catches a wall in training images, in evaluations, or in one of both only: the same as of the plain capture."""
+    """Catches a wall in training images, in evaluations, or in one of both only: the same as of the
+    plain capture."""
     walled = in_a_room(toy, tmp_path, keeps_masks=True)
     settings = make_settings(iterations=1, backdrop="masked")
     prepare = image_preparation(walled, settings)
@@ -91,12 +103,15 @@ def test_what_is_trained_and_evaluated_is_what_masks_show(toy: Capture, tmp_path
         inside = (mask == 0) | (mask == 255)
         assert np.abs(trained.astype(int) - expected)[inside].max() <= 1
         np.testing.assert_array_equal(kept, mask)
-        np.testing.assert_array_equal(read_evaluation_view(walled, view, backdrop="masked").target, trained)
+        np.testing.assert_array_equal(
+            read_evaluation_view(walled, view, backdrop="masked").target, trained
+        )
     assert image_preparation(walled, replace(settings, backdrop="plain")) is None
 
 
 def test_without_masks_the_mesh_is_the_mask(toy: Capture, tmp_path: Path) -> None:
-    """Catches a wall beside the mesh, and a head taken away with it: compared with the depth buffer's pixels."""
+    """Catches a wall beside the mesh, and a head taken away with it: compared with the depth
+    buffer's pixels."""
     walled = in_a_room(toy, tmp_path, keeps_masks=False)
     view = walled.views["train"][0]
     small, image, mask = read_view(view, 0.7)
@@ -104,7 +119,9 @@ def test_without_masks_the_mesh_is_the_mask(toy: Capture, tmp_path: Path) -> Non
     assert made is not None
     mesh = rasterize(np.asarray(walled.mesh(view.timestep)), walled.faces, small.camera)[0] >= 0
     assert same_but_for_the_edge(made > 0, mesh)
-    np.testing.assert_array_equal(found[made == 0], np.broadcast_to([0, 255, 0], found[made == 0].shape))
+    np.testing.assert_array_equal(
+        found[made == 0], np.broadcast_to([0, 255, 0], found[made == 0].shape)
+    )
     np.testing.assert_array_equal(found[made == 255], image[made == 255])
 
 
@@ -115,4 +132,6 @@ def test_silhouette_is_what_the_depth_buffer_shows(toy: Capture) -> None:
     seen = rasterize(mesh, toy.faces, camera)[0] >= 0
     assert same_but_for_the_edge(silhouette(mesh, toy.faces, camera), seen)
     turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.world_to_camera
-    assert not silhouette(mesh, toy.faces, Camera(**{**vars(camera), "world_to_camera": turned})).any()
+    assert not silhouette(
+        mesh, toy.faces, Camera(**{**vars(camera), "world_to_camera": turned})
+    ).any()

@@ -1,4 +1,5 @@
-"""Another background in every iteration: what is transparent in the capture becomes transparent in the avatar."""
+"""Another background in every iteration: what is transparent in the capture becomes transparent in
+the avatar."""
 
 import numpy as np
 import pytest
@@ -13,9 +14,13 @@ from .toys import quick_settings
 
 
 def test_exchanged_background_is_the_composite_over_the_new_one() -> None:
-    """Catches a wrong sign or scale in the compositing: compared with blending the foreground itself."""
+    """Catches a wrong sign or scale in the compositing: compared with blending the foreground
+    itself."""
     rng = np.random.default_rng(0)
-    foreground, coverage = rng.integers(0, 256, (9, 7, 3)), rng.integers(0, 256, (9, 7)).astype(np.uint8)
+    foreground, coverage = (
+        rng.integers(0, 256, (9, 7, 3)),
+        rng.integers(0, 256, (9, 7)).astype(np.uint8),
+    )
     alpha = coverage[..., None] / 255
     before, after = np.array([255, 255, 255], np.float32), np.array([20, 130, 240], np.float32)
     image = np.rint(foreground * alpha + before * (1 - alpha)).astype(np.uint8)
@@ -27,8 +32,11 @@ def test_exchanged_background_is_the_composite_over_the_new_one() -> None:
 
 
 def transmittance_error(capture: Capture, random_background: bool) -> float:
-    """Mean square of alpha − mask on the held-out views, after a short training on a white head before white."""
-    trainer = Trainer(capture, quick_settings("global", lattice=1, random_background=random_background), {})
+    """Mean square of alpha − mask on the held-out views, after a short training on a white head
+    before white."""
+    trainer = Trainer(
+        capture, quick_settings("global", lattice=1, random_background=random_background), {}
+    )
     for n, view in zip(range(150), view_order(capture.views["train"], 1, 0), strict=False):
         trainer.step(view, np.full_like(read_image(view), 255), n / 150, read_mask(view))
     errors = []
@@ -42,8 +50,11 @@ def transmittance_error(capture: Capture, random_background: bool) -> float:
 
 
 def test_alpha_becomes_the_mask(toy: Capture) -> None:
-    """Catches splats whose opacity no image can tell, because they have the background's color: a white fringe."""
-    assert transmittance_error(toy, random_background=True) < 0.6 * transmittance_error(toy, random_background=False)
+    """Catches splats whose opacity no image can tell, because they have the background's color: a
+    white fringe."""
+    assert transmittance_error(toy, random_background=True) < 0.6 * transmittance_error(
+        toy, random_background=False
+    )
 
 
 def test_without_a_mask_the_background_stays(toy: Capture) -> None:

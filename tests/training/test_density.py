@@ -21,7 +21,8 @@ FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 
 
 def busy_state(listed: list[int]) -> TrainState:
-    """Forty splats on six triangles, of which the listed ones have a screen gradient, the first the largest."""
+    """Forty splats on six triangles, of which the listed ones have a screen gradient, the first the
+    largest."""
     state = random_state(COUNT, FACES)
     state.face[:] = np.arange(COUNT) % FACES
     state.screen_gradient[:] = 0
@@ -36,8 +37,8 @@ def control(state: TrainState, budget: int = 1000, share: float = 1.0, seed: int
 
 
 def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
-    """Catches moments of one row given to another after splitting, and children without a second moment: both throw
-    splats about for many steps."""
+    """Catches moments of one row given to another after splitting, and children without a second
+    moment: both throw splats about for many steps."""
     listed = [3, 17, 30]
     state = busy_state(listed)
     before = bits(state)
@@ -52,7 +53,9 @@ def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
         if name.startswith("first"):
             assert not array[COUNT - 3 :].any()
         elif name.startswith(("second", "steps")):
-            np.testing.assert_array_equal(after[name][COUNT - 3 :], before[name][parents], err_msg=name)
+            np.testing.assert_array_equal(
+                after[name][COUNT - 3 :], before[name][parents], err_msg=name
+            )
     for value, average in zip(new.parameters, new.average, strict=True):
         np.testing.assert_array_equal(value[COUNT - 3 :], average[COUNT - 3 :])
     assert not new.screen_gradient.any()
@@ -61,7 +64,8 @@ def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
 
 
 def test_children_stand_on_either_side_along_the_longest_axis() -> None:
-    """Catches a rotation that is transposed or forgotten, an offset in the wrong unit, and a lost triangle."""
+    """Catches a rotation that is transposed or forgotten, an offset in the wrong unit, and a lost
+    triangle."""
     listed = [3, 17, 30, 8]
     state = busy_state(listed)
     parents = state.splats()
@@ -77,18 +81,23 @@ def test_children_stand_on_either_side_along_the_longest_axis() -> None:
         axis = Rotation.from_quat(np.roll(parents.rotation[row], -1)).as_matrix()[:, longest]
         offset = (pair.xyz[1] - pair.xyz[0]) / np.linalg.norm(pair.xyz[1] - pair.xyz[0])
         assert abs(offset @ axis) == pytest.approx(1, abs=1e-4)
-        reach = np.abs((pair.xyz - parents.xyz[row]) @ axis) / np.exp(parents.log_scale[row, longest])
+        reach = np.abs((pair.xyz - parents.xyz[row]) @ axis) / np.exp(
+            parents.log_scale[row, longest]
+        )
         assert ((reach > 0.2) & (reach < 1.0)).all()
         shrunk = parents.log_scale[row] - pair.log_scale
         assert (shrunk[:, longest] > 0.2).all()
         np.testing.assert_array_equal(np.delete(shrunk, longest, axis=1), 0)
         np.testing.assert_array_equal(pair.sh, parents.sh[[row, row]])
-        assert (controlled.unseen_share[[COUNT - 4 + n, COUNT + n]] == state.unseen_share[row]).all()
+        assert (
+            controlled.unseen_share[[COUNT - 4 + n, COUNT + n]] == state.unseen_share[row]
+        ).all()
 
 
 @pytest.mark.parametrize("opacity", [0.2, 0.5, 0.9, 0.99])
 def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
-    """Catches halves that leave a hole or darken the picture: the next steps would only repair what splitting broke."""
+    """Catches halves that leave a hole or darken the picture: the next steps would only repair what
+    splitting broke."""
     splats = Splats(
         xyz=np.zeros((1, 3), np.float32),
         rotation=np.array([[0.9, 0.1, -0.3, 0.2]], np.float32),
@@ -103,7 +112,9 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
     camera = Camera(64, 64, 128.0, 128.0, 32.0, 32.0, pose)
 
     def cover(state: TrainState) -> np.ndarray:
-        return render_differentiable(Parameters(*map(torch.from_numpy, state.parameters)), camera, degree=0)[1].numpy()
+        return render_differentiable(
+            Parameters(*map(torch.from_numpy, state.parameters)), camera, degree=0
+        )[1].numpy()
 
     state = new_state(splats)
     parent = cover(state)
@@ -117,13 +128,19 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
     for axis in (rows, columns):
         centre = [np.average(axis, weights=picture) for picture in (parent, children)]
         assert centre[1] == pytest.approx(centre[0], abs=0.2)
-        spread = [np.sqrt(np.average((axis - centre[0]) ** 2, weights=picture)) for picture in (parent, children)]
+        spread = [
+            np.sqrt(np.average((axis - centre[0]) ** 2, weights=picture))
+            for picture in (parent, children)
+        ]
         assert 0.75 < spread[1] / spread[0] < 1.1
 
 
-@pytest.mark.parametrize(("budget", "share", "split"), [(0, 1.0, 0), (2, 1.0, 2), (1000, 0.05, 2), (1000, 1.0, 5)])
+@pytest.mark.parametrize(
+    ("budget", "share", "split"), [(0, 1.0, 0), (2, 1.0, 2), (1000, 0.05, 2), (1000, 1.0, 5)]
+)
 def test_budget_and_share_bound_the_growth(budget: int, share: float, split: int) -> None:
-    """Catches unbounded growth, and splits of other splats than those with the largest screen gradient."""
+    """Catches unbounded growth, and splits of other splats than those with the largest screen
+    gradient."""
     listed = [20, 4, 33, 11, 26]
     state = busy_state(listed)
     gone = {tuple(p) for p in state.splats().xyz[listed[:split]].tolist()}
@@ -135,10 +152,14 @@ def test_budget_and_share_bound_the_growth(budget: int, share: float, split: int
 
 
 def test_turns_end_where_the_splats_have_grown_enough() -> None:
-    """Catches growth that is counted anew in every turn, and turns outside of their part of the training."""
+    """Catches growth that is counted anew in every turn, and turns outside of their part of the
+    training."""
     settings = TrainingSettings(density_interval=2, density_span=(0.2, 0.8), growth=0.25)
     turns, state, counts = DensityControl(settings, COUNT, np.ones(FACES, bool)), busy_state([]), []
-    due = [turns.is_due(iteration, progress) for iteration, progress in ((2, 0.1), (2, 0.2), (3, 0.5), (2, 0.8))]
+    due = [
+        turns.is_due(iteration, progress)
+        for iteration, progress in ((2, 0.1), (2, 0.2), (3, 0.5), (2, 0.8))
+    ]
     assert due == [False, True, False, False]
     for iteration in range(2, 10, 2):
         state.screen_gradient[:] = 1
@@ -159,10 +180,13 @@ def test_the_screen_gradient_is_a_mean() -> None:
 
 
 def test_faint_splats_go_but_no_triangles_last_one() -> None:
-    """Catches bald triangles, which nothing would ever fill again; unbound splats do not count as a triangle's own."""
+    """Catches bald triangles, which nothing would ever fill again; unbound splats do not count as a
+    triangle's own."""
     state = busy_state([])
     state.unbound[:] = np.arange(COUNT) % 7 == 3
-    state.parameters.opacity[:] = np.where(np.arange(COUNT) < 30, FAINT_LOGIT - 0.1, FAINT_LOGIT + 0.1)
+    state.parameters.opacity[:] = np.where(
+        np.arange(COUNT) < 30, FAINT_LOGIT - 0.1, FAINT_LOGIT + 0.1
+    )
     state.parameters.opacity[(state.face == 2)] = FAINT_LOGIT - 1
     state.parameters.opacity[14] = FAINT_LOGIT - 0.5  # the most opaque of triangle 2
     state.parameters.opacity[38] = 3.0
@@ -174,7 +198,9 @@ def test_faint_splats_go_but_no_triangles_last_one() -> None:
     bound = new.face[~new.unbound]
     assert set(bound.tolist()) == set(range(FACES))
     assert int((bound == 2).sum()) == 1
-    assert new.parameters.opacity[(new.face == 2) & ~new.unbound].tolist() == pytest.approx([FAINT_LOGIT - 0.5])
+    assert new.parameters.opacity[(new.face == 2) & ~new.unbound].tolist() == pytest.approx(
+        [FAINT_LOGIT - 0.5]
+    )
     others = new.face != 2
     assert (new.parameters.opacity[others] > FAINT_LOGIT).all()
     assert (new.parameters.opacity[new.unbound & others] > FAINT_LOGIT).all()

@@ -1,4 +1,5 @@
-"""Detail difference against its formula in float64, pixel by pixel, and on blur that PSNR prefers."""
+"""Detail difference against its formula in float64, pixel by pixel, and on blur that PSNR
+prefers."""
 
 import numpy as np
 import pytest
@@ -38,9 +39,12 @@ def test_against_the_formula() -> None:
 
 
 def test_detail_that_is_a_pixel_off_beats_blur() -> None:
-    """Catches a criterion that, like PSNR, keeps the blurred state of a run instead of the one with hair."""
+    """Catches a criterion that, like PSNR, keeps the blurred state of a run instead of the one with
+    hair."""
     rng = np.random.default_rng(1)
-    strands = np.repeat(gaussian_filter(rng.random((96, 96)), (4, 0.8))[None], 3, 0).astype(np.float32)
+    strands = np.repeat(gaussian_filter(rng.random((96, 96)), (4, 0.8))[None], 3, 0).astype(
+        np.float32
+    )
     strands = (strands - strands.min()) / np.ptp(strands)
     target = (255 * strands).round().astype(np.uint8).transpose(1, 2, 0)
     moved = np.roll(strands, 1, axis=2)

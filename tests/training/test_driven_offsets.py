@@ -33,7 +33,9 @@ def squeezed(toy: Capture) -> Capture:
 
 
 def make_trainer(capture: Capture, seed: int = 0) -> Trainer:
-    settings = quick_settings("global", lattice=1, driven_offsets=("strain_position",), random_background=False)
+    settings = quick_settings(
+        "global", lattice=1, driven_offsets=("strain_position",), random_background=False
+    )
     trainer = Trainer(capture, settings, {})
     position = trainer.state.driven_offsets["strain_position"]
     position.value[:] = np.random.default_rng(seed).normal(0, 1e-3, position.value.shape)
@@ -41,12 +43,14 @@ def make_trainer(capture: Capture, seed: int = 0) -> Trainer:
 
 
 def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
-    """Catches a gradient of the wrong sign, unit or axes, and one summed over other splats: against differences of the
-    loss by each coefficient of a few triangles."""
+    """Catches a gradient of the wrong sign, unit or axes, and one summed over other splats: against
+    differences of the loss by each coefficient of a few triangles."""
     capture = squeezed(toy)
     trainer = make_trainer(capture)
     view = capture.views["train"][0]
-    target = np.random.default_rng(1).integers(0, 255, (view.camera.height, view.camera.width, 3), np.uint8)
+    target = np.random.default_rng(1).integers(
+        0, 255, (view.camera.height, view.camera.width, 3), np.uint8
+    )
     state = trainer.state
     position = state.driven_offsets["strain_position"]
     before = position.value.copy()
@@ -79,13 +83,14 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
         np.testing.assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
     rate = STRAIN_POSITION.rate_share * trainer.settings.rates.xyz
     moved = (stepped - before)[strongest]
-    np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.05)  # Adam's first step is as long as the rate
+    # Adam's first step is as long as the rate
+    np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.05)
     assert (np.sign(moved) == -np.sign(gradient[strongest])).all()
 
 
 def test_the_step_is_adam_in_float64() -> None:
-    """Catches a bias correction, an average or a count that is not each triangle's own, gradients of splats that were
-    not trained, and a broken gradient that gets in."""
+    """Catches a bias correction, an average or a count that is not each triangle's own, gradients
+    of splats that were not trained, and a broken gradient that gets in."""
     rng, faces, rate, ema_share, epsilon = np.random.default_rng(2), 6, 0.02, 0.1, np.float32(1e-3)
     state = new_offset(rng.normal(0, 1, (faces, 3, 3)))
     value, average = state.value.astype(np.float64), state.value.astype(np.float64)
@@ -136,7 +141,12 @@ def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
     drawn = trainer.render(view, 0.0)
     expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
     np.testing.assert_allclose(drawn, expected, atol=2e-5)
-    still = render_avatar(replace(avatar, driven_offsets={}), capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
+    still = render_avatar(
+        replace(avatar, driven_offsets={}),
+        capture.mesh(view.timestep),
+        view.camera,
+        (1.0, 1.0, 1.0),
+    )
     assert np.abs(still - drawn).max() > 0.005
 
 
@@ -144,7 +154,11 @@ def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
     """Catches triangles that are not selected, whose splats would move in all frames."""
     capture = squeezed(toy)
     settings = quick_settings(
-        "selective", lattice=1, driven_offsets=("strain_position",), warm_up_share=0.0, global_interval=1000
+        "selective",
+        lattice=1,
+        driven_offsets=("strain_position",),
+        warm_up_share=0.0,
+        global_interval=1000,
     )
     selected = np.zeros(len(capture.faces), bool)
     selected[:200] = True
@@ -174,10 +188,11 @@ def trained(capture: Capture, out: Path, **changes: Any) -> Path:
 
 
 def test_a_run_keeps_them(toy: Capture, tmp_path: Path) -> None:
-    """Catches coefficients that density control loses, that the avatar or the checkpoint forgets, or that a
-    continuation begins without."""
+    """Catches coefficients that density control loses, that the avatar or the checkpoint forgets,
+    or that a continuation begins without."""
     capture = squeezed(toy)
-    capture = replace(capture, views={"train": capture.views["train"]})  # the avatar is then that of the last state
+    # the avatar is then that of the last state
+    capture = replace(capture, views={"train": capture.views["train"]})
     out = trained(capture, tmp_path / "run")
     avatar, kept = read_avatar(out / "avatar.npz"), read_checkpoint(out)
     position = kept.state.driven_offsets["strain_position"]
@@ -205,23 +220,36 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(toy: Capture, tmp_path: P
     whole = read_avatar(trained(capture, tmp_path / "whole") / "avatar.npz")
     settings = read_run(tmp_path / "whole").settings
     run = Run(capture.root, None, "vhap", settings)
-    train(capture, tmp_path / "parts", run, report=lambda progress: progress.figures().get("iteration", 0) == 17)
+    train(
+        capture,
+        tmp_path / "parts",
+        run,
+        report=lambda progress: progress.figures().get("iteration", 0) == 17,
+    )
     assert read_checkpoint(tmp_path / "parts").iteration == 17
     train(capture, tmp_path / "parts", run, resume=True)
     parts = read_avatar(tmp_path / "parts" / "avatar.npz")
-    np.testing.assert_array_equal(parts.driven_offsets["strain_position"], whole.driven_offsets["strain_position"])
+    np.testing.assert_array_equal(
+        parts.driven_offsets["strain_position"], whole.driven_offsets["strain_position"]
+    )
     np.testing.assert_array_equal(parts.splats.xyz, whole.splats.xyz)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        ("first", np.zeros((3, 3, 3), np.float32), r"strain_position/first is float32 \(3, 3, 3\), expected float32"),
+        (
+            "first",
+            np.zeros((3, 3, 3), np.float32),
+            r"strain_position/first is float32 \(3, 3, 3\), expected float32",
+        ),
         ("steps", None, "missing or malformed"),
         ("value", np.nan, "strain_position/value holds a value that is not finite"),
     ],
 )
-def test_a_damaged_checkpoint(toy: Capture, tmp_path: Path, name: str, value: Any, says: str) -> None:
+def test_a_damaged_checkpoint(
+    toy: Capture, tmp_path: Path, name: str, value: Any, says: str
+) -> None:
     """Catches coefficients that are taken for what they are not."""
     out = trained(squeezed(toy), tmp_path / "run", seed=1)
     arrays = read_npz(out / CHECKPOINT)
@@ -239,7 +267,12 @@ def test_a_checkpoint_of_another_choice(toy: Capture, tmp_path: Path) -> None:
     """Catches a checkpoint without coefficients that is resumed as if it had some."""
     capture = squeezed(toy)
     out = trained(capture, tmp_path / "run")
-    arrays = {n: a for n, a in read_npz(out / CHECKPOINT).items() if not n.startswith("strain_position/")}
+    arrays = {
+        n: a for n, a in read_npz(out / CHECKPOINT).items() if not n.startswith("strain_position/")
+    }
     write_npz(out / CHECKPOINT, arrays)
-    with pytest.raises(StgaError, match=r"its checkpoint and run\.json disagree on the driven offset strain_position"):
+    with pytest.raises(
+        StgaError,
+        match=r"its checkpoint and run\.json disagree on the driven offset strain_position",
+    ):
         train(capture, out, read_run(out), resume=True)

@@ -25,7 +25,8 @@ from .toys import quick_settings
 
 
 def test_evaluation_views_are_evenly_spread(toy: Capture) -> None:
-    """Catches evaluations while training that cost more than the training, or look at one end of the sequence."""
+    """Catches evaluations while training that cost more than the training, or look at one end of
+    the sequence."""
     view = toy.views["val"][0]
     many = tuple(replace(view, timestep=t) for t in range(100))
     chosen = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
@@ -45,12 +46,16 @@ def test_regions_of_a_view(toy: Capture) -> None:
     # The ball's lower part moves, which is below in the image, and only the ball does.
     rows = np.flatnonzero(where.any(1))
     assert rows.min() > factory.CY
-    assert not (where & ~factory.silhouette())[:-1].any() or (where & ~factory.silhouette()).mean() < 0.02
+    assert (
+        not (where & ~factory.silhouette())[:-1].any()
+        or (where & ~factory.silhouette()).mean() < 0.02
+    )
     assert not moving.target.flags.writeable
 
 
 def test_interior_leaves_out_the_matte_s_border(toy: Capture, tmp_path: Path) -> None:
-    """Catches an avatar that is chosen by the matte's border or the background, which differ from view to view."""
+    """Catches an avatar that is chosen by the matte's border or the background, which differ from
+    view to view."""
     view, size = toy.views["val"][0], 400
     camera = replace(view.camera, width=size, height=size)
     mask = np.zeros((size, size), np.uint8)
@@ -61,7 +66,8 @@ def test_interior_leaves_out_the_matte_s_border(toy: Capture, tmp_path: Path) ->
     interior = read_evaluation_view(toy, view).interior
     assert interior is not None
     rows, columns = np.nonzero(interior)
-    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (103, 296, 103, 296)  # 0.75 % of 400 pixels
+    # 0.75 % of 400 pixels
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (103, 296, 103, 296)
     assert interior.sum() > 0.99 * 194**2
 
 
@@ -70,10 +76,13 @@ def test_only_the_nearest_triangle_is_seen(toy: Capture) -> None:
     view = toy.views["val"][0]
     mesh = toy.mesh(view.timestep)
     away = mesh[toy.faces].mean(1) - view.camera.position
-    normals = np.cross(mesh[toy.faces[:, 1]] - mesh[toy.faces[:, 0]], mesh[toy.faces[:, 2]] - mesh[toy.faces[:, 0]])
+    normals = np.cross(
+        mesh[toy.faces[:, 1]] - mesh[toy.faces[:, 0]], mesh[toy.faces[:, 2]] - mesh[toy.faces[:, 0]]
+    )
     behind = (away * normals).sum(1) > 0
     everything = visible_pixels(toy, view, np.ones(len(toy.faces), bool))
-    assert visible_pixels(toy, view, behind).sum() < 0.06 * everything.sum()  # edges of the silhouette
+    # edges of the silhouette
+    assert visible_pixels(toy, view, behind).sum() < 0.06 * everything.sum()
     assert visible_pixels(toy, view, ~behind).sum() > 0.94 * everything.sum()
     disc = factory.silhouette()
     assert (everything ^ disc).sum() < 0.08 * disc.sum()  # the ball is a polyhedron
@@ -97,12 +106,17 @@ def test_transparent_images_lie_over_the_settings_background(toy: Capture, tmp_p
     gray = (0.2, 0.4, 0.6)
     target = read_evaluation_view(capture, views[0], gray).target
     np.testing.assert_array_equal(target[0, 0], [51, 102, 153])
-    settings = replace(quick_settings("global", lattice=0, iterations=2), background=gray, random_background=False)
+    settings = replace(
+        quick_settings("global", lattice=0, iterations=2), background=gray, random_background=False
+    )
     path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
-    outside = np.ones(capture.neutral.shape) * 10  # behind the cameras: nothing but the background is rendered
+    # behind the cameras: nothing but the background is rendered
+    outside = np.ones(capture.neutral.shape) * 10
     avatar = read_avatar(path)
     empty = evaluate_avatar(avatar, replace(capture, mesh=lambda timestep: outside), "test")
-    over_gray = np.where(factory.silhouette()[..., None], factory.picture(0, 0), np.round(255 * np.array(gray)))
+    over_gray = np.where(
+        factory.silhouette()[..., None], factory.picture(0, 0), np.round(255 * np.array(gray))
+    )
     error = np.square(over_gray / 255 - np.array(gray)).mean()
     assert empty.psnr == pytest.approx(-10 * np.log10(error), abs=0.1)
     assert read_metrics(tmp_path / "run")[-1]["psnr"] > empty.psnr

@@ -1,4 +1,5 @@
-"""Extending a finished run by further takes: what is selected, what is remembered, and resumption to the same bits."""
+"""Extending a finished run by further takes: what is selected, what is remembered, and resumption
+to the same bits."""
 
 import importlib
 import json
@@ -36,7 +37,8 @@ from .toys import quick_settings
 
 ITERATIONS = 15
 CAP_PX = 8
-"""Height above the ball's center, in pixels, from which it is yellow in the second take: about 4 cm."""
+"""Height above the ball's center, in pixels, from which it is yellow in the second take: about 4
+cm."""
 
 
 @pytest.fixture(scope="module")
@@ -57,17 +59,25 @@ def takes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("parent") / "run"
     capture = open_capture(takes[0])
-    settings = quick_settings("global", iterations=60, lattice=1, strain_color=True, density_interval=0)
+    settings = quick_settings(
+        "global", iterations=60, lattice=1, strain_color=True, density_interval=0
+    )
     train(capture, out, Run(capture.root, None, "vhap", settings))
     return out
 
 
-def prepare_extension(parent: Path, takes: tuple[Path, ...], growth: float = 0.0, iterations: int = 1) -> Prepared:
-    request = Extend(parent / "unused", parent, takes, growth=growth, iterations=iterations, device="cpu")
+def prepare_extension(
+    parent: Path, takes: tuple[Path, ...], growth: float = 0.0, iterations: int = 1
+) -> Prepared:
+    request = Extend(
+        parent / "unused", parent, takes, growth=growth, iterations=iterations, device="cpu"
+    )
     return prepare(request, ignore, lambda line: None)
 
 
-def extend(parent: Path, take: Path, out: Path, stop: int | None = None, growth: float = 0.0) -> Path:
+def extend(
+    parent: Path, take: Path, out: Path, stop: int | None = None, growth: float = 0.0
+) -> Path:
     prepared = prepare_extension(parent, (take,), growth, iterations=ITERATIONS)
 
     def report(progress: Progress) -> bool:
@@ -77,8 +87,11 @@ def extend(parent: Path, take: Path, out: Path, stop: int | None = None, growth:
     return out
 
 
-def test_the_run_remembers_its_takes(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
-    """Catches an extended run that opens without its new take, or with one whose images were exchanged."""
+def test_the_run_remembers_its_takes(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+) -> None:
+    """Catches an extended run that opens without its new take, or with one whose images were
+    exchanged."""
     before = {path.name: path.read_bytes() for path in parent.iterdir()}
     moved = Path(shutil.copytree(takes[1], tmp_path / "new"))
     out = extend(parent, moved, tmp_path / "extended")
@@ -101,7 +114,8 @@ def test_the_run_remembers_its_takes(takes: tuple[Path, Path], parent: Path, tmp
 
 
 def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches a selection by motion alone, which would not learn a changed skin, and one of the whole head."""
+    """Catches a selection by motion alone, which would not learn a changed skin, and one of the
+    whole head."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
     capture = prepared.capture
     height = capture.mesh(4)[capture.faces].mean(1)[:, 1]
@@ -111,20 +125,31 @@ def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path
     assert selected[front & (height < 0)].mean() < 0.1
 
 
-def test_selection_is_written_without_training(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
-    """Catches a selection at the joined takes' timesteps instead of the new take's own, and a run that is begun."""
+def test_selection_is_written_without_training(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+) -> None:
+    """Catches a selection at the joined takes' timesteps instead of the new take's own, and a run
+    that is begun."""
     path = tmp_path / "selection.npz"
     assert main(["extend", str(parent), str(takes[1]), "--select-only", str(path)]) == 0
     expected = prepare_extension(parent, (takes[1],), iterations=1).selection
     written = read_npz(path)
     assert list(written) == ["00000", "00001", "00003"]
-    assert all(np.array_equal(written[f"{timestep - 4:05d}"], faces) for timestep, faces in expected.items())
+    assert all(
+        np.array_equal(written[f"{timestep - 4:05d}"], faces)
+        for timestep, faces in expected.items()
+    )
     assert not parent.with_name("run_2").exists()
-    assert main(["extend", str(parent), str(takes[1]), str(takes[0]), "--select-only", str(path)]) == 2
+    assert (
+        main(["extend", str(parent), str(takes[1]), str(takes[0]), "--select-only", str(path)]) == 2
+    )
 
 
-def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
-    """Catches what was forgotten hidden in a mean, and an extension that does not learn the new take."""
+def test_each_take_is_evaluated_apart(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+) -> None:
+    """Catches what was forgotten hidden in a mean, and an extension that does not learn the new
+    take."""
     first, *_, last = read_metrics(extend(parent, takes[1], tmp_path / "extended"))
     assert first["iteration"] == 0
     assert last["psnr_take_2"] > first["psnr_take_2"] + 0.1
@@ -133,9 +158,14 @@ def test_each_take_is_evaluated_apart(takes: tuple[Path, Path], parent: Path, tm
 
 @pytest.mark.parametrize("growth", [0.0, 0.5])
 def test_a_stopped_extension_is_continued_to_the_same_bits(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path, growth: float, monkeypatch: pytest.MonkeyPatch
+    takes: tuple[Path, Path],
+    parent: Path,
+    tmp_path: Path,
+    growth: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches an order, a selection, a take or a count of splats that a resumed extension does not find again."""
+    """Catches an order, a selection, a take or a count of splats that a resumed extension does not
+    find again."""
     monkeypatch.setattr(continuation, "DENSITY_INTERVAL", 3)
     whole = extend(parent, takes[1], tmp_path / "whole", growth=growth)
     stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7, growth=growth)
@@ -147,9 +177,11 @@ def test_a_stopped_extension_is_continued_to_the_same_bits(
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
-def test_a_resumed_extension_needs_no_parent(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
-    """Catches a run that fails at its next evaluation because the run that it began with was moved, or that takes over
-    another avatar that lies there now."""
+def test_a_resumed_extension_needs_no_parent(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+) -> None:
+    """Catches a run that fails at its next evaluation because the run that it began with was moved,
+    or that takes over another avatar that lies there now."""
     beside = Path(shutil.copytree(parent, tmp_path / "parent"))
     out = extend(beside, takes[1], tmp_path / "extended", stop=7)
     before = read_avatar(out / "avatar.npz").strain_range
@@ -159,14 +191,20 @@ def test_a_resumed_extension_needs_no_parent(takes: tuple[Path, Path], parent: P
     np.testing.assert_array_equal(read_avatar(out / "avatar.npz").strain_range, before)
 
 
-def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Path], tmp_path: Path) -> None:
-    """Catches splats that cannot gain coefficients, or do not train them, and an avatar that they change at once."""
+def test_what_follows_strain_can_begin_with_a_further_take(
+    takes: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """Catches splats that cannot gain coefficients, or do not train them, and an avatar that they
+    change at once."""
     capture = open_capture(takes[0])
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
     train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
     prepared = prepare_extension(tmp_path / "run", (takes[1],), iterations=6)
     run = replace(
-        prepared.run, settings=replace(prepared.run.settings, strain_color=True, driven_offsets=("strain_position",))
+        prepared.run,
+        settings=replace(
+            prepared.run.settings, strain_color=True, driven_offsets=("strain_position",)
+        ),
     )
     train(prepared.capture, tmp_path / "new", run, prepared.selection)
     before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
@@ -181,7 +219,8 @@ def test_what_follows_strain_can_begin_with_a_further_take(takes: tuple[Path, Pa
 
 
 def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that forgets because it sees the new take only, or that sees old views at one end only."""
+    """Catches an extension that forgets because it sees the new take only, or that sees old views
+    at one end only."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
@@ -191,11 +230,14 @@ def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
 
 
 def test_strain_color_begins_with_its_first_rate(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches strain coefficients as slow as colors that the old takes have trained, and other rates that jump."""
+    """Catches strain coefficients as slow as colors that the old takes have trained, and other
+    rates that jump."""
     original = read_run(parent).settings.rates
     extended = prepare_extension(parent, (takes[1],), iterations=1).run.settings.rates
     middle = learning_rates(original, START_SHARE)
-    assert learning_rates(extended, 0.0) == pytest.approx({**middle, "strain_color": original.strain_color})
+    assert learning_rates(extended, 0.0) == pytest.approx(
+        {**middle, "strain_color": original.strain_color}
+    )
 
 
 def test_what_new_takes_need_is_trained_first() -> None:
@@ -210,9 +252,14 @@ def test_what_new_takes_need_is_trained_first() -> None:
 
 @pytest.mark.parametrize("change", ["shape", "images", "folder"])
 def test_takes_that_do_not_fit(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
+    takes: tuple[Path, Path],
+    parent: Path,
+    tmp_path: Path,
+    change: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches another head, or a take without images, that is found out after minutes of training."""
+    """Catches another head, or a take without images, that is found out after minutes of
+    training."""
 
     def changed(path: Path, *rest: Any) -> Capture:
         capture = open_capture(path, *rest)
@@ -239,21 +286,41 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("extend")
 
 
-def test_the_benchmark_compares_equal_effects(benchmark: Any, takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that wins because training anew goes without an effect that began with the take."""
+def test_the_benchmark_compares_equal_effects(
+    benchmark: Any, takes: tuple[Path, Path], parent: Path
+) -> None:
+    """Catches an extension that wins because training anew goes without an effect that began with
+    the take."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
-    settings = replace(prepared.run.settings, strain_color=True, driven_offsets=("strain_position",))
+    settings = replace(
+        prepared.run.settings, strain_color=True, driven_offsets=("strain_position",)
+    )
     arms = benchmark.extend_arms(replace(prepared, run=replace(prepared.run, settings=settings)), 0)
-    assert (arms["anew"].settings.strain_color, arms["anew"].settings.driven_offsets) == (True, ("strain_position",))
+    assert (arms["anew"].settings.strain_color, arms["anew"].settings.driven_offsets) == (
+        True,
+        ("strain_position",),
+    )
     plain = arms["all-in-turn-plain"].settings
     assert (plain.strain_color, plain.driven_offsets) == (True, ())  # as the parent
 
 
 def test_the_benchmark_shows_what_the_old_take_pays(benchmark: Any) -> None:
     """Catches a summary that praises what the new take gains and is silent about the old one."""
-    first = {"psnr_take_1": 40.0, "psnr_moving_take_1": 39.0, "psnr_take_2": 35.0, "psnr_moving_take_2": 30.0}
-    last = {"psnr_take_1": 39.5, "psnr_moving_take_1": 37.0, "psnr_take_2": 39.0, "psnr_moving_take_2": 36.0}
-    lines = [{**values, "psnr": 37.0, "seconds": 10.0 * n} for n, values in enumerate((first, last))]
+    first = {
+        "psnr_take_1": 40.0,
+        "psnr_moving_take_1": 39.0,
+        "psnr_take_2": 35.0,
+        "psnr_moving_take_2": 30.0,
+    }
+    last = {
+        "psnr_take_1": 39.5,
+        "psnr_moving_take_1": 37.0,
+        "psnr_take_2": 39.0,
+        "psnr_moving_take_2": 36.0,
+    }
+    lines = [
+        {**values, "psnr": 37.0, "seconds": 10.0 * n} for n, values in enumerate((first, last))
+    ]
     rows = [
         [cell.strip() for cell in row.strip("|").split("|")]
         for row in benchmark.differences({"extend": [lines], "anew": [[lines[1]]]})
@@ -265,10 +332,23 @@ def test_the_benchmark_shows_what_the_old_take_pays(benchmark: Any) -> None:
 
 
 def test_the_benchmark_shows_what_there_is(benchmark: Any) -> None:
-    """Catches a measurement that is lost after its trainings, where nothing moves and where only `anew` was asked."""
-    first = {"psnr": 30.0, "psnr_take_1": 30.0, "psnr_take_2": 30.0, "seconds": 0.0, "iterations": 0}
-    ends = [first, {"psnr": 40.0, "psnr_take_1": 40.0, "psnr_take_2": 40.0, "seconds": 2.0, "iterations": 9}]
-    assert benchmark.table({"extend": [ends], "all-in-turn": [ends]})[2] == "| before |  |  | 30.00 | 30.00 |  |"
+    """Catches a measurement that is lost after its trainings, where nothing moves and where only
+    `anew` was asked."""
+    first = {
+        "psnr": 30.0,
+        "psnr_take_1": 30.0,
+        "psnr_take_2": 30.0,
+        "seconds": 0.0,
+        "iterations": 0,
+    }
+    ends = [
+        first,
+        {"psnr": 40.0, "psnr_take_1": 40.0, "psnr_take_2": 40.0, "seconds": 2.0, "iterations": 9},
+    ]
+    assert (
+        benchmark.table({"extend": [ends], "all-in-turn": [ends]})[2]
+        == "| before |  |  | 30.00 | 30.00 |  |"
+    )
     assert "| extend | +10.00 | +10.00 |" in benchmark.differences({"extend": [ends]})
     assert [row.split()[1] for row in benchmark.table({"anew": [ends]})] == ["arm", "---", "anew"]
 
@@ -290,24 +370,38 @@ def in_millimeters(root: Path, cameras: bool, meshes: bool = False) -> Path:
 @pytest.mark.parametrize(
     ("cameras", "meshes", "expected"),
     [
-        (True, False, r"new: its head appears 1e\+03 times smaller in the images than in those of .*old"),
+        (
+            True,
+            False,
+            r"new: its head appears 1e\+03 times smaller in the images than in those of .*old",
+        ),
         (True, True, r"new: its tracked meshes are 1e\+03 times as large as the neutral mesh"),
         (False, True, r"new: its tracked meshes are 1e\+03 times as large as the neutral mesh"),
     ],
 )
 def test_a_take_in_millimeters(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path, cameras: bool, meshes: bool, expected: str
+    takes: tuple[Path, Path],
+    parent: Path,
+    tmp_path: Path,
+    cameras: bool,
+    meshes: bool,
+    expected: str,
 ) -> None:
-    """Catches a take in another unit than the run's, on which training is wasted without an error."""
+    """Catches a take in another unit than the run's, on which training is wasted without an
+    error."""
     take = in_millimeters(Path(shutil.copytree(takes[0], tmp_path / "new")), cameras, meshes)
     with pytest.raises(StgaError, match=expected):
         prepare_extension(parent, (take,))
 
 
 def test_a_flame_take_in_millimeters(tmp_path: Path) -> None:
-    """Catches a FLAME take whose cameras and translation are in millimeters; its meshes' size is the model's."""
+    """Catches a FLAME take whose cameras and translation are in millimeters; its meshes' size is
+    the model's."""
     root, model = factory.write_flame_capture(tmp_path / "old")
-    run, settings = tmp_path / "run", quick_settings("global", iterations=1, lattice=0, density_interval=0)
+    run, settings = (
+        tmp_path / "run",
+        quick_settings("global", iterations=1, lattice=0, density_interval=0),
+    )
     train(open_capture(root, model), run, Run(root, model, "vhap", settings))
     moved = in_millimeters(Path(shutil.copytree(root, tmp_path / "new")), cameras=True)
     for path in (moved / "flame_param").glob("*.npz"):
@@ -321,7 +415,9 @@ def test_takes_from_another_distance_fit(takes: tuple[Path, Path]) -> None:
     """Catches a refusal of cameras that stand three times as far away, or zoom."""
     first = open_capture(takes[0])
     views = [
-        replace(view, camera=replace(view.camera, fl_x=view.camera.fl_x / 3, fl_y=view.camera.fl_y / 3))
+        replace(
+            view, camera=replace(view.camera, fl_x=view.camera.fl_x / 3, fl_y=view.camera.fl_y / 3)
+        )
         for view in first.views["train"]
     ]
     require_same_scale(first, replace(first, views={"train": tuple(views)}))
@@ -335,8 +431,11 @@ def test_a_take_given_twice(takes: tuple[Path, Path], parent: Path) -> None:
         prepare_extension(parent, (takes[1], again))
 
 
-def test_views_that_show_something_else_are_named(takes: tuple[Path, Path], parent: Path, tmp_path: Path) -> None:
-    """Catches exchanged images that are trained without a warning, and a warning about a take that looks different."""
+def test_views_that_show_something_else_are_named(
+    takes: tuple[Path, Path], parent: Path, tmp_path: Path
+) -> None:
+    """Catches exchanged images that are trained without a warning, and a warning about a take that
+    looks different."""
     said: list[str] = []
     request = Extend(parent / "unused", parent, (takes[1],), iterations=1, device="cpu")
     prepare(request, ignore, said.append)
@@ -346,4 +445,7 @@ def test_views_that_show_something_else_are_named(takes: tuple[Path, Path], pare
     Image.fromarray(red).save(take / "images/00001_01.png")
     prepare(replace(request, captures=(take,)), ignore, said.append)
     (line,) = [line for line in said if "swapped" in line]
-    assert line == "warning: images/00001_01.png: does not look like the head from this camera; are images swapped?"
+    assert (
+        line
+        == "warning: images/00001_01.png: does not look like the head from this camera; are images swapped?"
+    )

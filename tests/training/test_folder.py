@@ -26,7 +26,12 @@ FACES = 5
 
 
 def make_run(**changes: Any) -> Run:
-    return Run(Path("/data/head"), Path("/data/flame.npz"), "opencv", make_settings(iterations=9, **changes))
+    return Run(
+        Path("/data/head"),
+        Path("/data/flame.npz"),
+        "opencv",
+        make_settings(iterations=9, **changes),
+    )
 
 
 def make_checkpoint() -> Checkpoint:
@@ -56,11 +61,26 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
         ({"format": "stga-avatar"}, r"run\.json: is not a run"),
         ({"capture": None}, r"run\.json: setting capture: expected a path, got None"),
         ({"settings": None}, r"run\.json: settings: fields are missing"),
-        ({"settings": {}}, r"run\.json: settings: fields are missing or unknown \(adam_epsilon, antialiased, "),
-        ({"device": "toaster"}, r"run\.json: setting device: expected auto, cpu, gpu or gpu:NAME, got 'toaster'"),
-        ({"principal_point": "corner"}, r"run\.json: setting principal_point: expected one of vhap, .*, got 'corner'"),
-        ({"identity": {"faces": 5}}, r"run\.json: identity: fields are missing or unknown \(cameras, "),
-        ({"takes": [{"capture": "a"}]}, r"run\.json: takes\.0: fields are missing or unknown \(identity, start\)"),
+        (
+            {"settings": {}},
+            r"run\.json: settings: fields are missing or unknown \(adam_epsilon, antialiased, ",
+        ),
+        (
+            {"device": "toaster"},
+            r"run\.json: setting device: expected auto, cpu, gpu or gpu:NAME, got 'toaster'",
+        ),
+        (
+            {"principal_point": "corner"},
+            r"run\.json: setting principal_point: expected one of vhap, .*, got 'corner'",
+        ),
+        (
+            {"identity": {"faces": 5}},
+            r"run\.json: identity: fields are missing or unknown \(cameras, ",
+        ),
+        (
+            {"takes": [{"capture": "a"}]},
+            r"run\.json: takes\.0: fields are missing or unknown \(identity, start\)",
+        ),
         (
             {"continuation": {"parent": "a", "avatar": "b", "first": 5, "last": 3}},
             r"run\.json: continuation: its last timestep 3 is before its first, 5",
@@ -68,7 +88,8 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
     ],
 )
 def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    """Catches a run of another version read as one's own, and a traceback for one edited by hand."""
+    """Catches a run of another version read as one's own, and a traceback for one edited by
+    hand."""
     folder.write_run(tmp_path, make_run())
     edit_json(tmp_path / "run.json", **change)
     with pytest.raises(StgaError, match=message):
@@ -86,7 +107,8 @@ def test_run_files_that_are_none(tmp_path: Path, text: str) -> None:
 
 
 def test_selection_round_trip(tmp_path: Path) -> None:
-    """Catches timesteps mixed up or masks that lose their kind, and a selection made for another mesh."""
+    """Catches timesteps mixed up or masks that lose their kind, and a selection made for another
+    mesh."""
     rng = np.random.default_rng(0)
     selection = {t: rng.random(FACES) < 0.5 for t in (0, 3, 123456)}
     checkpoint_files.write_selection(tmp_path, selection, "a")
@@ -95,7 +117,9 @@ def test_selection_round_trip(tmp_path: Path) -> None:
     for timestep, faces in selection.items():
         np.testing.assert_array_equal(again[timestep], faces)
         assert again[timestep].dtype == bool
-    with pytest.raises(StgaError, match=r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"):
+    with pytest.raises(
+        StgaError, match=r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"
+    ):
         checkpoint_files.read_selection(tmp_path, FACES + 1)
     checkpoint_files.write_selection(tmp_path, {0: np.ones(FACES, np.float32)}, "a")
     with pytest.raises(StgaError, match="float32"):
@@ -161,7 +185,8 @@ def meta(**changes: Any) -> np.ndarray:
 
 
 def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
-    """The moments of positions that follow strain, of FACES triangles, and what is changed of them."""
+    """The moments of positions that follow strain, of FACES triangles, and what is changed of
+    them."""
     rows = np.zeros((FACES, 3, 3), np.float32)
     arrays = {
         "value": rows, "average": rows, "first": rows, "second": rows, "steps": np.zeros(FACES, np.int32), **changes,
@@ -174,39 +199,78 @@ DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
     "no moments": ({"second/sh": None}, "a field is missing"),
     "no rows": ({"steps": None}, "a field is missing"),
     "no meta": ({"meta": None}, "a field is missing"),
-    "shorter array": ({"first/xyz": np.zeros((11, 3), np.float32)}, r"/xyz is .* \(11, 3\), expected .* \(12, 3\)"),
+    "shorter array": (
+        {"first/xyz": np.zeros((11, 3), np.float32)},
+        r"/xyz is .* \(11, 3\), expected .* \(12, 3\)",
+    ),
     "scalar": ({"opacity": np.zeros((), np.float32)}, "an array has no rows"),
     "meta is no JSON": ({"meta": np.frombuffer(b"hello", np.uint8)}, "malformed"),
     "meta is a list": ({"meta": np.frombuffer(b"[]", np.uint8)}, "meta is no object"),
     "another version": ({"meta": meta(version=1)}, "was written by another version"),
     "unknown count": ({"meta": meta(color=3)}, "malformed .*color"),
-    "negative iteration": ({"meta": meta(iteration=-1)}, "iteration is -1, expected a whole number from 0 up"),
+    "negative iteration": (
+        {"meta": meta(iteration=-1)},
+        "iteration is -1, expected a whole number from 0 up",
+    ),
     "half an iteration": ({"meta": meta(iteration=1.5)}, "iteration is 1.5"),
     "an iteration that is true": ({"meta": meta(iteration=True)}, "iteration is True"),
-    "iteration beyond what is exact": ({"meta": meta(iteration=1 << 53)}, "iteration is 9007199254740992"),
-    "visit before the first": ({"meta": meta(visit=-2)}, "visit is -2, expected a whole number from -1 up"),
+    "iteration beyond what is exact": (
+        {"meta": meta(iteration=1 << 53)},
+        "iteration is 9007199254740992",
+    ),
+    "visit before the first": (
+        {"meta": meta(visit=-2)},
+        "visit is -2, expected a whole number from -1 up",
+    ),
     "negative splats": ({"meta": meta(initial_count=-1)}, "initial_count is -1"),
     "negative evaluations": ({"meta": meta(evaluations=-1)}, "evaluations is -1"),
     "endless time": ({"meta": meta(elapsed_s=math.inf)}, "elapsed_s is inf"),
     "time before the start": ({"meta": meta(elapsed_s=-1.0)}, "elapsed_s is -1.0"),
     "time that is a text": ({"meta": meta(elapsed_s="1")}, "elapsed_s is '1'"),
-    "quality that is no number": ({"meta": meta(best_difference=math.nan)}, "best_difference is nan"),
+    "quality that is no number": (
+        {"meta": meta(best_difference=math.nan)},
+        "best_difference is nan",
+    ),
     "negative timestep": ({"meta": meta(last_timestep=-1)}, "last_timestep is -1"),
-    "timestep beyond what is exact": ({"meta": meta(last_timestep=1 << 53)}, "last_timestep is 9007199254740992"),
+    "timestep beyond what is exact": (
+        {"meta": meta(last_timestep=1 << 53)},
+        "last_timestep is 9007199254740992",
+    ),
     "losses that are no list": ({"meta": meta(losses=5)}, "losses is no list of numbers"),
-    "a loss that is no number": ({"meta": meta(losses=[0.5, math.nan])}, "losses is no list of numbers"),
+    "a loss that is no number": (
+        {"meta": meta(losses=[0.5, math.nan])},
+        "losses is no list of numbers",
+    ),
     "identity that is no text": ({"meta": meta(identity=None)}, "identity is no text"),
-    "wrong width": ({"parameters/rotation": np.zeros((12, 3), np.float32)}, "parameters/rotation is .*, expected"),
+    "wrong width": (
+        {"parameters/rotation": np.zeros((12, 3), np.float32)},
+        "parameters/rotation is .*, expected",
+    ),
     "wrong kind": ({"parameters/xyz": np.zeros((12, 3), np.float64)}, "parameters/xyz is float64"),
-    "not finite": ({"parameters/xyz": NOT_FINITE}, "parameters/xyz holds a value that is not finite"),
-    "moment of another shape": ({"first/sh": np.zeros((12, 1, 3), np.float32)}, r"/sh is .* \(12, 1, 3\), expected"),
-    "coefficients of no degree": ({"parameters/sh": np.zeros((12, 2, 3), np.float32)}, "has 2 coefficients"),
-    "strain of doubles": (strain_position(value=np.zeros((FACES, 3, 3))), "strain_position/value is float64"),
+    "not finite": (
+        {"parameters/xyz": NOT_FINITE},
+        "parameters/xyz holds a value that is not finite",
+    ),
+    "moment of another shape": (
+        {"first/sh": np.zeros((12, 1, 3), np.float32)},
+        r"/sh is .* \(12, 1, 3\), expected",
+    ),
+    "coefficients of no degree": (
+        {"parameters/sh": np.zeros((12, 2, 3), np.float32)},
+        "has 2 coefficients",
+    ),
+    "strain of doubles": (
+        strain_position(value=np.zeros((FACES, 3, 3))),
+        "strain_position/value is float64",
+    ),
     "strain of other triangles": (
         strain_position(first=np.zeros((4, 3, 3), np.float32)),
         r"strain_position/first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)",
     ),
-    "steps that are no int32": (strain_position(steps=np.zeros(FACES, np.int64)), "strain_position/steps is int64"),
+    "steps that are no int32": (
+        strain_position(steps=np.zeros(FACES, np.int64)),
+        "strain_position/steps is int64",
+    ),
     "strain that is not finite": (
         strain_position(second=np.full((FACES, 3, 3), np.inf, np.float32)),
         "strain_position/second holds a value that is not finite",
@@ -216,8 +280,8 @@ DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_checkpoints(tmp_path: Path, name: str) -> None:
-    """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check, and one that is
-    refused for another reason than what is wrong with it."""
+    """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check,
+    and one that is refused for another reason than what is wrong with it."""
     checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     with np.load(path) as data:
@@ -229,9 +293,12 @@ def test_damaged_checkpoints(tmp_path: Path, name: str) -> None:
 
 
 def test_checkpoint_at_its_limits(tmp_path: Path) -> None:
-    """Catches a run that cannot be resumed because its first or last possible value counts as damaged."""
+    """Catches a run that cannot be resumed because its first or last possible value counts as
+    damaged."""
     for iteration, visit, timestep in ((0, -1, 0), ((1 << 53) - 1, (1 << 53) - 1, (1 << 53) - 1)):
-        checkpoint = Checkpoint(random_state(3, FACES), iteration, visit, timestep, 0, 0.0, 1.0, 0, [0.0])
+        checkpoint = Checkpoint(
+            random_state(3, FACES), iteration, visit, timestep, 0, 0.0, 1.0, 0, [0.0]
+        )
         checkpoint_files.write_checkpoint(tmp_path, checkpoint)
         again = checkpoint_files.read_checkpoint(tmp_path)
         assert (again.iteration, again.visit, again.last_timestep) == (iteration, visit, timestep)
@@ -245,12 +312,18 @@ def test_missing_checkpoint(tmp_path: Path) -> None:
 
 def line(iteration: int, **changes: Any) -> dict[str, Any]:
     """A line of metrics with the fields that every line has."""
-    times = {"seconds": 0.5 * iteration, "splats": 80, "evaluation_s": 0.1, "wall_s": float(iteration)}
+    times = {
+        "seconds": 0.5 * iteration,
+        "splats": 80,
+        "evaluation_s": 0.1,
+        "wall_s": float(iteration),
+    }
     return {"iteration": iteration, **times, **changes}
 
 
 def test_metrics_with_a_cut_last_line(tmp_path: Path) -> None:
-    """Catches a run that cannot be resumed because a kill cut its last line, and lines lost before that one."""
+    """Catches a run that cannot be resumed because a kill cut its last line, and lines lost before
+    that one."""
     assert metrics_log.read_metrics(tmp_path) == []
     lines = [line(n, psnr=20.0 + n, ssim=0.9) for n in (10, 20, 30)]
     for written in lines:
@@ -288,7 +361,8 @@ FORECAST = {"seconds": 1.0, "psnr": 30.0, "error": 0.1, "ahead": 5.0, "gain": 0.
     ],
 )
 def test_damaged_metrics(tmp_path: Path, damaged: Any, message: str) -> None:
-    """Catches a traceback in resume, curve or summary for a line that lacks a field or has a wrong one."""
+    """Catches a traceback in resume, curve or summary for a line that lacks a field or has a wrong
+    one."""
     for written in (line(5), damaged, line(20)):
         metrics_log.append_metrics(tmp_path, written)
     with pytest.raises(StgaError, match=rf"metrics\.jsonl: line 2: {message}") as caught:
@@ -310,7 +384,9 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
         "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", hold, str(target)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with pytest.raises(StgaError, match=f"process {other.pid}"), folder.locked(target):
@@ -321,10 +397,12 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
         assert lock_owner(target / "run.lock") == os.getpid()
 
 
-@pytest.mark.parametrize("content", ["", "hello", "0", "1", pytest.param(str(os.getpid()), id="own process")])
+@pytest.mark.parametrize(
+    "content", ["", "hello", "0", "1", pytest.param(str(os.getpid()), id="own process")]
+)
 def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path, content: str) -> None:
-    """Catches a folder locked for ever by a process killed while it wrote its lock, or whose number lives on in
-    another process (1 always does)."""
+    """Catches a folder locked for ever by a process killed while it wrote its lock, or whose number
+    lives on in another process (1 always does)."""
     (tmp_path / "run.lock").write_text(content)
     with folder.locked(tmp_path):
         pass

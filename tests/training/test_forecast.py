@@ -67,7 +67,8 @@ def test_four_of_five_forecasts_come_true(noise: float) -> None:
 
 
 def test_one_bad_evaluation_does_not_tilt_the_forecast() -> None:
-    """Catches least squares: right after splats were put back, an evaluation may be a decibel too low."""
+    """Catches least squares: right after splats were put back, an evaluation may be a decibel too
+    low."""
     psnr = rising(TIMES)
     psnr[-3] -= 2
     told = forecast(curve(TIMES, psnr), 20.0)
@@ -121,7 +122,8 @@ def test_a_run_is_flat_when_neither_measure_rises() -> None:
 
 
 def test_forecast_of_both_measures() -> None:
-    """Catches a detail difference that is forecast in dB, upwards, or for a run that does not measure it."""
+    """Catches a detail difference that is forecast in dB, upwards, or for a run that does not
+    measure it."""
     lines = evaluations(rising(TIMES), 10 ** (-(30 - 20 / np.sqrt(TIMES)) / 20))
     assert detail_curve(lines)[-1][1] == pytest.approx(30 - 20 / np.sqrt(120))
     gain = 20 / np.sqrt(120) - 20 / np.sqrt(240)
@@ -135,7 +137,8 @@ def test_forecast_of_both_measures() -> None:
 
 
 def test_hits() -> None:
-    """Catches forecasts counted that cannot be checked yet, and ones compared with the wrong moment."""
+    """Catches forecasts counted that cannot be checked yet, and ones compared with the wrong
+    moment."""
 
     def told(seconds: float, psnr: float) -> dict[str, float]:
         return Forecast(seconds, psnr, 0.2, 10.0, 0.0).as_json()
@@ -151,25 +154,33 @@ def test_hits() -> None:
 
 
 def test_the_curve_leaves_out_what_was_evaluated_twice() -> None:
-    """Catches a run that is stopped at an evaluation, which is then repeated: two points at once have no slope."""
+    """Catches a run that is stopped at an evaluation, which is then repeated: two points at once
+    have no slope."""
     lines = [{"seconds": s, "psnr": 19 + s} for s in (1.0, 2.0, 2.0)]
     lines.append({"seconds": 3.0})
     assert curve_of(lines) == [(1.0, 20.0), (2.0, 21.0)]
 
 
 def test_why_a_target_was_missed() -> None:
-    """Catches "train longer" where that does not help, and another time than the curve will take."""
+    """Catches "train longer" where that does not help, and another time than the curve will
+    take."""
     risen = curve(TIMES, rising(TIMES))  # in 120 s; 36 − 20/√400 = 35
-    assert explain_missed_target(risen, 35).endswith("extrapolating the curve, it would take about 4.7 min more")
+    assert explain_missed_target(risen, 35).endswith(
+        "extrapolating the curve, it would take about 4.7 min more"
+    )
     assert explain_missed_target(risen, 34.18).endswith("would take about 12 s more")
-    assert explain_missed_target(risen, 40).endswith("levels off at about 36.0 dB; more time alone would not reach it")
+    assert explain_missed_target(risen, 40).endswith(
+        "levels off at about 36.0 dB; more time alone would not reach it"
+    )
     for near in (35.99, 37):  # 1.8 dB are still to come, which may be off by as much as a forecast
         assert explain_missed_target(risen, near).endswith(
             "levels off at about 36.0 dB; only a much longer budget might reach it"
         )
     fell = np.where(TIMES < 50, rising(TIMES), 30.0)
     assert "nothing was gained after 48 s" in explain_missed_target(curve(TIMES, fell), 40)
-    assert "does not rise steadily" in explain_missed_target(curve(TIMES[:6], -rising(TIMES[:6])), 40)
+    assert "does not rise steadily" in explain_missed_target(
+        curve(TIMES[:6], -rising(TIMES[:6])), 40
+    )
     assert explain_missed_target([(1.0, 20.0)], 40) == (
         "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it would take"
     )

@@ -12,7 +12,8 @@ from stga_addon.training.optimize.frames import CACHED_TIMESTEPS, FrameStore
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_frames_are_those_of_the_timesteps_mesh(toy: Capture, convention: str) -> None:
-    """Catches frames of another timestep, of another convention, or scaled by the posed mesh instead of the neutral."""
+    """Catches frames of another timestep, of another convention, or scaled by the posed mesh
+    instead of the neutral."""
     store = FrameStore(toy, convention)
     for timestep in (3, 0, 3):
         expected = face_frames(toy.mesh(timestep), toy.faces, toy.neutral, convention)
@@ -44,7 +45,8 @@ def test_meshes_are_read_once_and_few_are_kept(toy: Capture) -> None:
 
 
 def test_meshes_that_were_read_elsewhere_are_used(toy: Capture) -> None:
-    """Catches a second read of a mesh that the loader has prepared, and a cached mesh that is replaced."""
+    """Catches a second read of a mesh that the loader has prepared, and a cached mesh that is
+    replaced."""
     read: list[int] = []
 
     def mesh(timestep: int) -> np.ndarray:

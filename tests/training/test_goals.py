@@ -39,7 +39,8 @@ def scores(values: Iterator[float]) -> Evaluate:
 
 
 class Clock:
-    """A clock that only training and evaluation move: by fixed amounts, so that no machine is too slow for the test."""
+    """A clock that only training and evaluation move: by fixed amounts, so that no machine is too
+    slow for the test."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -68,7 +69,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
-def test_evaluation_keeps_to_its_share_of_the_time(toy: Capture, tmp_path: Path, clock: Clock) -> None:
+def test_evaluation_keeps_to_its_share_of_the_time(
+    toy: Capture, tmp_path: Path, clock: Clock
+) -> None:
     """Catches evaluations that eat the budget, are counted as training, or hardly ever come."""
     train(toy, tmp_path, run_of(toy, iterations=None, seconds=400.0))
     lines = read_metrics(tmp_path)
@@ -82,15 +85,29 @@ def test_evaluation_keeps_to_its_share_of_the_time(toy: Capture, tmp_path: Path,
 def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock) -> None:
     """Catches forecasts that cannot be checked afterwards, or that nobody sees."""
     told: list[Progress] = []
-    train(toy, tmp_path, run_of(toy, iterations=200), report=lambda progress: bool(told.append(progress)))
+    train(
+        toy,
+        tmp_path,
+        run_of(toy, iterations=200),
+        report=lambda progress: bool(told.append(progress)),
+    )
     lines = read_metrics(tmp_path)
-    assert [line["iteration"] for line in lines if "forecast" in line] == [80, 100, 120, 140, 160, 180]
+    assert [line["iteration"] for line in lines if "forecast" in line] == [
+        80,
+        100,
+        120,
+        140,
+        160,
+        180,
+    ]
     hit, checked = checked_forecasts(lines)
     assert 0 < hit <= checked == 6
     assert any("another" in progress.detail for progress in told)
 
 
-def test_a_reached_target_ends_the_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reached_target_ends_the_run(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a target that is passed by, and one that a resumed run forgets it has reached."""
     values = iter([25.0, 29.0, 30.5, 30.5])
     monkeypatch.setattr(evaluator, "evaluate", scores(values))
@@ -105,8 +122,14 @@ def test_a_reached_target_ends_the_run(toy: Capture, tmp_path: Path, monkeypatch
 def test_the_avatar_that_reached_the_target_is_kept(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches "30 dB was reached" beside a file that has less, because an earlier one was sharper."""
-    found = iter([Quality(25.0, 0.5, detail_difference=0.1), *[Quality(30.5, 0.5, detail_difference=0.2)] * 2])
+    """Catches "30 dB was reached" beside a file that has less, because an earlier one was
+    sharper."""
+    found = iter(
+        [
+            Quality(25.0, 0.5, detail_difference=0.1),
+            *[Quality(30.5, 0.5, detail_difference=0.2)] * 2,
+        ]
+    )
     monkeypatch.setattr(evaluator, "evaluate", lambda *arguments, **named: next(found))
     run = run_of(toy, target_psnr=30.0)
     path = train(toy, tmp_path, run)
@@ -116,13 +139,16 @@ def test_the_avatar_that_reached_the_target_is_kept(
     assert end.best_difference == 0.2
 
 
-def test_a_target_out_of_sight_is_said_while_training(toy: Capture, tmp_path: Path, clock: Clock) -> None:
+def test_a_target_out_of_sight_is_said_while_training(
+    toy: Capture, tmp_path: Path, clock: Clock
+) -> None:
     """Catches a person who waits to the end to learn that it was in vain."""
     told: list[str] = []
     run = run_of(toy, iterations=40, target_psnr=60.0)
     train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.detail)))
     assert any("60 dB is out of reach" in forecast_text for forecast_text in told)
-    assert not any(forecast_text.startswith(";") for forecast_text in told)  # near the end there is nothing else to say
+    # near the end there is nothing else to say
+    assert not any(forecast_text.startswith(";") for forecast_text in told)
     assert read_checkpoint(tmp_path).iteration == 40
 
 
@@ -137,7 +163,8 @@ def test_a_target_needs_held_out_views(toy: Capture, tmp_path: Path) -> None:
 def test_a_run_that_no_longer_improves(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock, stop: bool
 ) -> None:
-    """Catches overfitting that nobody is told about, and a run that stops without having been asked to."""
+    """Catches overfitting that nobody is told about, and a run that stops without having been asked
+    to."""
     falling = (30 - n / 10 for n in count())
     monkeypatch.setattr(evaluator, "evaluate", scores(falling))
     told: list[str] = []
@@ -146,11 +173,14 @@ def test_a_run_that_no_longer_improves(
     assert (read_checkpoint(tmp_path).iteration < 200) == stop
     if not stop:
         assert any(
-            re.fullmatch(r"no gain since \d+ s: more time no longer helps", forecast_text) for forecast_text in told
+            re.fullmatch(r"no gain since \d+ s: more time no longer helps", forecast_text)
+            for forecast_text in told
         )
 
 
-def test_images_grow_where_settings_say_so(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_grow_where_settings_say_so(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches coarse training that never ends, or whose camera does not fit its image."""
     seen: list[tuple[int, int]] = []
     step = session.Trainer.step

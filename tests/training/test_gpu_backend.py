@@ -1,5 +1,5 @@
-"""The iteration by the WebGPU kernels, on software Vulkan where there is no GPU, against the CPU's: states, freezing,
-whole runs."""
+"""The iteration by the WebGPU kernels, on software Vulkan where there is no GPU, against the CPU's:
+states, freezing, whole runs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +20,13 @@ from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
-from stga_addon.training.optimize.state import OffsetState, TrainState, arrays_of, keep_rows, new_state
+from stga_addon.training.optimize.state import (
+    OffsetState,
+    TrainState,
+    arrays_of,
+    keep_rows,
+    new_state,
+)
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
@@ -38,14 +44,19 @@ pytestmark = pytest.mark.needs("adapter")
 
 def settings_of(**changes: Any) -> TrainingSettings:
     """Every term of the loss at work on most splats."""
-    limits = {"scale_limit": 0.2, "distance_weight": 0.1, "distance_limit": 0.3, "unseen_opacity_weight": 0.5}
+    limits = {
+        "scale_limit": 0.2,
+        "distance_weight": 0.1,
+        "distance_limit": 0.3,
+        "unseen_opacity_weight": 0.5,
+    }
     effects = {"strain_color": True, "antialiased": True, "driven_offsets": ("strain_position",)}
     return quick_settings("selective", **{**limits, **effects, **changes})
 
 
 def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
-    """Splats unlike each other, in the middle of training; the average of how positions follow strain is far from the
-    latest values."""
+    """Splats unlike each other, in the middle of training; the average of how positions follow
+    strain is far from the latest values."""
     state = new_state(initial_splats(capture, settings))
     rng = np.random.default_rng(0)
     for value in state.parameters:
@@ -70,7 +81,9 @@ def following(state: TrainState) -> OffsetState:
 
 def every_bit(state: TrainState) -> dict[str, np.ndarray]:
     """A copy of every value by name, so that equal ones have equal bits; gradients left out."""
-    position = {name: table.copy().view(np.uint32) for name, table in vars(following(state)).items()}
+    position = {
+        name: table.copy().view(np.uint32) for name, table in vars(following(state)).items()
+    }
     return {**bits(state), **{f"strain_position/{name}": table for name, table in position.items()}}
 
 
@@ -81,7 +94,9 @@ def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuB
     return cpu, GpuBackend(Device(), settings, frames, disturbed(capture, settings))
 
 
-def batch_of(capture: Capture, settings: TrainingSettings, timestep: int = 1, **changes: Any) -> Batch:
+def batch_of(
+    capture: Capture, settings: TrainingSettings, timestep: int = 1, **changes: Any
+) -> Batch:
     view = view_of(capture, timestep)
     values = {
         "view": view, "target": read_image(view), "mask": None, "background": np.ones(3, np.float32), "sh_degree": 3,
@@ -97,14 +112,17 @@ def moments(step: Backend) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("part", ["whole", "mouth", "another background"])
 def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
-    """Catches a term of the loss, a limit, a rate, a bias correction or a background that is left out or differs."""
+    """Catches a term of the loss, a limit, a rate, a bias correction or a background that is left
+    out or differs."""
     settings = settings_of()
     changes: dict[str, Any] = {}
     if part == "mouth":
         changes["selected"] = toy.regions["mouth"]
     if part == "another background":
         # All or nothing: a mixture may lie between two bytes, and either is right.
-        mask = 255 * np.random.default_rng(1).integers(0, 2, read_image(view_of(toy, 1)).shape[:2], np.uint8)
+        mask = 255 * np.random.default_rng(1).integers(
+            0, 2, read_image(view_of(toy, 1)).shape[:2], np.uint8
+        )
         changes |= {"mask": mask, "background": np.float32([0.13, 0.82, 0.43])}
     batch = batch_of(toy, settings, **changes)
     cpu, gpu = pair(toy, settings)
@@ -118,7 +136,8 @@ def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
             continue
         got, want = state[name].astype(float), expected[name].astype(float)
         off = np.abs(got - want) > 2e-4 * np.abs(want).max()
-        # The first step is the rate times the gradient's sign, which rounding may turn where the gradient is nothing.
+        # The first step is the rate times the gradient's sign, which rounding may turn where the
+        # gradient is nothing.
         assert off.mean() < 2e-3 if name.startswith("parameters/") else not off.any(), name
 
 
@@ -130,7 +149,9 @@ def test_losses_are_the_cpus_and_returned_two_iterations_late(toy: Capture) -> N
     batches = [batch_of(toy, settings, timestep, selected=part) for timestep, part in parts]
     expected, losses = ([step.step(batch) for batch in batches] for step in (cpu, gpu))
     assert [loss is None for loss in losses] == [True, True, False, False, True, False]
-    assert [losses[n] for n in (2, 3, 5)] == pytest.approx([expected[n] for n in (0, 1, 3)], rel=1e-3)
+    assert [losses[n] for n in (2, 3, 5)] == pytest.approx(
+        [expected[n] for n in (0, 1, 3)], rel=1e-3
+    )
 
 
 def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
@@ -150,7 +171,8 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> Non
 
 
 def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
-    """Catches tiles left out around the selection, and pixels read that no tile rendered: they hold NaN."""
+    """Catches tiles left out around the selection, and pixels read that no tile rendered: they hold
+    NaN."""
     settings = settings_of(scale_weight=0.0, distance_weight=0.0)
     view, target = large(view_of(toy, 1))
     whole = batch_of(toy, settings, view=view, target=target)
@@ -159,7 +181,15 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
     first.step(whole)
     second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
     device = second.device
-    for name in ("image", "pixels", "v_image", "pair_gradients", "projected", "gradients", "screen"):
+    for name in (
+        "image",
+        "pixels",
+        "v_image",
+        "pair_gradients",
+        "projected",
+        "gradients",
+        "screen",
+    ):
         device.upload(name, np.full(device.buffer(name, 0).size // 4, np.nan, np.float32))
     second.step(part)
     rows = np.flatnonzero(second.state.steps != disturbed(toy, settings).steps)
@@ -170,10 +200,16 @@ def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
         assert np.abs(got[rows] - want[rows]).max() <= 1e-6 * np.abs(want[rows]).max(), name
 
 
-def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an iteration lost, counted twice or half done where the buffers were too small for it."""
+def test_an_iteration_without_room_is_repeated(
+    toy: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an iteration lost, counted twice or half done where the buffers were too small for
+    it."""
     settings = settings_of()
-    batches = [batch_of(toy, settings, timestep, selected=s) for timestep, s in ((1, None), (3, toy.regions["mouth"]))]
+    batches = [
+        batch_of(toy, settings, timestep, selected=s)
+        for timestep, s in ((1, None), (3, toy.regions["mouth"]))
+    ]
     results = []
     for capacity in (rasterize.INITIAL_PAIR_CAPACITY, 10):
         monkeypatch.setattr(rasterize, "INITIAL_PAIR_CAPACITY", capacity)
@@ -187,7 +223,8 @@ def test_an_iteration_without_room_is_repeated(toy: Capture, monkeypatch: pytest
 
 @pytest.mark.parametrize("part", [None, "mouth"])
 def test_an_iteration_is_one_submit(toy: Capture, part: str | None) -> None:
-    """Catches work that waits for the host, or that costs a submit or many dispatches of its own."""
+    """Catches work that waits for the host, or that costs a submit or many dispatches of its
+    own."""
     settings = settings_of()
     _, gpu = pair(toy, settings)
     batch = batch_of(toy, settings, selected=None if part is None else toy.regions[part])
@@ -218,7 +255,8 @@ def test_everything_is_compiled_before_the_first_iteration(toy: Capture) -> None
 def test_a_lost_gpu_is_followed_by_the_cpu(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Catches a run that ends, begins again or loses its checkpoint where a driver is reset, and a CPU unasked."""
+    """Catches a run that ends, begins again or loses its checkpoint where a driver is reset, and a
+    CPU unasked."""
     device = f"gpu:{gpu_device.device().name}"
     run = replace(make_run(toy, "selective", iterations=12, strain_color=True), device=device)
     train(toy, tmp_path, run, report=stop_at(5))
@@ -227,7 +265,9 @@ def test_a_lost_gpu_is_followed_by_the_cpu(
     def breaks(self: GpuBackend, batch: Batch) -> float | None:
         done.append(batch)
         if len(done) == 3:
-            raise DeviceError("Card 9000 was lost", "try again, with --device cpu if it happens again")
+            raise DeviceError(
+                "Card 9000 was lost", "try again, with --device cpu if it happens again"
+            )
         return step(self, batch)
 
     monkeypatch.setattr(GpuBackend, "step", breaks)
@@ -236,7 +276,14 @@ def test_a_lost_gpu_is_followed_by_the_cpu(
     assert read_checkpoint(tmp_path).iteration == 5
     done.clear()
     stages: list[str] = []
-    train(toy, tmp_path, run, resume=True, report=lambda progress: bool(stages.append(progress.stage)), falls_back=True)
+    train(
+        toy,
+        tmp_path,
+        run,
+        resume=True,
+        report=lambda progress: bool(stages.append(progress.stage)),
+        falls_back=True,
+    )
     assert len(done) == 3
     assert "Continuing on the CPU" in stages
     assert "Card 9000 was lost; continuing on the CPU from the last checkpoint" in caplog.messages
@@ -245,7 +292,8 @@ def test_a_lost_gpu_is_followed_by_the_cpu(
 
 
 def test_states_are_the_same_bits_on_both(toy: Capture) -> None:
-    """Catches a checkpoint of one device that the other reads differently: rows, moments, counts, statistics, marks."""
+    """Catches a checkpoint of one device that the other reads differently: rows, moments, counts,
+    statistics, marks."""
     settings = settings_of()
     cpu, gpu = pair(toy, settings)
     for timestep in (1, 3):
@@ -258,8 +306,11 @@ def test_states_are_the_same_bits_on_both(toy: Capture) -> None:
     gpu.step(batch_of(toy, settings))
     cpu.state = gpu.state
     assert not np.array_equal(bits(cpu.state)["parameters/xyz"], bits(state)["parameters/xyz"])
-    np.testing.assert_array_equal(every_bit(state)["strain_position/value"], kept["strain_position/value"])
-    cpu.step(batch_of(toy, settings))  # which fails where an array has another type or is not contiguous
+    np.testing.assert_array_equal(
+        every_bit(state)["strain_position/value"], kept["strain_position/value"]
+    )
+    # which fails where an array has another type or is not contiguous
+    cpu.step(batch_of(toy, settings))
     gpu.state = replace(state, driven_offsets={})
     gpu.step(batch_of(toy, settings))
     assert not gpu.state.driven_offsets
@@ -289,7 +340,8 @@ def runs(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Callable[[st
 
 @pytest.mark.slow
 def test_a_run_reaches_the_cpus_quality(runs: Callable[[str], Path]) -> None:
-    """Catches an iteration that is nearly right: schedule, density control, resets and selection all take part."""
+    """Catches an iteration that is nearly right: schedule, density control, resets and selection
+    all take part."""
     ours, theirs = (read_metrics(runs(device))[-1] for device in ("gpu", "cpu"))
     assert ours["psnr"] == pytest.approx(theirs["psnr"], abs=0.15)
     assert ours["psnr"] > read_metrics(runs("gpu"))[0]["psnr"] + 1
@@ -302,7 +354,8 @@ def test_a_run_reaches_the_cpus_quality(runs: Callable[[str], Path]) -> None:
 def test_a_run_moves_to_the_other_device(
     toy: Capture, runs: Callable[[str], Path], tmp_path: Path, begun: str, resumed: str
 ) -> None:
-    """Catches a checkpoint that only its own device continues, and moments or counts lost on the way."""
+    """Catches a checkpoint that only its own device continues, and moments or counts lost on the
+    way."""
     run = make_run(toy, "selective", iterations=40, strain_color=True)
     train(toy, tmp_path, replace(run, device=begun), report=stop_at(17))
     assert read_checkpoint(tmp_path).iteration == 17
@@ -330,8 +383,9 @@ def assert_near(got: TrainState, want: TrainState) -> None:
 @pytest.mark.parametrize("strain_color", [True, False])
 @pytest.mark.parametrize("part", [None, "mouth"])
 def test_iterations_are_the_cpus(toy: Capture, part: str | None, strain_color: bool) -> None:
-    """Catches splats that are not moved, a gradient of other splats or with that of the limits, strain that is
-    there for colors only, and another timestep's strain: over a few iterations, whole and local."""
+    """Catches splats that are not moved, a gradient of other splats or with that of the limits,
+    strain that is there for colors only, and another timestep's strain: over a few iterations,
+    whole and local."""
     capture, settings = squeezed(toy), settings_of(strain_color=strain_color)
     cpu, gpu = pair(capture, settings)
     before = every_bit(cpu.state)
@@ -346,11 +400,14 @@ def test_iterations_are_the_cpus(toy: Capture, part: str | None, strain_color: b
     assert moved.any()
     if selected is not None:
         assert not moved[~selected].any()
-    assert (moved == (following(gpu.state).steps != following(disturbed(capture, settings)).steps)).all()
+    assert (
+        moved == (following(gpu.state).steps != following(disturbed(capture, settings)).steps)
+    ).all()
 
 
 def test_the_first_gradient_of_offsets_is_the_cpus(toy: Capture) -> None:
-    """Catches an error of the gradient that Adam's division hides: the first moment is a tenth of it."""
+    """Catches an error of the gradient that Adam's division hides: the first moment is a tenth of
+    it."""
     capture, settings = squeezed(toy), settings_of()
     cpu, gpu = pair(capture, settings)
     for backend in (cpu, gpu):
@@ -376,7 +433,8 @@ def test_renders_with_the_average(toy: Capture) -> None:
 
 
 def test_other_splats_on_the_triangles(toy: Capture) -> None:
-    """Catches triangles that sum the gradients of the splats which they had before density control."""
+    """Catches triangles that sum the gradients of the splats which they had before density
+    control."""
     capture, settings = squeezed(toy), settings_of()
     cpu, gpu = pair(capture, settings)
     state = disturbed(capture, settings)
@@ -389,7 +447,8 @@ def test_other_splats_on_the_triangles(toy: Capture) -> None:
 
 
 def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, tmp_path: Path) -> None:
-    """Catches coefficients, moments, averages or ages that a checkpoint of a GPU forgets, and sums in the order of
+    """Catches coefficients, moments, averages or ages that a checkpoint of a GPU forgets, and sums
+    in the order of
     chance: every bit must agree, across density control."""
     effects = {"driven_offsets": ("strain_position",), "strain_color": True}
     run = replace(make_run(squeezed(toy), "selective", iterations=14, **effects), device="gpu")

@@ -1,4 +1,5 @@
-"""Bytes that training takes per splat, pixel and pair: the GPU's buffers against the CPU's arrays, as documented."""
+"""Bytes that training takes per splat, pixel and pair: the GPU's buffers against the CPU's arrays,
+as documented."""
 
 import re
 from dataclasses import replace
@@ -48,11 +49,16 @@ def batch_of(capture: Capture, width: int, height: int) -> Batch:
     target, mask = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
     for array in (target, mask):
         array.setflags(write=False)
-    return Batch(view, target, mask, np.ones(3, np.float32), 3, None, learning_rates(SETTINGS.rates, 0.0))
+    return Batch(
+        view, target, mask, np.ones(3, np.float32), 3, None, learning_rates(SETTINGS.rates, 0.0)
+    )
 
 
-def cpu_bytes(capture: Capture, count: int, size: tuple[int, int], log_scale: float) -> tuple[Counts, int]:
-    """Of the state and of the buffers that iterations share; without what a kernel allocates for itself."""
+def cpu_bytes(
+    capture: Capture, count: int, size: tuple[int, int], log_scale: float
+) -> tuple[Counts, int]:
+    """Of the state and of the buffers that iterations share; without what a kernel allocates for
+    itself."""
     state = new_state(splats_on(capture, count, log_scale))
     frames = FrameStore(capture, SETTINGS.convention)
     backend = CpuBackend(SETTINGS, frames, state)
@@ -63,7 +69,9 @@ def cpu_bytes(capture: Capture, count: int, size: tuple[int, int], log_scale: fl
     return (count, size[0] * size[1], pairs), sum(array.nbytes for array in arrays)
 
 
-def gpu_bytes(capture: Capture, count: int, size: tuple[int, int], capacity: int) -> tuple[Counts, int]:
+def gpu_bytes(
+    capture: Capture, count: int, size: tuple[int, int], capacity: int
+) -> tuple[Counts, int]:
     rasterize.INITIAL_PAIR_CAPACITY = capacity
     device, frames = Device(), FrameStore(capture, SETTINGS.convention)
     state = new_state(splats_on(capture, count, -9.0))
@@ -80,8 +88,11 @@ def per_item(measured: list[tuple[Counts, int]]) -> np.ndarray:
     return np.linalg.solve(counts, [size for _, size in measured])[:3]
 
 
-def test_memory_is_the_cpus_and_as_documented(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a table added to the GPU's iterations, and figures in the documentation that no longer hold."""
+def test_memory_is_the_cpus_and_as_documented(
+    toy: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a table added to the GPU's iterations, and figures in the documentation that no
+    longer hold."""
     monkeypatch.setattr(rasterize, "INITIAL_PAIR_CAPACITY", 1)  # restored at the end
     small, wide = (320, 160), (640, 160)
     on_cpu = per_item(
@@ -101,7 +112,12 @@ def test_memory_is_the_cpus_and_as_documented(toy: Capture, monkeypatch: pytest.
         ]
     )
     text = (Path(__file__).parents[2] / "docs/performance.md").read_text(encoding="utf-8")
-    rows = [re.search(rf"^\| a {name}\D*\| ([\d,]+) \| ([\d,]+) \|", text, re.M) for name in ("splat", "pixel", "pair")]
-    documented = np.array([[float(figure.replace(",", "")) for figure in row.groups()] for row in rows if row])
+    rows = [
+        re.search(rf"^\| a {name}\D*\| ([\d,]+) \| ([\d,]+) \|", text, re.M)
+        for name in ("splat", "pixel", "pair")
+    ]
+    documented = np.array(
+        [[float(figure.replace(",", "")) for figure in row.groups()] for row in rows if row]
+    )
     np.testing.assert_allclose(np.stack([on_cpu, on_gpu], 1), documented, rtol=0.02, atol=0.6)
     assert (np.abs(on_gpu / on_cpu - 1) < 0.2).all()

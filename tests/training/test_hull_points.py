@@ -36,7 +36,9 @@ def cameras(count: int = 20) -> list[Camera]:
     found = []
     for n in range(count):
         height, angle = 1 - 2 * (n + 0.5) / count, n * np.pi * (3 - np.sqrt(5))
-        forward = -np.array([np.sqrt(1 - height**2) * np.cos(angle), height, np.sqrt(1 - height**2) * np.sin(angle)])
+        forward = -np.array(
+            [np.sqrt(1 - height**2) * np.cos(angle), height, np.sqrt(1 - height**2) * np.sin(angle)]
+        )
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         pose = np.eye(4)
@@ -49,14 +51,17 @@ def cameras(count: int = 20) -> list[Camera]:
 def silhouette(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
     """(H, W) bool: the pixels whose ray passes the centre within the radius."""
     rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
-    rays = np.stack([(columns - camera.cx) / FOCAL, (rows - camera.cy) / FOCAL, np.ones((SIZE, SIZE))], -1)
+    rays = np.stack(
+        [(columns - camera.cx) / FOCAL, (rows - camera.cy) / FOCAL, np.ones((SIZE, SIZE))], -1
+    )
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     seen = camera.world_to_camera[:3, :3] @ centre + camera.world_to_camera[:3, 3]
     return np.asarray(np.linalg.norm(np.cross(rays, seen), axis=-1) < radius)
 
 
 def scene(root: Path, centre: np.ndarray = CENTRE, radius: float = RADIUS) -> Capture:
-    """A head mesh of 8 cm that at TIMESTEP is turned, moved and 10 % larger than the neutral one, and the ball."""
+    """A head mesh of 8 cm that at TIMESTEP is turned, moved and 10 % larger than the neutral one,
+    and the ball."""
     ball = trimesh.creation.icosphere(4, 0.06)
     neutral, faces = np.array(ball.vertices), np.array(ball.faces, np.int32)
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
@@ -87,12 +92,14 @@ def in_world(capture: Capture, points, convention: str = "stga"):
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_points_stand_on_the_balls_surface(beside: Capture, convention: str) -> None:
-    """Catches swapped image axes, an ignored principal point, points in the wrong frame, and a shell with holes."""
+    """Catches swapped image axes, an ignored principal point, points in the wrong frame, and a
+    shell with holes."""
     points = hull_points(beside, beside.views["train"], convention, 1)
     world = in_world(beside, points, convention)
     height = np.linalg.norm(world.xyz - CENTRE, axis=1) - RADIUS
     assert len(world) > 300
-    # The hull of twenty views is a little larger than the ball; the grid point lies within a voxel of its surface.
+    # The hull of twenty views is a little larger than the ball; the grid point lies within a voxel
+    # of its surface.
     assert height.min() > -2 * VOXEL_SIZE_M
     assert height.max() < 2 * VOXEL_SIZE_M
     # Around the mesh's bounding box the grid ends, and near the mesh no points are wanted.
@@ -109,7 +116,8 @@ def test_points_stand_on_the_balls_surface(beside: Capture, convention: str) -> 
 
 
 def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside: Capture) -> None:
-    """Catches limits that would pull hair onto the skin, and hair that follows a far part of the face."""
+    """Catches limits that would pull hair onto the skin, and hair that follows a far part of the
+    face."""
     points = hull_points(beside, beside.views["train"], "stga", 2)
     assert points.unbound.all()
     assert points.sh.shape == (len(points), 9, 3)
@@ -126,7 +134,8 @@ def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside: Ca
 
 
 def test_masks_that_are_missing_are_read_from_white(beside: Capture) -> None:
-    """Catches captures without masks left without points; the light color stands 5 under white in one channel only."""
+    """Catches captures without masks left without points; the light color stands 5 under white in
+    one channel only."""
     views = [replace(view, mask=None) for view in beside.views["train"]]
     bare, masked = (hull_points(beside, v, "stga", 0) for v in (views, beside.views["train"]))
     np.testing.assert_array_equal(bare.xyz, masked.xyz)
@@ -136,8 +145,8 @@ def test_masks_that_are_missing_are_read_from_white(beside: Capture) -> None:
 def test_blocks_leave_nothing_out(
     beside: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: int, shift: int
 ) -> None:
-    """Catches blocks of voxels that are skipped although some of their voxels are in the hull; all but a few images end
-    `shift` pixels behind the ball's first column."""
+    """Catches blocks of voxels that are skipped although some of their voxels are in the hull; all
+    but a few images end `shift` pixels behind the ball's first column."""
     views = list(beside.views["train"])
     for number, view in enumerate(views[whole:], whole):
         assert view.mask
@@ -154,12 +163,14 @@ def test_blocks_leave_nothing_out(
 
 
 def test_nothing_near_the_mesh(tmp_path: Path) -> None:
-    """Catches points on the skin itself, where the mesh's own splats are; here the ball is half inside the head."""
+    """Catches points on the skin itself, where the mesh's own splats are; here the ball is half
+    inside the head."""
     capture = scene(tmp_path, np.array([0.04, 0.04, 0.02]), 0.04)
     world = in_world(capture, hull_points(capture, capture.views["train"], "stga", 0))
     head = np.linalg.norm(world.xyz - capture.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
     assert len(world) > 100
-    # The clearance is measured to vertices and centroids, 2 mm from any point of a triangle of this mesh.
+    # The clearance is measured to vertices and centroids, 2 mm from any point of a triangle of this
+    # mesh.
     assert np.abs(head).min() > MIN_MESH_DISTANCE_M - 0.002
     assert np.abs(head).min() < MIN_MESH_DISTANCE_M + VOXEL_SIZE_M
 
@@ -183,10 +194,17 @@ def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("one", [False, True])
 def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -> None:
-    """Catches a collar that turns with the chin it lies under, and hair beside the neck that does not."""
+    """Catches a collar that turns with the chin it lies under, and hair beside the neck that does
+    not."""
     model = small_head(0)
-    frame = replace(neutral_frame(model), rotation=np.array([0.0, 0.4, 0.0]), neck_pose=np.array([0.0, -0.4, 0.0]))
-    head = FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame)
+    frame = replace(
+        neutral_frame(model),
+        rotation=np.array([0.0, 0.4, 0.0]),
+        neck_pose=np.array([0.0, -0.4, 0.0]),
+    )
+    head = FlameSequence(
+        model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame
+    )
     mesh = sequence_mesh(head, TIMESTEP)
     for centre, carried in (([0.0, -0.175, 0.115], True), ([0.0, -0.135, 0.115], False)):
         views = scene(tmp_path, np.array(centre), 0.015).views
@@ -203,16 +221,22 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -
         )
         assert len(before) == len(after) > 20
         assert not torso_faces(model)[before.face].all()
-        assert torso_faces(model)[after.face].all() if carried else (after.face == before.face).all()
+        assert (
+            torso_faces(model)[after.face].all() if carried else (after.face == before.face).all()
+        )
         world = [in_world(capture, points).xyz for points in (before, after)]
         np.testing.assert_allclose(world[0], world[1], atol=1e-6)
 
 
 def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path: Path) -> None:
-    """Catches a chest that bulges as the hull of few cameras does, one that loses its place when it turns, and a hull
-    of many cameras that is thrown away."""
+    """Catches a chest that bulges as the hull of few cameras does, one that loses its place when it
+    turns, and a hull of many cameras that is thrown away."""
     model = small_head(0)
-    turned = replace(neutral_frame(model), rotation=np.array([0.0, 0.4, 0.0]), neck_pose=np.array([0.0, -0.4, 0.0]))
+    turned = replace(
+        neutral_frame(model),
+        rotation=np.array([0.0, 0.4, 0.0]),
+        neck_pose=np.array([0.0, -0.4, 0.0]),
+    )
     frames = {TIMESTEP: turned, TIMESTEP + 1: neutral_frame(model)}
     head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
     views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
@@ -241,7 +265,8 @@ def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside: Capture, convention: str) -> None:
-    """Catches points off their pixels' rays, holes in the layer, and a layer in front of or behind the head."""
+    """Catches points off their pixels' rays, holes in the layer, and a layer in front of or behind
+    the head."""
     view = next(view for view in beside.views["train"] if _gap(view.camera) > 0.02)
     world = in_world(beside, flat_points(beside, view, convention, 1), convention)
     pixels, depth = view.camera.project(world.xyz.astype(np.float64))
@@ -253,9 +278,13 @@ def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside: Capture, conve
     assert depth.max() < mesh_depth.max()
     step = VOXEL_SIZE_M * FOCAL / FAR
     inner = silhouette(view.camera, CENTRE, RADIUS - 2 * VOXEL_SIZE_M)
-    wanted = np.argwhere(inner & ~silhouette(view.camera, beside.mesh(TIMESTEP).mean(0), 1.1 * 0.06 + 0.01))[:, ::-1]
+    wanted = np.argwhere(
+        inner & ~silhouette(view.camera, beside.mesh(TIMESTEP).mean(0), 1.1 * 0.06 + 0.01)
+    )[:, ::-1]
     assert len(wanted) > 50
-    assert np.linalg.norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
+    assert (
+        np.linalg.norm(wanted[:, None] + 0.5 - pixels[None], axis=2).min(axis=1).max() < 1.5 * step
+    )
     assert world.unbound.all()
     np.testing.assert_allclose(np.exp(world.log_scale), VOXEL_SIZE_M / 2, rtol=1e-5)
 
@@ -270,10 +299,13 @@ def _gap(camera: Camera) -> float:
 def test_a_single_camera_continues_the_torso_that_it_cuts_off(
     tmp_path: Path, right: float, up: float, continued: bool
 ) -> None:
-    """Catches a chest that ends in the air where the image did, and hair that is continued like one."""
+    """Catches a chest that ends in the air where the image did, and hair that is continued like
+    one."""
     model = small_head(0)
     frame = neutral_frame(model)
-    head = FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame)
+    head = FlameSequence(
+        model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame
+    )
     number = min(range(20), key=lambda n: abs(float(cameras()[n].position[1])))
     ball = right * cameras()[number].world_to_camera[0, :3] + [0.0, up, 0.0]
     mesh, views = sequence_mesh(head, TIMESTEP), scene(tmp_path, ball, 0.08).views
@@ -282,7 +314,9 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(
         tmp_path, "flame", model.faces, model.v_template, views, (TIMESTEP,), {},
         lambda timestep: mesh, lambda timestep, pose: mesh, head,
     )  # fmt: skip
-    cut, whole = (in_world(capture, flat_points(capture, side, "stga", 0, torso)) for torso in (False, True))
+    cut, whole = (
+        in_world(capture, flat_points(capture, side, "stga", 0, torso)) for torso in (False, True)
+    )
     pixels = side.camera.project(whole.xyz.astype(np.float64))[0]
     beyond = ((pixels < 0) | (pixels >= SIZE)).any(axis=1)
     assert beyond.any() == continued
@@ -291,7 +325,9 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(
         assert (pixels[beyond, 1] > SIZE).any()
         assert pixels[beyond, 1].max() < 1.4 * SIZE
         np.testing.assert_allclose(
-            whole.sh[beyond, 0] * SH_C0 + 0.5, np.tile([90, 250, 40], (beyond.sum(), 1)) / 255, atol=1e-6
+            whole.sh[beyond, 0] * SH_C0 + 0.5,
+            np.tile([90, 250, 40], (beyond.sum(), 1)) / 255,
+            atol=1e-6,
         )
         assert (whole.opacity[beyond] > 2).all()
 

@@ -1,4 +1,5 @@
-"""Identity of a run: what was trained on one capture is not continued, measured or rendered on another."""
+"""Identity of a run: what was trained on one capture is not continued, measured or rendered on
+another."""
 
 import hashlib
 import json
@@ -39,7 +40,9 @@ ITERATIONS = 12
 
 
 def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run:
-    settings = quick_settings("global", **{"iterations": ITERATIONS, "lattice": 0, "sh_degree": 0, **changes})
+    settings = quick_settings(
+        "global", **{"iterations": ITERATIONS, "lattice": 0, "sh_degree": 0, **changes}
+    )
     return Run(capture.root, flame, "vhap", settings)
 
 
@@ -75,7 +78,9 @@ def move_cameras(root: Path) -> None:
 
 def rename_images(root: Path) -> None:
     shutil.copytree(root / "images", root / "pictures")
-    edit_frames(root, lambda frame: frame.update(file_path=frame["file_path"].replace("images", "pictures")))
+    edit_frames(
+        root, lambda frame: frame.update(file_path=frame["file_path"].replace("images", "pictures"))
+    )
 
 
 def halve_images(root: Path) -> None:
@@ -97,7 +102,10 @@ def larger_neutral(root: Path) -> None:
 
 CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "poses": (move_cameras, "other camera poses or intrinsics"),
-    "focal length": (lambda root: edit_frames(root, lambda f: f.update(fl_x=101.0)), "other camera poses"),
+    "focal length": (
+        lambda root: edit_frames(root, lambda f: f.update(fl_x=101.0)),
+        "other camera poses",
+    ),
     "sizes": (halve_images, "other images or image sizes"),
     "names": (rename_images, "other images or image sizes"),
     "triangles": (other_topology, "a mesh with other triangles"),
@@ -107,7 +115,8 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_changed_captures_are_refused(copy: Path, toy: Capture, tmp_path: Path, name: str) -> None:
-    """Catches a run that is resumed or measured on another capture, by its path or replaced in place."""
+    """Catches a run that is resumed or measured on another capture, by its path or replaced in
+    place."""
     change, message = CHANGES[name]
     other = shutil.copytree(toy.root, tmp_path / "other")
     change(other)
@@ -116,13 +125,17 @@ def test_changed_captures_are_refused(copy: Path, toy: Capture, tmp_path: Path, 
         open_run(copy, other)
     with pytest.raises(StgaError, match=message):
         train(open_capture(other), copy, make_run(toy), resume=True)
-    factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))  # replaced in place
+    # replaced in place
+    factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
     with pytest.raises(StgaError, match=rf"was trained on {other} .*, but it now has .*{message}"):
         open_run(copy)
 
 
-def test_moved_captures_and_refined_meshes_are_accepted(copy: Path, toy: Capture, tmp_path: Path) -> None:
-    """Catches a run that is lost with its capture's old path, or with a better tracking of its frames."""
+def test_moved_captures_and_refined_meshes_are_accepted(
+    copy: Path, toy: Capture, tmp_path: Path
+) -> None:
+    """Catches a run that is lost with its capture's old path, or with a better tracking of its
+    frames."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     vertices, faces = factory.ball()
     for timestep in toy.timesteps:
@@ -134,8 +147,11 @@ def test_moved_captures_and_refined_meshes_are_accepted(copy: Path, toy: Capture
     assert read_run(copy).capture == other
 
 
-def test_runs_of_format_version_4_are_resumed(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a run of the version before, refused for a setting that it has by default; and with another value."""
+def test_runs_of_format_version_4_are_resumed(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a run of the version before, refused for a setting that it has by default; and with
+    another value."""
     out = tmp_path / "run"
 
     def recorded(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
@@ -146,7 +162,10 @@ def test_runs_of_format_version_4_are_resumed(toy: Capture, tmp_path: Path, monk
     with monkeypatch.context() as before:
         before.setattr(open_run_module, "identity_of", recorded)
         train(toy, out, make_run(toy), report=stop_at(ITERATIONS // 2))
-    factory.edit(out / "run.json", lambda document: (document.update(version=4), document["settings"].pop("torso")))
+    factory.edit(
+        out / "run.json",
+        lambda document: (document.update(version=4), document["settings"].pop("torso")),
+    )
     opened = open_run(out)
     train(opened.capture, out, opened.run, resume=True)
     assert read_checkpoint(out).iteration == ITERATIONS
@@ -156,12 +175,15 @@ def test_runs_of_format_version_4_are_resumed(toy: Capture, tmp_path: Path, monk
 
 
 def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
-    """Catches a run that cannot be resumed where another linear algebra library rounds differently."""
+    """Catches a run that cannot be resumed where another linear algebra library rounds
+    differently."""
     rng = np.random.default_rng(0)
 
     def shifted(view: Any) -> Any:
         noise = 1e-15 * rng.normal(size=(4, 4))
-        return replace(view, camera=replace(view.camera, world_to_camera=view.camera.world_to_camera + noise))
+        return replace(
+            view, camera=replace(view.camera, world_to_camera=view.camera.world_to_camera + noise)
+        )
 
     views = {split: tuple(map(shifted, members)) for split, members in toy.views.items()}
     settings = quick_settings()
@@ -172,7 +194,8 @@ def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
 
 
 def test_another_flame_model_is_refused(tmp_path: Path) -> None:
-    """Catches a run that goes on with the meshes of another FLAME model, though --flame may name a moved one."""
+    """Catches a run that goes on with the meshes of another FLAME model, though --flame may name a
+    moved one."""
     root, model = factory.write_flame_capture(tmp_path / "capture")
     capture, out = open_capture(root, model), tmp_path / "run"
     train(capture, out, make_run(capture, model), report=stop_at(4))
@@ -188,7 +211,8 @@ def test_another_flame_model_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_capture_of_another_kind_is_named_as_such(toy: Capture, tmp_path: Path) -> None:
-    """Catches a run on a FLAME capture, resumed on tracked meshes, that blames the FLAME file instead."""
+    """Catches a run on a FLAME capture, resumed on tracked meshes, that blames the FLAME file
+    instead."""
     root, model = factory.write_flame_capture(tmp_path / "flame")
     capture, out = open_capture(root, model), tmp_path / "run"
     train(capture, out, make_run(capture, model), report=stop_at(4))
@@ -203,8 +227,11 @@ def test_edited_settings_are_refused(copy: Path) -> None:
         open_run(copy)
 
 
-def test_every_command_checks_the_identity(copy: Path, toy: Capture, tmp_path: Path, capsys: Any) -> None:
-    """Catches a command that opens a run without the check: each ends with one sentence and exit code 2."""
+def test_every_command_checks_the_identity(
+    copy: Path, toy: Capture, tmp_path: Path, capsys: Any
+) -> None:
+    """Catches a command that opens a run without the check: each ends with one sentence and exit
+    code 2."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     move_cameras(other)
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
@@ -216,7 +243,9 @@ def test_every_command_checks_the_identity(copy: Path, toy: Capture, tmp_path: P
     factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
     cameras = str(other / "transforms_test.json")
     assert main(["eval", str(copy)]) == 2
-    assert main(["render", str(copy), "--cameras", cameras, "--out", str(tmp_path / "pictures")]) == 2
+    assert (
+        main(["render", str(copy), "--cameras", cameras, "--out", str(tmp_path / "pictures")]) == 2
+    )
     assert main(["export", str(copy), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 2
     told = capsys.readouterr().err
     assert told.count("other camera poses or intrinsics; train into another folder") == 5
@@ -227,7 +256,8 @@ def test_every_command_checks_the_identity(copy: Path, toy: Capture, tmp_path: P
 
 
 def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Capture) -> None:
-    """Catches a new run that continues a removed one, because it died before its first checkpoint."""
+    """Catches a new run that continues a removed one, because it died before its first
+    checkpoint."""
     (copy / "run.json").unlink()
     run = make_run(toy, seed=5)
 
@@ -249,7 +279,9 @@ def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Captur
 
 
 @pytest.mark.parametrize("name", ["checkpoint.npz", "selection.npz"])
-def test_files_of_another_run_are_refused(copy: Path, toy: Capture, tmp_path: Path, name: str) -> None:
+def test_files_of_another_run_are_refused(
+    copy: Path, toy: Capture, tmp_path: Path, name: str
+) -> None:
     """Catches a checkpoint or a selection that was copied beside the run.json of another run."""
     train(toy, tmp_path / "other", make_run(toy, seed=5), report=stop_at(3))
     shutil.copy(tmp_path / "other" / name, copy / name)
@@ -258,7 +290,8 @@ def test_files_of_another_run_are_refused(copy: Path, toy: Capture, tmp_path: Pa
 
 
 def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path) -> None:
-    """Catches `render` that reads cameras by another convention than the one that the avatar was trained with."""
+    """Catches `render` that reads cameras by another convention than the one that the avatar was
+    trained with."""
     root = shutil.copytree(toy.root, tmp_path / "capture")
     edit_frames(root, lambda frame: frame.update(cy=frame["cy"] + 7))
     capture = open_capture(root, principal_point="opencv")
@@ -270,7 +303,16 @@ def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path)
     def pictures(source: Path, *options: str) -> list[bytes]:
         folder = tmp_path / f"{source.name}{len(options)}"
         driver = ["--capture", str(root)] if source.is_file() else []
-        command = ["render", str(source), "--cameras", cameras, "--out", str(folder), *driver, *options]
+        command = [
+            "render",
+            str(source),
+            "--cameras",
+            cameras,
+            "--out",
+            str(folder),
+            *driver,
+            *options,
+        ]
         assert main(command) == 0
         return [path.read_bytes() for path in sorted(folder.iterdir())]
 
@@ -280,11 +322,14 @@ def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path)
 
 
 def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a run that moves from the CPU to a GPU, where refined tracking cannot be resumed, or to another GPU."""
+    """Catches a run that moves from the CPU to a GPU, where refined tracking cannot be resumed, or
+    to another GPU."""
     run = read_run(copy)
     assert run.device == "cpu"
     monkeypatch.setattr(
-        open_run_module, "choose_device", lambda wanted: (wanted if wanted == "cpu" else "gpu:Card", "why")
+        open_run_module,
+        "choose_device",
+        lambda wanted: (wanted if wanted == "cpu" else "gpu:Card", "why"),
     )
     assert device_of(run)[0] == "cpu"
     assert device_of(run, "gpu")[0] == "gpu:Card"
@@ -296,12 +341,16 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
         device_of(replace(run, settings=replace(run.settings, tracking=True)), "gpu")
     monkeypatch.undo()
     monkeypatch.setattr(device_choice, "find_spec", lambda name: None)
-    with pytest.raises(StgaError, match=r"trained on gpu: .*wgpu .* is not installed; give --device cpu"):
+    with pytest.raises(
+        StgaError, match=r"trained on gpu: .*wgpu .* is not installed; give --device cpu"
+    ):
         device_of(replace(run, device="gpu:Card"))
     assert device_of(replace(run, device="cuda:0"), "cpu")[0] == "cpu"
 
 
-def test_a_resumed_job_keeps_the_device(copy: Path, toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumed_job_keeps_the_device(
+    copy: Path, toy: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a worker that always trains on what this machine offers."""
     monkeypatch.setattr(device_choice, "_fastest", lambda: ("gpu:Card", "why"))
     perform(Resume(copy))
@@ -309,7 +358,8 @@ def test_a_resumed_job_keeps_the_device(copy: Path, toy: Capture, monkeypatch: p
 
 
 def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Path) -> None:
-    """Catches Ctrl-C that loses what was trained since the last checkpoint, or saves half an iteration."""
+    """Catches Ctrl-C that loses what was trained since the last checkpoint, or saves half an
+    iteration."""
 
     def interrupt(progress: Progress) -> bool:
         if progress.figures().get("iteration", 0) == 5 and progress.stage == "Training":
@@ -345,7 +395,8 @@ def test_second_interrupt_quits_at_once(toy: Capture, tmp_path: Path) -> None:
 
 
 def test_a_prepared_run_begins_with_its_identity(toy: Capture, tmp_path: Path) -> None:
-    """Catches a run.json written ahead of the training (as the benchmark does) that stays without identity."""
+    """Catches a run.json written ahead of the training (as the benchmark does) that stays without
+    identity."""
     write_run(tmp_path, make_run(toy))
     assert json.loads((tmp_path / "run.json").read_text())["identity"] is None
     train(toy, tmp_path, make_run(toy), resume=True, report=stop_at(2))

@@ -1,4 +1,5 @@
-"""The limits that keep a splat near what it covers, against autograd of their formulas; stray resets."""
+"""The limits that keep a splat near what it covers, against autograd of their formulas; stray
+resets."""
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ FACES, WEIGHT = 5, 0.7
 
 @pytest.fixture(params=range(3))
 def scene(request: pytest.FixtureRequest):
-    """Splats about half of which are over their limits, rows that leave some out, and limits (F,) per triangle."""
+    """Splats about half of which are over their limits, rows that leave some out, and limits (F,)
+    per triangle."""
     splats = random_splats(50, FACES, request.param)
     rng = np.random.default_rng(request.param)
     rows = np.flatnonzero(rng.random(50) < 0.7).astype(np.int32)
@@ -27,7 +29,9 @@ def scene(request: pytest.FixtureRequest):
 def expected(values: np.ndarray, size, splats, rows, limits) -> tuple[float, np.ndarray]:
     """limits (2, F) of bound and of unbound splats."""
     x = torch.tensor(values, dtype=torch.float64, requires_grad=True)
-    of = torch.tensor(limits[splats.unbound[rows].astype(int), splats.face[rows]], dtype=torch.float64)
+    of = torch.tensor(
+        limits[splats.unbound[rows].astype(int), splats.face[rows]], dtype=torch.float64
+    )
     excess = torch.relu(size(x)[rows] - of.reshape(-1, *[1] * (size(x).dim() - 1)))
     norm = excess.norm()
     (WEIGHT * norm).backward()
@@ -35,8 +39,8 @@ def expected(values: np.ndarray, size, splats, rows, limits) -> tuple[float, np.
 
 
 def test_scale_limit(scene) -> None:
-    """Catches a gradient that forgets the exponential or the norm, reaches unlisted rows, overwrites, or holds unbound
-    splats to the limit of bound ones."""
+    """Catches a gradient that forgets the exponential or the norm, reaches unlisted rows,
+    overwrites, or holds unbound splats to the limit of bound ones."""
     splats, rows, limit = scene
     limits = np.stack([limit, 0.6 * limit[::-1]]).astype(np.float32) * np.float32(np.exp(-5))
     norm, gradient = expected(splats.log_scale, torch.exp, splats, rows, limits)
@@ -51,7 +55,8 @@ def test_scale_limit(scene) -> None:
 
 
 def test_distance_limit(scene) -> None:
-    """Catches a gradient along the wrong axis or of the squared norm, and unbound splats pulled towards the mesh."""
+    """Catches a gradient along the wrong axis or of the squared norm, and unbound splats pulled
+    towards the mesh."""
     splats, rows, limit = scene
     limit = limit * np.float32(0.015)
     limits = np.stack([limit, np.full_like(limit, np.inf)])
@@ -66,7 +71,8 @@ def test_distance_limit(scene) -> None:
 
 
 def test_opacity_weight(scene) -> None:
-    """Catches a pull on unlisted splats, in the wrong direction, without the share, or of the logit itself."""
+    """Catches a pull on unlisted splats, in the wrong direction, without the share, or of the logit
+    itself."""
     splats, rows, _ = scene
     share = np.random.default_rng(3).random(50, np.float32)
     x = torch.tensor(splats.opacity, dtype=torch.float64, requires_grad=True)
@@ -92,12 +98,16 @@ def test_within_the_limits_nothing_happens(kernel) -> None:
 
 @pytest.mark.parametrize("to", [0.0, 0.5, 1.0])
 def test_stray_resets(to: float) -> None:
-    """Catches a limit of another triangle, unbound splats pulled home, and momentum that throws a splat out again."""
+    """Catches a limit of another triangle, unbound splats pulled home, and momentum that throws a
+    splat out again."""
     state = random_state(60, FACES)
     state.unbound[:] = np.arange(60) % 4 == 0
     limit = np.array([0.005, 0.012, 0.02, 0.03, 10.0], np.float32)
     xyz, face = state.parameters.xyz.copy(), state.face
-    far = [bool(np.hypot(np.hypot(*p[:2]), p[2]) > limit[f]) for p, f in zip(xyz.astype(float), face, strict=True)]
+    far = [
+        bool(np.hypot(np.hypot(*p[:2]), p[2]) > limit[f])
+        for p, f in zip(xyz.astype(float), face, strict=True)
+    ]
     strays = np.array(far) & (np.arange(60) % 4 != 0)
     assert 5 < strays.sum() < 40
     assert np.array(far)[::4].any()
@@ -122,8 +132,11 @@ def test_stray_resets(to: float) -> None:
 
 
 def test_the_first_step_after_a_stray_reset_is_no_longer_than_the_rate() -> None:
-    """Catches moments that do not fit the row's step count: zeroed ones make a first step of 3.2 times the rate."""
-    rates = dict.fromkeys(("xyz", "rotation", "log_scale", "opacity", "sh", "sh_rest", "strain_color"), 1e-3)
+    """Catches moments that do not fit the row's step count: zeroed ones make a first step of 3.2
+    times the rate."""
+    rates = dict.fromkeys(
+        ("xyz", "rotation", "log_scale", "opacity", "sh", "sh_rest", "strain_color"), 1e-3
+    )
     state, rows = new_state(random_splats(8, FACES)), np.arange(8, dtype=np.int32)
     state.unbound[:] = False
     state.parameters.xyz[:4] = 1.0
@@ -136,4 +149,5 @@ def test_the_first_step_after_a_stray_reset_is_no_longer_than_the_rate() -> None
     state.gradients.xyz[:] = 1e-4  # one standard deviation
     adam.step(state, rows, rates)
     step = (before - state.parameters.xyz)[:4]
-    np.testing.assert_allclose(step, 0.1 * rates["xyz"], rtol=0.2)  # (1 − β1) of the rate, as momentum builds up again
+    # (1 − β1) of the rate, as momentum builds up again
+    np.testing.assert_allclose(step, 0.1 * rates["xyz"], rtol=0.2)

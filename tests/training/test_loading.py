@@ -25,8 +25,11 @@ def no_residuals(*arguments: Any) -> Residuals:
     return Residuals(np.zeros(1), np.ones(1))
 
 
-def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches training that waits for mesh files on captures longer than the cache, and numbers that depend on it."""
+def test_no_mesh_is_read_on_the_training_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches training that waits for mesh files on captures longer than the cache, and numbers
+    that depend on it."""
     timesteps = range(2 * CACHED_TIMESTEPS)
     opened = open_capture(factory.write_mesh_capture(tmp_path / "capture", timesteps, range(2)))
     read: list[tuple[int, bool]] = []
@@ -37,10 +40,12 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path: Path, monkeypatch: pyt
 
     capture = replace(opened, mesh=mesh, views={"train": opened.views["train"]})
     run = make_run(capture, "global", iterations=len(timesteps) - 1)
-    monkeypatch.setattr(session, "triangle_residuals", no_residuals)  # which read meshes after training
+    # which read meshes after training
+    monkeypatch.setattr(session, "triangle_residuals", no_residuals)
     train(capture, tmp_path / "loaded", run)
     assert {timestep for timestep, _ in read} == set(timesteps[:-1])  # the last one is a test view
-    # Before training, splats are placed on the first mesh, and given colors there and on a few later ones.
+    # Before training, splats are placed on the first mesh, and given colors there and on a few
+    # later ones.
     before = [timesteps[0], *evenly_spread(timesteps[1:-1], MAX_LATER_TIMESTEPS)]
     assert [timestep for timestep, on_training_thread in read if on_training_thread] == before
 

@@ -7,7 +7,12 @@ from raster.reference import image_loss
 
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
 from stga_addon.raster.cpu.layout import TILE
-from stga_addon.training.optimize.losses import image_gradient, mean_ssim, tile_rectangles, whole_image
+from stga_addon.training.optimize.losses import (
+    image_gradient,
+    mean_ssim,
+    tile_rectangles,
+    whole_image,
+)
 
 # float32 variances (differences of blurred squares) over C2 = 9e-4: about 1e-7 / 9e-4, times a few.
 TOLERANCE = 5e-4
@@ -24,8 +29,11 @@ def random_pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.
     return image, np.ascontiguousarray(target.transpose(1, 2, 0))
 
 
-def reference(image: np.ndarray, target: np.ndarray, weight: float) -> tuple[np.ndarray, torch.Tensor, torch.Tensor]:
-    """Gradient (3, H, W), |difference| and SSIM maps: plain convolutions in float64, gradient by autograd."""
+def reference(
+    image: np.ndarray, target: np.ndarray, weight: float
+) -> tuple[np.ndarray, torch.Tensor, torch.Tensor]:
+    """Gradient (3, H, W), |difference| and SSIM maps: plain convolutions in float64, gradient by
+    autograd."""
     x = torch.tensor(image, dtype=torch.float64, requires_grad=True)
     # The 8-bit value as the float32 it is compared as, so that equal pixels are equal here too.
     y = torch.tensor(target * np.float32(1 / 255), dtype=torch.float64).permute(2, 0, 1)
@@ -41,7 +49,8 @@ def assert_same_gradient(gradient: np.ndarray, expected: np.ndarray) -> None:
 @pytest.mark.parametrize(("height", "width"), SIZES)
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_gradient_and_values(height: int, width: int, weight: float) -> None:
-    """Catches a wrong window, padding, constant or derivative, rows lost between bands, and images below the window."""
+    """Catches a wrong window, padding, constant or derivative, rows lost between bands, and images
+    below the window."""
     image, target = random_pair(height, width)
     out = np.full_like(image, np.nan)
     l1, ssim = image_gradient(image, target, whole_image(height, width), weight, out)
@@ -54,7 +63,8 @@ def test_gradient_and_values(height: int, width: int, weight: float) -> None:
 
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_constant_images(value: int) -> None:
-    """Catches 0/0 and a negative variance where nothing varies, and a sign for pixels that already agree."""
+    """Catches 0/0 and a negative variance where nothing varies, and a sign for pixels that already
+    agree."""
     target = np.full((20, 25, 3), value, np.uint8)
     same = np.full((3, 20, 25), np.float32(value) * np.float32(1 / 255), np.float32)
     out = np.empty_like(same)
@@ -78,14 +88,18 @@ RECTANGLES = {
 
 @pytest.mark.parametrize("name", RECTANGLES)
 def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
-    """Catches pixels further than LOSS_REACH_PX being read (they are NaN here), and pixels outside being written."""
+    """Catches pixels further than LOSS_REACH_PX being read (they are NaN here), and pixels outside
+    being written."""
     image, target = random_pair(59, 71, seed=1)
     rectangles = np.array(RECTANGLES[name], np.int64)
     expected, absolute, ssim = reference(image, target, 0.2)
     inside, near = np.zeros((59, 71), bool), np.zeros((59, 71), bool)
     for x0, y0, x1, y1 in rectangles:
         inside[y0:y1, x0:x1] = True
-        near[max(0, y0 - LOSS_REACH_PX) : y1 + LOSS_REACH_PX, max(0, x0 - LOSS_REACH_PX) : x1 + LOSS_REACH_PX] = True
+        near[
+            max(0, y0 - LOSS_REACH_PX) : y1 + LOSS_REACH_PX,
+            max(0, x0 - LOSS_REACH_PX) : x1 + LOSS_REACH_PX,
+        ] = True
     assert not near.all()
     partial = np.where(near, image, np.float32(np.nan))
     out = np.full_like(image, 7.0)
@@ -97,7 +111,8 @@ def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
 
 
 def test_too_short_a_reach_would_be_noticed() -> None:
-    """Catches a gradient that ignores its neighbourhood, for which the test above would pass with any LOSS_REACH_PX."""
+    """Catches a gradient that ignores its neighbourhood, for which the test above would pass with
+    any LOSS_REACH_PX."""
     image, target = random_pair(59, 71, seed=1)
     expected, changed = np.empty_like(image), np.empty_like(image)
     rectangles = np.array([[30, 25, 47, 40]])
@@ -110,8 +125,8 @@ def test_too_short_a_reach_would_be_noticed() -> None:
 @pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
 @pytest.mark.parametrize("bands", [1, 2, 3, 64])
 def test_rectangles_tile_the_image(height: int, width: int, bands: int) -> None:
-    """Catches a pixel that two rectangles or none covers, and an empty one where the image has fewer rows than
-    bands."""
+    """Catches a pixel that two rectangles or none covers, and an empty one where the image has
+    fewer rows than bands."""
     covered = np.zeros((height, width), int)
     for x0, y0, x1, y1 in whole_image(height, width, bands):
         assert x0 < x1
@@ -121,7 +136,8 @@ def test_rectangles_tile_the_image(height: int, width: int, bands: int) -> None:
 
 
 def test_bands_do_not_change_a_bit() -> None:
-    """Catches a run that goes another way on another number of threads, which decides how many bands there are."""
+    """Catches a run that goes another way on another number of threads, which decides how many
+    bands there are."""
     image, target = random_pair(75, 110, seed=2)
     whole, cut = np.empty_like(image), np.empty_like(image)
     losses = image_gradient(image, target, whole_image(75, 110, 1), 0.2, whole)
@@ -131,8 +147,8 @@ def test_bands_do_not_change_a_bit() -> None:
 
 
 def test_sums_are_added_up_in_one_order() -> None:
-    """Catches a sum whose order LLVM chooses: it was another after another compilation, and where LLVM feared that
-    arrays overlap, with other addresses."""
+    """Catches a sum whose order LLVM chooses: it was another after another compilation, and where
+    LLVM feared that arrays overlap, with other addresses."""
     image, target = random_pair(37, 802, seed=3)
     rows = np.abs(image - np.moveaxis(target, 2, 0) * np.float32(1 / 255))
     while rows.shape[2] > 1:
@@ -163,7 +179,8 @@ def test_tile_rectangles_cover_the_marked_tiles(share: float, seed: int) -> None
 
 
 def test_separate_tiles_get_separate_rectangles() -> None:
-    """Catches one box around everything, which is right but costs the whole image; and touching tiles split."""
+    """Catches one box around everything, which is right but costs the whole image; and touching
+    tiles split."""
     tiles = np.zeros((6, 8), bool)
     tiles[0, 0] = tiles[1, 1] = tiles[5, 7] = True
     found = {tuple(r) for r in tile_rectangles(tiles, 90, 125).tolist()}

@@ -1,4 +1,5 @@
-"""LPIPS against the same network in numpy with random weights, and against figures of the package lpips."""
+"""LPIPS against the same network in numpy with random weights, and against figures of the package
+lpips."""
 
 import hashlib
 import os
@@ -25,7 +26,13 @@ from stga_addon.training.run.session import train
 
 from .toys import quick_settings
 
-LAYERS = ((3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1))
+LAYERS = (
+    (3, 64, 11, 4, 2),
+    (64, 192, 5, 1, 2),
+    (192, 384, 3, 1, 1),
+    (384, 256, 3, 1, 1),
+    (256, 256, 3, 1, 1),
+)
 """Of AlexNet's features, as its authors have them: channels in and out, width, stride, padding."""
 REFERENCE = {(31, 40): 0.020162, (64, 33): 0.025562, (120, 90): 0.084581}
 """(H, W) of `pair` -> what the package lpips 0.1.4 (net="alex") says of it."""
@@ -38,8 +45,13 @@ def random_weights() -> dict[str, Any]:
     for number, (before, after, width, _, _) in enumerate(LAYERS):
         kernel = rng.normal(0, (before * width**2) ** -0.5, (width, width, before, after))
         bias = rng.normal(0, 0.1, after)
-        weights["AlexNet_0"][f"Conv_{number}"] = {"kernel": kernel.astype("f4"), "bias": bias.astype("f4")}
-        weights[f"NetLinLayer_{number}"] = {"Conv_0": {"kernel": rng.random((1, 1, after, 1)).astype("f4")}}
+        weights["AlexNet_0"][f"Conv_{number}"] = {
+            "kernel": kernel.astype("f4"),
+            "bias": bias.astype("f4"),
+        }
+        weights[f"NetLinLayer_{number}"] = {
+            "Conv_0": {"kernel": rng.random((1, 1, after, 1)).astype("f4")}
+        }
     return weights
 
 
@@ -76,18 +88,23 @@ def features(image: np.ndarray, weights: dict[str, Any]) -> list[np.ndarray]:
             x = windows(x, 3, 2).max((3, 4))
         convolution = weights["AlexNet_0"][f"Conv_{number}"]
         padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-        x = np.einsum("chwij,ijco->ohw", windows(padded, width, stride), convolution["kernel"], optimize=True)
+        x = np.einsum(
+            "chwij,ijco->ohw", windows(padded, width, stride), convolution["kernel"], optimize=True
+        )
         x = np.maximum(x + convolution["bias"][:, None, None], 0)
         found.append(x)
     return found
 
 
 def test_distance_is_that_of_the_network_in_numpy(weights_file: Path) -> None:
-    """Catches transposed kernels, another stride, padding or pooling, and features weighted before normalization."""
+    """Catches transposed kernels, another stride, padding or pooling, and features weighted before
+    normalization."""
     weights = random_weights()
     image, target = pair(47, 68)
     expected = 0.0
-    for number, (one, other) in enumerate(zip(features(image, weights), features(target, weights), strict=True)):
+    for number, (one, other) in enumerate(
+        zip(features(image, weights), features(target, weights), strict=True)
+    ):
         apart = one / np.linalg.norm(one, axis=0) - other / np.linalg.norm(other, axis=0)
         expected += np.einsum(
             "chw,c->hw", apart**2, weights[f"NetLinLayer_{number}"]["Conv_0"]["kernel"][0, 0, :, 0]
@@ -110,14 +127,19 @@ def test_distance_matches_the_package_lpips(size: tuple[int, int]) -> None:
 def test_evaluation_measures_lpips_if_weights_are_named(
     tmp_path: Path, weights_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches images taken for −1…1, channels that are mixed up, a region that sees the rest of the image, and images
-    too small for the network."""
+    """Catches images taken for −1…1, channels that are mixed up, a region that sees the rest of the
+    image, and images too small for the network."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
     image, target = pair(47, 68)
     quality = evaluate(lambda view: image, [evaluation_view_of(tmp_path, target)], perceptual=True)
     stored = np.round(255 * target).astype("f4") / 255
-    assert quality.lpips == pytest.approx(read_network(weights_file).distance(image, stored), rel=1e-6)
-    assert "lpips" not in evaluate(lambda view: image, [evaluation_view_of(tmp_path, target)]).as_json()
+    assert quality.lpips == pytest.approx(
+        read_network(weights_file).distance(image, stored), rel=1e-6
+    )
+    assert (
+        "lpips"
+        not in evaluate(lambda view: image, [evaluation_view_of(tmp_path, target)]).as_json()
+    )
 
     evaluation_view = evaluation_view_of(tmp_path, target)
     where = np.zeros((47, 68), bool)
@@ -128,7 +150,10 @@ def test_evaluation_measures_lpips_if_weights_are_named(
     assert of_region == pytest.approx(read_network(weights_file).distance(partly, stored), rel=1e-6)
 
     small, other = pair(30, 68)
-    assert evaluate(lambda view: small, [evaluation_view_of(tmp_path, other)], perceptual=True).lpips is None
+    assert (
+        evaluate(lambda view: small, [evaluation_view_of(tmp_path, other)], perceptual=True).lpips
+        is None
+    )
 
 
 def evaluation_view_of(root: Path, target: np.ndarray) -> EvaluationView:
@@ -140,9 +165,12 @@ def evaluation_view_of(root: Path, target: np.ndarray) -> EvaluationView:
 
 
 def test_another_file_is_refused(tmp_path: Path) -> None:
-    """Catches figures that are measured with other weights: the checksum is that of the file as published."""
+    """Catches figures that are measured with other weights: the checksum is that of the file as
+    published."""
     path = write_weights(tmp_path / "alexnet.ckpt", random_weights())
-    with pytest.raises(StgaError, match=r"ckpt: is not the weights file .* expected 443c5bc35326b81e.*d744b1\)$"):
+    with pytest.raises(
+        StgaError, match=r"ckpt: is not the weights file .* expected 443c5bc35326b81e.*d744b1\)$"
+    ):
         read_network(path)
     with pytest.raises(StgaError, match="cannot be read"):
         read_network(tmp_path)
@@ -165,9 +193,15 @@ def test_a_missing_file_is_reported_before_training(
 def test_only_the_final_evaluation_measures_lpips(
     toy: Capture, tmp_path: Path, weights_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches slow evaluations during training, a canceled run that waits for LPIPS, and a missing final figure."""
+    """Catches slow evaluations during training, a canceled run that waits for LPIPS, and a missing
+    final figure."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
-    train(toy, tmp_path / "run", run_of(toy), report=lambda progress: progress.figures().get("iteration", 0) >= 11)
+    train(
+        toy,
+        tmp_path / "run",
+        run_of(toy),
+        report=lambda progress: progress.figures().get("iteration", 0) >= 11,
+    )
     assert not any("lpips" in line for line in read_metrics(tmp_path / "run"))
     train(toy, tmp_path / "run", run_of(toy), resume=True)
     *before, last = read_metrics(tmp_path / "run")

@@ -21,12 +21,15 @@ def head_and_image() -> tuple[np.ndarray, np.ndarray]:
     """A mask (H, W) bool and a rendering (3, H, W) float32 over white."""
     head = np.zeros((SIDE, SIDE), bool)
     head[6:26, 8:24] = True
-    image = np.where(head, np.random.default_rng(0).uniform(0.2, 0.7, (3, SIDE, SIDE)), 1.0).astype(np.float32)
+    image = np.where(head, np.random.default_rng(0).uniform(0.2, 0.7, (3, SIDE, SIDE)), 1.0).astype(
+        np.float32
+    )
     return head, image
 
 
 def test_inverts_what_training_corrects() -> None:
-    """Catches another model than the effect's: gain and offset swapped, mixed channels, a background that changes."""
+    """Catches another model than the effect's: gain and offset swapped, mixed channels, a
+    background that changes."""
     head, image = head_and_image()
     gain, offset = np.array([1.1, 0.9, 1.2]), np.array([5.0, -8.0, 2.0])
     levels = 255 * image.transpose(1, 2, 0)
@@ -42,7 +45,8 @@ def test_inverts_what_training_corrects() -> None:
 
 
 def test_a_rendering_of_one_color_stays_finite() -> None:
-    """Catches a singular system where gain and offset cannot be told apart, and a crash without a mask or pixels."""
+    """Catches a singular system where gain and offset cannot be told apart, and a crash without a
+    mask or pixels."""
     head, _ = head_and_image()
     flat = np.full((3, SIDE, SIDE), 0.5, np.float32)
     target = np.full((SIDE, SIDE, 3), 153, np.uint8)
@@ -51,11 +55,14 @@ def test_a_rendering_of_one_color_stays_finite() -> None:
 
 
 def test_evaluation_reports_both(tmp_path: Path) -> None:
-    """Catches figures that are matched without being asked for, and a report that hides the other figure."""
+    """Catches figures that are matched without being asked for, and a report that hides the other
+    figure."""
     head, image = head_and_image()
     target = np.where(head[..., None], 0.8 * image.transpose(1, 2, 0), 1.0)
     Image.fromarray((255 * target).round().astype(np.uint8)).save(tmp_path / "0.png")
-    view = View(0, 0, Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4)), "0.png", tmp_path / "0.png")
+    view = View(
+        0, 0, Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4)), "0.png", tmp_path / "0.png"
+    )
     views = [EvaluationView(view, (255 * target).round().astype(np.uint8), {"mask": head}, head)]
     plain = evaluate(lambda view: image, views)
     matched = evaluate(lambda view: image, views, exposure=known_exposure((), ()))
@@ -67,7 +74,8 @@ def test_evaluation_reports_both(tmp_path: Path) -> None:
 
 
 def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path: Path) -> None:
-    """Catches six numbers fitted to views of cameras whose exposure training has estimated, which hides its errors."""
+    """Catches six numbers fitted to views of cameras whose exposure training has estimated, which
+    hides its errors."""
     head, image = head_and_image()
     gain, offset = np.array([0.8, 1.1, 0.9]), np.array([4.0, -6.0, 3.0])
     levels = 255 * image.transpose(1, 2, 0)
@@ -76,12 +84,16 @@ def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path: Path) -> None:
     views = [View(0, number, camera, "0.png", tmp_path / "0.png") for number in range(3)]
     known = known_exposure([[0, *gain, *offset]], views[:2])
     trained, plain, other = (
-        evaluate(lambda view: image, [EvaluationView(view, target, {"mask": head}, head)], exposure=known)
+        evaluate(
+            lambda view: image, [EvaluationView(view, target, {"mask": head}, head)], exposure=known
+        )
         for view in views
     )
     assert trained.psnr > 45
     assert trained.psnr_unmatched is None
-    assert plain.psnr == pytest.approx(evaluate(lambda view: image, [EvaluationView(views[1], target)]).psnr)
+    assert plain.psnr == pytest.approx(
+        evaluate(lambda view: image, [EvaluationView(views[1], target)]).psnr
+    )
     assert plain.psnr_unmatched is None  # trained, and not corrected
     assert other.psnr > 45
     assert other.psnr_unmatched == pytest.approx(plain.psnr)

@@ -21,7 +21,8 @@ def random_image(seed: int) -> np.ndarray:
 
 
 def reference_ssim(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
-    """Mean SSIM of two (H, W, 3) images in 0…1: Gaussian window of 11 pixels, σ 1.5, zeros around the image."""
+    """Mean SSIM of two (H, W, 3) images in 0…1: Gaussian window of 11 pixels, σ 1.5, zeros around
+    the image."""
 
     def blur(a: np.ndarray) -> np.ndarray:
         return gaussian_filter(a, (1.5, 1.5, 0), mode="constant", radius=(5, 5, 0))
@@ -45,7 +46,8 @@ def write_views(root: Path, count: int) -> list[View]:
 
 
 def test_psnr() -> None:
-    """Catches a mean over the wrong axes, a peak of 255, natural logarithms, and a mask that is ignored."""
+    """Catches a mean over the wrong axes, a peak of 255, natural logarithms, and a mask that is
+    ignored."""
     target = random_image(0)
     image = np.random.default_rng(1).random((3, HEIGHT, WIDTH)).astype(np.float32)
     error = (image.astype(float) - np.moveaxis(target / 255, 2, 0)) ** 2
@@ -57,10 +59,12 @@ def test_psnr() -> None:
 
 
 def test_evaluate_means_over_views_and_clips(tmp_path: Path) -> None:
-    """Catches PSNR of the mean error instead of the mean PSNR, another SSIM, and values over one that count double."""
+    """Catches PSNR of the mean error instead of the mean PSNR, another SSIM, and values over one
+    that count double."""
     views = write_views(tmp_path, 3)
     drawn = {
-        view.name: np.random.default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32) for view in views
+        view.name: np.random.default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32)
+        for view in views
     }
     drawn["2.png"] = (random_image(2).transpose(2, 0, 1) / 255 * 0.9 + 0.05).astype(np.float32)
     quality = evaluate(lambda view: drawn[view.name], sights_of(views))
@@ -68,13 +72,18 @@ def test_evaluate_means_over_views_and_clips(tmp_path: Path) -> None:
         (np.clip(drawn[view.name], 0, 1).transpose(1, 2, 0).astype(float), random_image(n) / 255)
         for n, view in enumerate(views)
     ]
-    assert quality.psnr == pytest.approx(np.mean([-10 * np.log10(np.mean((a - b) ** 2)) for a, b in pairs]), abs=1e-3)
-    assert quality.ssim == pytest.approx(np.mean([reference_ssim(a, b) for a, b in pairs]), abs=1e-4)
+    assert quality.psnr == pytest.approx(
+        np.mean([-10 * np.log10(np.mean((a - b) ** 2)) for a, b in pairs]), abs=1e-3
+    )
+    assert quality.ssim == pytest.approx(
+        np.mean([reference_ssim(a, b) for a, b in pairs]), abs=1e-4
+    )
     assert quality.lpips is None
 
 
 def test_regions_are_measured_by_themselves(tmp_path: Path) -> None:
-    """Catches a region's figures that depend on the rest of the image, and views without the region that count."""
+    """Catches a region's figures that depend on the rest of the image, and views without the region
+    that count."""
     views = write_views(tmp_path, 2)
     where = np.zeros((HEIGHT, WIDTH), bool)
     where[4:24, 3:18] = True
@@ -102,7 +111,8 @@ def test_regions_are_measured_by_themselves(tmp_path: Path) -> None:
 
 
 def test_peak_memory_never_falls() -> None:
-    """Catches bytes, or kilobytes, taken for mebibytes, and the memory of now for that of the peak."""
+    """Catches bytes, or kilobytes, taken for mebibytes, and the memory of now for that of the
+    peak."""
     before = peak_memory_mb()
     if before is None:
         pytest.skip("this system does not say how much memory a process held")
@@ -114,11 +124,15 @@ def test_peak_memory_never_falls() -> None:
     assert (peak_memory_mb() or 0) > after - 1  # the system counts roughly
 
 
-def test_lpips_is_left_out_where_its_weights_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_is_left_out_where_its_weights_are_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches a crash, or a made-up number, without weights."""
     monkeypatch.delenv("STGA_LPIPS", raising=False)
     evaluation_views = sights_of(write_views(tmp_path, 1))
-    quality = evaluate(lambda view: np.zeros((3, HEIGHT, WIDTH), np.float32), evaluation_views, perceptual=True)
+    quality = evaluate(
+        lambda view: np.zeros((3, HEIGHT, WIDTH), np.float32), evaluation_views, perceptual=True
+    )
     assert quality.lpips is None
     assert set(quality.as_json()) == {"psnr", "ssim", "detail_difference"}
     assert Quality(30.0, 0.9, 0.1).as_json() == {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1}

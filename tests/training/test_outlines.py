@@ -24,7 +24,8 @@ UPRIGHT_NEEDLE_M = np.array([0.0005, 0.03, 0.0005])
 
 
 def place(trainer: Trainer, row: int, position: list[float]) -> None:
-    """Make a splat an opaque, upright needle at a world position in meters (the toy's upper part never moves)."""
+    """Make a splat an opaque, upright needle at a world position in meters (the toy's upper part
+    never moves)."""
     state, capture = trainer.state, trainer.capture
     frames = face_frames(capture.mesh(0), capture.faces, capture.neutral)
     needle = replace(
@@ -40,7 +41,9 @@ def place(trainer: Trainer, row: int, position: list[float]) -> None:
             getattr(values, name)[row] = getattr(local, name)[0]
 
 
-def splats_after_a_turn(capture: Capture, needle: list[float], masks: bool = True) -> tuple[int, int]:
+def splats_after_a_turn(
+    capture: Capture, needle: list[float], masks: bool = True
+) -> tuple[int, int]:
     """How many splats there are before and after iteration 200 of a training with a needle."""
     quiet = {"density_interval": 0, "stray_reset_interval": 0, "random_background": masks}
     trainer = Trainer(capture, quick_settings("global", **quiet), {})
@@ -54,14 +57,15 @@ def splats_after_a_turn(capture: Capture, needle: list[float], masks: bool = Tru
 
 
 def test_a_needle_beside_the_head_does_not_outlive_its_turn(toy: Capture) -> None:
-    """Catches a spike over the hair that lies outside of all masks and stays in every picture of the avatar."""
+    """Catches a spike over the hair that lies outside of all masks and stays in every picture of
+    the avatar."""
     before, after = splats_after_a_turn(toy, [0.0, 0.15, 0.0])
     assert after == before - 1
 
 
 def test_without_masks_nothing_is_pruned(toy: Capture) -> None:
-    """Catches white clothes or teeth taken for background, where no mask says what is, and a published method that is
-    no longer what was published."""
+    """Catches white clothes or teeth taken for background, where no mask says what is, and a
+    published method that is no longer what was published."""
     views = tuple(replace(view, mask=None) for view in toy.views["train"])
     bare = replace(toy, views={**toy.views, "train": views})
     assert read_outlines(bare, 0) == []
@@ -71,10 +75,13 @@ def test_without_masks_nothing_is_pruned(toy: Capture) -> None:
 
 
 def test_outlines_are_the_masks_of_some_training_views(tmp_path: Path) -> None:
-    """Catches masks of other views or of another size than their cameras, too many of them, and a lost margin."""
+    """Catches masks of other views or of another size than their cameras, too many of them, and a
+    lost margin."""
     capture = open_capture(factory.write_mesh_capture(tmp_path / "many", range(11), range(3)))
     for path in (tmp_path / "many" / "fg_masks").iterdir():
-        mask = Image.open(path).resize((16 * factory.WIDTH, 16 * factory.HEIGHT), Image.Resampling.NEAREST)
+        mask = Image.open(path).resize(
+            (16 * factory.WIDTH, 16 * factory.HEIGHT), Image.Resampling.NEAREST
+        )
         mask.save(path)
     large = tuple(replace(view, camera=view.camera.scaled(16)) for view in capture.views["train"])
     outlines = read_outlines(replace(capture, views={**capture.views, "train": large}), 3)
@@ -82,7 +89,9 @@ def test_outlines_are_the_masks_of_some_training_views(tmp_path: Path) -> None:
     assert len({(each.timestep, each.camera.position.tobytes()) for each in outlines}) == 16
     for outline in outlines:
         assert outline.clear.shape == (outline.camera.height, outline.camera.width) == (400, 267)
-        columns, rows = np.meshgrid(*((np.arange(n) + 0.5) / s for n, s in ((267, 267 / 40), (400, 400 / 60))))
+        columns, rows = np.meshgrid(
+            *((np.arange(n) + 0.5) / s for n, s in ((267, 267 / 40), (400, 400 / 60)))
+        )
         covered = factory.silhouette()[rows.astype(int), columns.astype(int)]
         margin = binary_dilation(covered, iterations=4)
         assert (outline.clear != ~margin).mean() < 0.01
@@ -94,16 +103,21 @@ def pictures(rng: np.random.Generator) -> tuple[list[Outline], dict[int, FaceFra
     faces = rng.permutation(12).reshape(4, 3)
     frames, outlines = {}, []
     for timestep in range(5):
-        posed = 1.3 * neutral @ Rotation.random(random_state=timestep).as_matrix().T + rng.normal(0, 0.02, 3)
+        posed = 1.3 * neutral @ Rotation.random(random_state=timestep).as_matrix().T + rng.normal(
+            0, 0.02, 3
+        )
         frames[timestep] = face_frames(posed, faces, neutral)
         eye = Rotation.from_rotvec([0, 0.5 * timestep, 0]).apply([0.05, 0.1, 1.0])
         camera = look_at(eye, [0, 0, 0], 80, 60, 220.0)
-        outlines.append(Outline(timestep, camera, np.tile(np.arange(80) >= 30 + 5 * timestep, (60, 1))))
+        outlines.append(
+            Outline(timestep, camera, np.tile(np.arange(80) >= 30 + 5 * timestep, (60, 1)))
+        )
     return outlines, frames
 
 
 def outside_of_most(points: list[np.ndarray], outlines: list[Outline]) -> bool:
-    """Whether a point, given for each outline, is clear in more than half of the images that show it."""
+    """Whether a point, given for each outline, is clear in more than half of the images that show
+    it."""
     clear = []
     for point, outline in zip(points, outlines, strict=True):
         camera: Camera = outline.camera
@@ -116,8 +130,8 @@ def outside_of_most(points: list[np.ndarray], outlines: list[Outline]) -> bool:
 
 @pytest.mark.parametrize("region", [None, np.array([True, False, True, True])])
 def test_what_is_pruned(region: np.ndarray | None) -> None:
-    """Catches positions in another unit or frame, images that do not show a point but count, splats of other triangles,
-    and bald triangles."""
+    """Catches positions in another unit or frame, images that do not show a point but count, splats
+    of other triangles, and bald triangles."""
     rng = np.random.default_rng(2)
     outlines, frames = pictures(rng)
     state = random_state(300, 4)
@@ -132,7 +146,9 @@ def test_what_is_pruned(region: np.ndarray | None) -> None:
         points = []
         for timestep in range(5):
             frame, face = frames[timestep], splats.face[n]
-            points.append(frame.origin[face] + frame.scale[face] * frame.rotation[face] @ splats.xyz[n])
+            points.append(
+                frame.origin[face] + frame.scale[face] * frame.rotation[face] @ splats.xyz[n]
+            )
         pruned[n] = outside_of_most(points, outlines)
     for face in range(4):
         bound = np.flatnonzero((splats.face == face) & ~splats.unbound)

@@ -53,11 +53,15 @@ print(json.dumps([sum(before.values()), {name: [before[name], after[name]] for n
 
 
 def test_training_compiles_nothing_new(tmp_path: Path) -> None:
-    """Catches a kernel first met in the middle of a run (other types, read-only or strided arrays): seconds lost.
+    """Catches a kernel first met in the middle of a run (other types, read-only or strided arrays):
+    seconds lost.
 
     Images with transparency are decoded into arrays of another kind than those without.
     """
-    roots = [factory.write_mesh_capture(tmp_path / name, (0, 1, 3), range(3)) for name in ("opaque", "transparent")]
+    roots = [
+        factory.write_mesh_capture(tmp_path / name, (0, 1, 3), range(3))
+        for name in ("opaque", "transparent")
+    ]
     for path in (roots[1] / "images").iterdir():
         alpha = Image.open(roots[1] / "fg_masks" / path.name)
         image = Image.open(path).convert("RGB")
@@ -86,18 +90,24 @@ print(json.dumps([sum(kernel.stats.cache_hits.values()), len(kernel.signatures)]
 @pytest.mark.slow
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
 def test_a_second_process_compiles_what_is_missing(tmp_path: Path) -> None:
-    """Catches a first start that waits for a second process and then compiles everything again, or never starts one.
+    """Catches a first start that waits for a second process and then compiles everything again, or
+    never starts one.
 
-    One kernel, and what tells that all are compiled, are missing in a copy of this machine's kernels.
+    One kernel, and what tells that all are compiled, are missing in a copy of this machine's
+    kernels.
     """
     precompile_kernels()
-    shutil.copytree(KERNEL_CACHE_FOLDER, tmp_path / "kernels", ignore=shutil.ignore_patterns("*.tmp.*"))
+    shutil.copytree(
+        KERNEL_CACHE_FOLDER, tmp_path / "kernels", ignore=shutil.ignore_patterns("*.tmp.*")
+    )
     for name in ("tiles.fill_pairs", "image_loss.image_loss"):
         removed = list((tmp_path / "kernels").glob(f"*/{name}-*"))
         assert removed
         for path in removed:
             path.unlink()
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
-    done = subprocess.run([sys.executable, "-c", COLD], capture_output=True, text=True, timeout=300, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", COLD], capture_output=True, text=True, timeout=300, env=environment
+    )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == [1, 1]

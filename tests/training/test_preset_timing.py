@@ -8,7 +8,11 @@ import pytest
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.training import preset_timing
-from stga_addon.training.preset_timing import WARM_UP_ITERATIONS, seconds_per_iteration, time_presets
+from stga_addon.training.preset_timing import (
+    WARM_UP_ITERATIONS,
+    seconds_per_iteration,
+    time_presets,
+)
 from stga_addon.training.settings import PRESETS, Preset, make_settings
 
 
@@ -42,7 +46,8 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def test_the_mean_over_the_whole_course(toy: Capture, shares: list[float]) -> None:
-    """Catches a calibration of the cheap beginning only: images of 40 x 60 pixels, a third of the time at half size."""
+    """Catches a calibration of the cheap beginning only: images of 40 x 60 pixels, a third of the
+    time at half size."""
     settings = make_settings(iterations=100, coarse_share=1 / 3)
     pace = seconds_per_iteration(toy, settings, 2.4)
     fine, coarse = 0.024, 0.006

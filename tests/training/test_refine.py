@@ -1,4 +1,5 @@
-"""Refining a region of a finished run: nothing else changes, and a stopped refinement is continued to the same bits."""
+"""Refining a region of a finished run: nothing else changes, and a stopped refinement is continued
+to the same bits."""
 
 import shutil
 from collections.abc import Callable
@@ -41,7 +42,8 @@ ITERATIONS = 16
 
 @pytest.fixture(scope="module")
 def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with strain color, density control and hull points; its avatar is that of the last iteration."""
+    """A run with strain color, density control and hull points; its avatar is that of the last
+    iteration."""
     out = tmp_path_factory.mktemp("finished") / "run"
     settings = quick_settings(
         "global", iterations=12, strain_color=True, lattice=1, density_interval=10, density_span=(0.0, 1.0),
@@ -61,15 +63,26 @@ def parent(finished: Path, toy: Capture, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def opening(toy: Capture) -> Callable[..., Any]:
-    """`open_run` for the capture without held-out views, which is a file of its own to nobody but this test."""
+    """`open_run` for the capture without held-out views, which is a file of its own to nobody but
+    this test."""
     from stga_addon.training.run.folder import OpenedRun
 
     capture = replace(toy, views={"train": toy.views["train"]})
     return lambda folder, flame=None: OpenedRun(read_run(folder), capture, (capture,))
 
 
-def prepare_refinement(parent: Path, region: str, frames: tuple[int, int] | None = None, **changes: Any) -> Prepared:
-    request = Refine(parent / "unused", parent, region, frames=frames, iterations=ITERATIONS, device="cpu", **changes)
+def prepare_refinement(
+    parent: Path, region: str, frames: tuple[int, int] | None = None, **changes: Any
+) -> Prepared:
+    request = Refine(
+        parent / "unused",
+        parent,
+        region,
+        frames=frames,
+        iterations=ITERATIONS,
+        device="cpu",
+        **changes,
+    )
     return prepare(request, ignore, lambda line: None)
 
 
@@ -90,21 +103,27 @@ def rows_of(state: TrainState, keep: np.ndarray) -> dict[str, np.ndarray]:
     return {name: array[keep].view(np.uint8) for name, array in kept.items()}
 
 
-def test_nothing_outside_the_region_changes_by_one_bit(parent: Path, toy: Capture, tmp_path: Path) -> None:
-    """Catches momentum, averaging, density control or stray resets that reach splats beyond the region, and a
-    refinement that does nothing."""
+def test_nothing_outside_the_region_changes_by_one_bit(
+    parent: Path, toy: Capture, tmp_path: Path
+) -> None:
+    """Catches momentum, averaging, density control or stray resets that reach splats beyond the
+    region, and a refinement that does nothing."""
     before, region = read_avatar(parent / "avatar.npz"), toy.regions["mouth"]
     after = read_avatar(refine(parent, tmp_path / "refined") / "avatar.npz")
     outside = [~region[avatar.splats.face] for avatar in (before, after)]
     assert 0 < outside[0].sum() < len(before.splats)
     for name, old in vars(before.splats).items():
         new = getattr(after.splats, name)
-        np.testing.assert_array_equal(old[outside[0]].tobytes(), new[outside[1]].tobytes(), err_msg=name)
+        np.testing.assert_array_equal(
+            old[outside[0]].tobytes(), new[outside[1]].tobytes(), err_msg=name
+        )
     inside = before.splats.rows(~outside[0]), after.splats.rows(~outside[1])
     assert len(inside[1]) > len(inside[0])
     assert set(np.unique(inside[1].face)) == set(np.unique(inside[0].face))
     for name in ("xyz", "sh", "opacity", "strain_color"):
-        assert not np.array_equal(getattr(inside[0], name), getattr(inside[1], name)[: len(inside[0])]), name
+        assert not np.array_equal(
+            getattr(inside[0], name), getattr(inside[1], name)[: len(inside[0])]
+        ), name
     states = [read_checkpoint(folder).state for folder in (parent, tmp_path / "refined")]
     kept = [rows_of(state, ~region[state.face]) for state in states]
     for name, old in kept[0].items():
@@ -112,8 +131,11 @@ def test_nothing_outside_the_region_changes_by_one_bit(parent: Path, toy: Captur
             np.testing.assert_array_equal(kept[1][name], old, err_msg=name)
 
 
-def test_a_stopped_refinement_is_continued_to_the_same_bits(parent: Path, toy: Capture, tmp_path: Path) -> None:
-    """Catches an order of views, a region or a rate that a resumed refinement does not find again."""
+def test_a_stopped_refinement_is_continued_to_the_same_bits(
+    parent: Path, toy: Capture, tmp_path: Path
+) -> None:
+    """Catches an order of views, a region or a rate that a resumed refinement does not find
+    again."""
     whole = refine(parent, tmp_path / "whole", frames=(1, 3))
     stopped = refine(parent, tmp_path / "stopped", stop=7, frames=(1, 3))
     capture = replace(toy, views={"train": toy.views["train"]})
@@ -131,8 +153,11 @@ def test_the_run_before_is_left_alone(parent: Path, tmp_path: Path) -> None:
     assert run.continuation.parent == parent.resolve()
 
 
-def test_the_avatar_before_is_the_first_evaluation(parent: Path, toy: Capture, tmp_path: Path) -> None:
-    """Catches a report without what it is compared with, and a region that is not measured apart."""
+def test_the_avatar_before_is_the_first_evaluation(
+    parent: Path, toy: Capture, tmp_path: Path
+) -> None:
+    """Catches a report without what it is compared with, and a region that is not measured
+    apart."""
     prepared = prepare_refinement(parent, "mouth", (1, 3))
     train(toy, tmp_path / "refined", prepared.run, prepared.selection)
     first, *_, last = read_metrics(tmp_path / "refined")
@@ -141,11 +166,16 @@ def test_the_avatar_before_is_the_first_evaluation(parent: Path, toy: Capture, t
     assert last["psnr_region"] > first["psnr_region"]
 
 
-def test_a_region_that_no_camera_faces_is_refused(parent: Path, toy: Capture, tmp_path: Path) -> None:
-    """Catches a refinement that has no view to train on, which ends in a traceback after the start."""
+def test_a_region_that_no_camera_faces_is_refused(
+    parent: Path, toy: Capture, tmp_path: Path
+) -> None:
+    """Catches a refinement that has no view to train on, which ends in a traceback after the
+    start."""
     away = np.asarray(toy.neutral)[toy.faces].mean(1)[:, 2] < -0.09
     write_npz(tmp_path / "away.npz", {"weights": away})
-    with pytest.raises(StgaError, match=r"region '.*away\.npz': faces no training camera from timestep 0 to 4"):
+    with pytest.raises(
+        StgaError, match=r"region '.*away\.npz': faces no training camera from timestep 0 to 4"
+    ):
         prepare_refinement(parent, str(tmp_path / "away.npz"))
 
 
@@ -159,7 +189,8 @@ def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("limited", [True, False])
 def test_colors_of_another_range_of_strain_are_not_continued(parent: Path, limited: bool) -> None:
-    """Catches an avatar of an earlier version, whose colors all change when today's strain is put into them."""
+    """Catches an avatar of an earlier version, whose colors all change when today's strain is put
+    into them."""
     avatar = read_avatar(parent / "avatar.npz")
     assert avatar.strain_range is not None
     wider = avatar.strain_range.copy()
@@ -168,11 +199,16 @@ def test_colors_of_another_range_of_strain_are_not_continued(parent: Path, limit
     prepared = prepare_refinement(parent, "mouth")
     assert prepared.run.continuation is not None
     with pytest.raises(StgaError, match="as in an earlier version"):
-        starting_state(prepared.run.continuation, prepared.run.settings, len(prepared.capture.faces))
+        starting_state(
+            prepared.run.continuation, prepared.run.settings, len(prepared.capture.faces)
+        )
 
 
-def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent: Path, toy: Capture, tmp_path: Path) -> None:
-    """Catches a refinement that needs optimizer moments, or takes those of another state than the avatar's."""
+def test_without_its_checkpoint_an_avatar_is_refined_as_well(
+    parent: Path, toy: Capture, tmp_path: Path
+) -> None:
+    """Catches a refinement that needs optimizer moments, or takes those of another state than the
+    avatar's."""
     (parent / "checkpoint.npz").unlink()
     after = read_avatar(refine(parent, tmp_path / "refined", growth=0.0) / "avatar.npz").splats
     before = read_avatar(parent / "avatar.npz").splats
@@ -184,7 +220,10 @@ def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent: Path, toy: 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"region": "chin"}, r"region 'chin': is neither a region of the capture \(.*mouth.*\) nor"),
+        (
+            {"region": "chin"},
+            r"region 'chin': is neither a region of the capture \(.*mouth.*\) nor",
+        ),
         ({"frames": (7, 9)}, "no training views from timestep 7 to 9"),
         ({"growth": 1000.0}, "setting growth"),
     ],
@@ -205,11 +244,14 @@ def test_late_rates_are_the_rest_of_the_schedule() -> None:
 
 
 def test_order_of_views_continues_and_replays(toy: Capture) -> None:
-    """Catches a resumed order that starts anew, and other frames that are forgotten or trained too often."""
+    """Catches a resumed order that starts anew, and other frames that are forgotten or trained too
+    often."""
     continuation = Continuation(Path(), "", 1, 1)
     for region, count in ((np.ones(len(toy.faces), bool), 27), (None, 24)):  # to refine, to extend
         whole = list(islice(continued_order(continuation, toy, region, 5), 40))
-        assert list(islice(continued_order(continuation, toy, region, 5, start=13), 27)) == whole[13:]
+        assert (
+            list(islice(continued_order(continuation, toy, region, 5, start=13), 27)) == whole[13:]
+        )
         assert sum(view.timestep == 1 for view in whole) == count
     assert {view.timestep for view in whole} == {0, 1, 3}
     alone = islice(continued_order(Continuation(Path(), "", 0, 9), toy, None, 5), 20)
@@ -217,11 +259,18 @@ def test_order_of_views_continues_and_replays(toy: Capture) -> None:
 
 
 def test_replayed_timesteps_differ_most(toy: Capture) -> None:
-    """Catches a replay of neighbors that all look alike, and one that grows with the length of the takes."""
+    """Catches a replay of neighbors that all look alike, and one that grows with the length of the
+    takes."""
     offsets = {0: 0.0, 1: 0.001, 2: 0.05, 3: 0.051, 4: -0.04}
-    capture = replace(toy, expression_mesh=lambda timestep, zero_pose: toy.neutral + offsets[timestep])
+    capture = replace(
+        toy, expression_mesh=lambda timestep, zero_pose: toy.neutral + offsets[timestep]
+    )
     assert distinct_timesteps(capture, list(offsets), 3) == [0, 3, 4]
-    views = [replace(toy.views["train"][0], timestep=t, camera_index=c) for t in range(5) for c in range(16)]
+    views = [
+        replace(toy.views["train"][0], timestep=t, camera_index=c)
+        for t in range(5)
+        for c in range(16)
+    ]
     assert len(replayed_views(capture, views)) == 80
     kept = replayed_views(capture, views, 20)
     assert len(kept) == 20
@@ -229,8 +278,8 @@ def test_replayed_timesteps_differ_most(toy: Capture) -> None:
 
 
 def test_views_that_see_the_region(toy: Capture) -> None:
-    """Catches a region that is refined in views from behind, which do not show it: a triangle's winding in pixels is
-    the opposite of that seen from outside."""
+    """Catches a region that is refined in views from behind, which do not show it: a triangle's
+    winding in pixels is the opposite of that seen from outside."""
     views = toy.views["train"]
     for view in views[:3]:
         mesh = toy.mesh(view.timestep)

@@ -28,7 +28,13 @@ from .toys import quick_settings
 
 ITERATIONS = 24
 # Everything that changes a state happens in a few iterations.
-BUSY = {"density_interval": 5, "density_span": (0.0, 1.0), "stray_reset_interval": 4, "stray_limit": 0.3, "lattice": 1}
+BUSY = {
+    "density_interval": 5,
+    "density_span": (0.0, 1.0),
+    "stray_reset_interval": 4,
+    "stray_limit": 0.3,
+    "lattice": 1,
+}
 
 CLOCKED = ("seconds", "evaluation_s", "wall_s", "peak_memory_mb", "forecast")
 """Fields of a metrics line that depend on how fast the machine was."""
@@ -44,17 +50,27 @@ def stop_at(iteration: int) -> Callable[[Progress], bool]:
 
 
 def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Metrics without wall times; losses and SSIMs, whose rows are summed in float32, to seven digits."""
+    """Metrics without wall times; losses and SSIMs, whose rows are summed in float32, to seven
+    digits."""
     kept = [{k: v for k, v in line.items() if k not in CLOCKED} for line in lines]
-    return [{k: float(f"{v:.7g}") if k.startswith(("loss", "ssim")) else v for k, v in line.items()} for line in kept]
+    return [
+        {k: float(f"{v:.7g}") if k.startswith(("loss", "ssim")) else v for k, v in line.items()}
+        for line in kept
+    ]
 
 
 def assert_same_state(folder: Path, expected: Path) -> None:
     ours, theirs = read_checkpoint(folder), read_checkpoint(expected)
     right = arrays_of(theirs.state)
     for name, array in arrays_of(ours.state).items():
-        np.testing.assert_array_equal(array.view(np.uint8), right[name].view(np.uint8), err_msg=name)
-    assert (ours.iteration, ours.visit, ours.initial_count) == (theirs.iteration, theirs.visit, theirs.initial_count)
+        np.testing.assert_array_equal(
+            array.view(np.uint8), right[name].view(np.uint8), err_msg=name
+        )
+    assert (ours.iteration, ours.visit, ours.initial_count) == (
+        theirs.iteration,
+        theirs.visit,
+        theirs.initial_count,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +109,11 @@ def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
     ]  # fmt: skip
 
 
-def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
-    """Catches anything a step depends on and a checkpoint does not hold: order, moments, counts, random numbers."""
+def test_stopped_and_resumed_is_the_unbroken_run(
+    toy: Capture, unbroken: Path, tmp_path: Path
+) -> None:
+    """Catches anything a step depends on and a checkpoint does not hold: order, moments, counts,
+    random numbers."""
     run = make_run(toy)
     train(toy, tmp_path, run, report=stop_at(7))
     assert read_checkpoint(tmp_path).iteration == 7
@@ -105,7 +124,9 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, unbroken: Path, t
     ours = {line["iteration"]: line for line in without_times(read_metrics(tmp_path))}
     for line in without_times(read_metrics(unbroken)):
         again = ours[line["iteration"]]
-        assert {k: again[k] for k in ("psnr", "ssim", "splats")} == {k: line[k] for k in ("psnr", "ssim", "splats")}
+        assert {k: again[k] for k in ("psnr", "ssim", "splats")} == {
+            k: line[k] for k in ("psnr", "ssim", "splats")
+        }
 
 
 class Crash(Exception):
@@ -114,12 +135,17 @@ class Crash(Exception):
 
 @pytest.fixture(scope="module")
 def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that crashed after iteration 13, went on from a checkpoint of iteration 8, and came to its end."""
+    """A run that crashed after iteration 13, went on from a checkpoint of iteration 8, and came to
+    its end."""
     out = tmp_path_factory.mktemp("continued")
     with pytest.MonkeyPatch.context() as patch:
 
         def crash(progress: Progress) -> bool:
-            patch.setattr(run_module, "CHECKPOINT_S", 0.0 if progress.figures().get("iteration", 0) == 7 else 1e9)
+            patch.setattr(
+                run_module,
+                "CHECKPOINT_S",
+                0.0 if progress.figures().get("iteration", 0) == 7 else 1e9,
+            )
             if progress.figures().get("iteration", 0) == 13:
                 raise Crash
             return False
@@ -133,37 +159,51 @@ def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path) -> None:
-    """Catches evaluations that stand twice, or are missing, after going on from an older checkpoint."""
+    """Catches evaluations that stand twice, or are missing, after going on from an older
+    checkpoint."""
     assert_same_state(continued, unbroken)
     ours, theirs = (
-        [{k: v for k, v in line.items() if k != "loss"} for line in without_times(read_metrics(folder))]
+        [
+            {k: v for k, v in line.items() if k != "loss"}
+            for line in without_times(read_metrics(folder))
+        ]
         for folder in (continued, unbroken)
     )
     assert ours == theirs
     for name, value in vars(read_avatar(unbroken / "avatar.npz").splats).items():
-        np.testing.assert_array_equal(getattr(read_avatar(continued / "avatar.npz").splats, name), value)
+        np.testing.assert_array_equal(
+            getattr(read_avatar(continued / "avatar.npz").splats, name), value
+        )
 
 
 def test_the_loss_in_the_metrics_survives_a_crash(unbroken: Path, continued: Path) -> None:
-    """Catches a curve with a step in it where the run was interrupted: the mean is over the last iterations."""
-    ours, theirs = ([line["loss"] for line in read_metrics(folder)] for folder in (continued, unbroken))
-    # Not to the last bit: the value is summed in float32 along each row, for people to look at, and does not train.
+    """Catches a curve with a step in it where the run was interrupted: the mean is over the last
+    iterations."""
+    ours, theirs = (
+        [line["loss"] for line in read_metrics(folder)] for folder in (continued, unbroken)
+    )
+    # Not to the last bit: the value is summed in float32 along each row, for people to look at, and
+    # does not train.
     assert ours == pytest.approx(theirs, rel=1e-6)
 
 
 def test_checkpoints_as_often_as_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a farm's wish that is ignored, and a nonsensical one that ends in a traceback or in no checkpoints."""
+    """Catches a farm's wish that is ignored, and a nonsensical one that ends in a traceback or in
+    no checkpoints."""
     for text, seconds in (("", None), ("0.5", 0.5), ("0", 0.0)):
         monkeypatch.setenv("STGA_CHECKPOINT_S", text)
         assert run_module._asked_interval_s() == seconds
     for text in ("soon", "-1", "nan", "inf"):
         monkeypatch.setenv("STGA_CHECKPOINT_S", text)
-        with pytest.raises(StgaError, match="STGA_CHECKPOINT_S: expected seconds between checkpoints"):
+        with pytest.raises(
+            StgaError, match="STGA_CHECKPOINT_S: expected seconds between checkpoints"
+        ):
             run_module._asked_interval_s()
 
 
 def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path) -> None:
-    """Catches what an artist painted replaced by the rule when a run resumes that had no checkpoint yet."""
+    """Catches what an artist painted replaced by the rule when a run resumes that had no checkpoint
+    yet."""
     painted = {timestep: np.arange(len(toy.faces)) < 7 for timestep in toy.timesteps}
 
     def crash(progress: Progress) -> bool:
@@ -179,7 +219,9 @@ def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path)
     assert all((kept[timestep] == painted[timestep]).all() for timestep in painted)
 
 
-def test_resuming_before_the_first_checkpoint_begins_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+def test_resuming_before_the_first_checkpoint_begins_anew(
+    toy: Capture, unbroken: Path, tmp_path: Path
+) -> None:
     """Catches a run that can neither be resumed nor started again because it was killed early."""
 
     def crash(progress: Progress) -> bool:
@@ -196,7 +238,9 @@ def test_resuming_before_the_first_checkpoint_begins_anew(toy: Capture, unbroken
     assert without_times(read_metrics(tmp_path)) == without_times(read_metrics(unbroken))
 
 
-def test_resuming_a_finished_run_changes_nothing(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+def test_resuming_a_finished_run_changes_nothing(
+    toy: Capture, unbroken: Path, tmp_path: Path
+) -> None:
     """Catches steps beyond the budget and evaluations that pile up."""
     shutil.copytree(unbroken, tmp_path / "run")
     train(toy, tmp_path / "run", make_run(toy), resume=True)
@@ -212,7 +256,13 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
     for name in ("avatar.npz", "residuals.npz"):
         (out / name).unlink()
     told: list[str] = []
-    train(toy, out, make_run(toy), resume=True, report=lambda progress: bool(told.append(progress.stage)))
+    train(
+        toy,
+        out,
+        make_run(toy),
+        resume=True,
+        report=lambda progress: bool(told.append(progress.stage)),
+    )
     assert "Writing the missing avatar from the checkpoint" in told
     written = read_avatar(out / "avatar.npz").splats
     np.testing.assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
@@ -226,7 +276,8 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
 
 @pytest.mark.parametrize("change", ["renamed", "emptied"])
 def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, change: str) -> None:
-    """Catches a renamed run that is begun a second time under its old name, without what it needs to be resumed."""
+    """Catches a renamed run that is begun a second time under its old name, without what it needs
+    to be resumed."""
     out, moved = tmp_path / "run", tmp_path / "moved"
 
     def move(progress: Progress) -> bool:
@@ -244,8 +295,11 @@ def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, cha
     assert read_checkpoint(moved).iteration == ITERATIONS
 
 
-def test_the_best_avatar_is_kept(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a run that gets worse with time taking its best avatar with it, also over an interruption."""
+def test_the_best_avatar_is_kept(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a run that gets worse with time taking its best avatar with it, also over an
+    interruption."""
     scores = iter([0.3, 0.1, 0.2, 0.11, *[0.15] * 20])
     written: list[Avatar] = []
 
@@ -278,7 +332,9 @@ def test_without_held_out_views_the_latest_avatar_is_kept(toy: Capture, tmp_path
     assert all("psnr" not in line for line in read_metrics(tmp_path))
 
 
-def test_a_folder_with_a_run_is_not_overwritten(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+def test_a_folder_with_a_run_is_not_overwritten(
+    toy: Capture, unbroken: Path, tmp_path: Path
+) -> None:
     """Catches hours of training lost to a forgotten --resume."""
     before = {p.name: p.read_bytes() for p in unbroken.iterdir()}
     with pytest.raises(StgaError, match="already holds a run"):
@@ -303,7 +359,8 @@ def test_a_capture_without_training_views(toy: Capture, tmp_path: Path) -> None:
 
 
 def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches wall time that is not counted, counted twice when resumed, or overrun by more than an iteration."""
+    """Catches wall time that is not counted, counted twice when resumed, or overrun by more than an
+    iteration."""
     ticks = count()  # a clock that ticks when it is read, so that every step takes 0.01 s
     monkeypatch.setattr(run_module, "perf_counter", lambda: next(ticks) / 100)
     shares: list[float] = []
@@ -324,9 +381,14 @@ def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("schedule", ["default", "paper"])
-def test_every_strategy_and_schedule_runs(toy: Capture, tmp_path: Path, strategy: str, schedule: str) -> None:
-    """Catches a combination of settings that no other test trains, and an avatar in the wrong convention."""
-    settings = quick_settings(strategy, schedule=schedule, iterations=8, stray_reset_interval=3, density_interval=3)
+def test_every_strategy_and_schedule_runs(
+    toy: Capture, tmp_path: Path, strategy: str, schedule: str
+) -> None:
+    """Catches a combination of settings that no other test trains, and an avatar in the wrong
+    convention."""
+    settings = quick_settings(
+        strategy, schedule=schedule, iterations=8, stray_reset_interval=3, density_interval=3
+    )
     train(toy, tmp_path, Run(toy.root, None, "vhap", settings))
     avatar = read_avatar(tmp_path / "avatar.npz")
     assert avatar.convention == ("gaussian_avatars" if strategy == "gaussian-avatars" else "stga")
@@ -344,7 +406,8 @@ def test_a_given_selection_is_used(toy: Capture, tmp_path: Path) -> None:
 
 
 def test_a_resumed_run_checks_the_mesh(toy: Capture, tmp_path: Path) -> None:
-    """Catches splats on triangles that the capture no longer has, which kernels would read beyond the end for."""
+    """Catches splats on triangles that the capture no longer has, which kernels would read beyond
+    the end for."""
     run = make_run(toy, "global", iterations=4)
     train(toy, tmp_path, run, report=stop_at(2))
     fewer = replace(toy, faces=toy.faces[:100], regions={})
@@ -353,8 +416,8 @@ def test_a_resumed_run_checks_the_mesh(toy: Capture, tmp_path: Path) -> None:
 
 
 def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path) -> None:
-    """Catches shares that do not end at one, speeds or losses that are never filled in, and a wait for kernels with
-    nothing to look at."""
+    """Catches shares that do not end at one, speeds or losses that are never filled in, and a wait
+    for kernels with nothing to look at."""
     told: list[Progress] = []
     figures: list[dict[str, float]] = []
     first: list[int] = []

@@ -22,7 +22,8 @@ from stga_addon.training.settings import (
 @pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("schedule", SCHEDULES)
 def test_json_round_trip(strategy: str, schedule: str) -> None:
-    """Catches a field that changes its value or kind (a tuple into a list) in run.json, so a resumed run differs."""
+    """Catches a field that changes its value or kind (a tuple into a list) in run.json, so a
+    resumed run differs."""
     settings = make_settings(strategy, schedule, seconds=90.5, background=(0.0, 0.5, 1.0), seed=7)
     again = from_json(TrainingSettings, json.loads(json.dumps(to_json(settings))))
     assert again == settings
@@ -37,7 +38,14 @@ def test_nested_settings_round_trip() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"colour": 1}, {"rates": {"xyz": 1, "abc": 2}}, {"selection": {}}, {"rates": None}, {"effects": 5}]
+    "change",
+    [
+        {"colour": 1},
+        {"rates": {"xyz": 1, "abc": 2}},
+        {"selection": {}},
+        {"rates": None},
+        {"effects": 5},
+    ],
 )
 def test_unknown_or_missing_fields(change: dict[str, Any]) -> None:
     """Catches a misspelt field that is dropped without a message."""
@@ -48,14 +56,26 @@ def test_unknown_or_missing_fields(change: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"strategy": "best", "iterations": 5}, "setting strategy: expected one of global, selective"),
+        (
+            {"strategy": "best", "iterations": 5},
+            "setting strategy: expected one of global, selective",
+        ),
         ({"schedule": "fast", "iterations": 5}, "setting schedule: expected one of default, paper"),
-        ({"preset": "best", "iterations": 5}, "setting preset: expected one of draft, standard, final, got 'best'"),
+        (
+            {"preset": "best", "iterations": 5},
+            "setting preset: expected one of draft, standard, final, got 'best'",
+        ),
         ({"preset": [], "iterations": 5}, "setting preset: "),
         ({}, "either in seconds or in iterations"),
         ({"seconds": 5.0, "iterations": 5}, "either in seconds or in iterations"),
-        ({"iterations": -3}, "setting iterations: expected a whole number from 1 up to 2147483647, got -3"),
-        ({"effects": {"jaw": "on"}, "schedule": "paper"}, "--effect cannot be combined with --schedule paper"),
+        (
+            {"iterations": -3},
+            "setting iterations: expected a whole number from 1 up to 2147483647, got -3",
+        ),
+        (
+            {"effects": {"jaw": "on"}, "schedule": "paper"},
+            "--effect cannot be combined with --schedule paper",
+        ),
     ],
 )
 def test_impossible_settings(arguments: dict[str, Any], message: str) -> None:
@@ -75,7 +95,10 @@ REFUSED: list[tuple[str, Any]] = [
     *[("sh_steps", value) for value in ([0.1], (0.1, "0.2"), (-1.0,), 0.5)],
     *[("density_span", value) for value in ((0.1,), (0.1, 0.2, 0.3), (0.1, -1.0), (0.1, math.inf))],
     *[("background", value) for value in ((1.0, 1.0), (2.0, 0.0, 0.0), "white")],
-    *[("exposure", value) for value in (((0.0, 1.0),), ((0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0),), (5,), [[1.0] * 7])],
+    *[
+        ("exposure", value)
+        for value in (((0.0, 1.0),), ((0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0),), (5,), [[1.0] * 7])
+    ],
     *[("target_psnr", value) for value in (0.0, -1.0, 201.0, math.nan, "30")],
     *[("effects", value) for value in (5, {"jaw": "maybe"}, {"chin": "on"}, {1: "on"})],
     *[("hull_points", value) for value in (1, None, "yes")],
@@ -97,7 +120,8 @@ REFUSED: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("name", "value"), REFUSED)
 def test_one_schema_for_new_and_stored_settings(name: str, value: Any) -> None:
-    """Catches a setting that begins a run which cannot be read again, or a stored one that breaks training."""
+    """Catches a setting that begins a run which cannot be read again, or a stored one that breaks
+    training."""
     budget = {} if name == "seconds" else {"iterations": 5}
     with pytest.raises(StgaError, match=f"^setting {name}") as caught:
         make_settings(**{**budget, name: value})
@@ -110,7 +134,9 @@ def test_one_schema_for_new_and_stored_settings(name: str, value: Any) -> None:
         from_json(TrainingSettings, {**stored, name: plain})
 
 
-@pytest.mark.parametrize("change", [{"threshold": math.nan}, {"threshold": -1.0}, {"zero_pose": "neck"}])
+@pytest.mark.parametrize(
+    "change", [{"threshold": math.nan}, {"threshold": -1.0}, {"zero_pose": "neck"}]
+)
 def test_stored_selection_is_validated(change: dict[str, Any]) -> None:
     """Catches a stored selection rule that could not have been made."""
     stored = to_json(make_settings(iterations=5))

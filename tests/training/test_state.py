@@ -27,7 +27,8 @@ def test_flat_names_round_trip() -> None:
 
 
 def test_keep_and_join() -> None:
-    """Catches an array left at its old length or in another order after pruning, which would mix rows up."""
+    """Catches an array left at its old length or in another order after pruning, which would mix
+    rows up."""
     state = random_state(9, 5)
     keep = np.array([True, False, True, True, False, False, True, False, True])
     kept, rest = keep_rows(state, keep), keep_rows(state, ~keep)
@@ -41,7 +42,8 @@ def test_keep_and_join() -> None:
 
 
 def test_memory_is_shared_where_promised_and_only_there() -> None:
-    """Catches training that changes the splats it started from, and Adam on a copy of the parameters."""
+    """Catches training that changes the splats it started from, and Adam on a copy of the
+    parameters."""
     splats = random_splats(6, 4)
     xyz, face = splats.xyz.copy(), splats.face.copy()
     state = new_state(splats)
@@ -52,7 +54,9 @@ def test_memory_is_shared_where_promised_and_only_there() -> None:
     np.testing.assert_array_equal(splats.face, face)
     np.testing.assert_array_equal(copy.xyz, xyz)
     np.testing.assert_array_equal(state.average.xyz, xyz)
-    assert all(not array.any() for part in (state.gradients, state.first, state.second) for array in part)
+    assert all(
+        not array.any() for part in (state.gradients, state.first, state.second) for array in part
+    )
     for name, table in state.tables.items():
         parts = (state.parameters, state.gradients, state.first, state.second, state.average)
         for array, part in zip(table, parts, strict=False):

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
-from stga_addon.avatar.strain import COLOR_RANGE, MIN_COMPRESSION, color_range, face_strain, strain_basis
+from stga_addon.avatar.strain import (
+    COLOR_RANGE,
+    MIN_COMPRESSION,
+    color_range,
+    face_strain,
+    strain_basis,
+)
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.training.evaluate.metrics import evaluate_avatar
@@ -33,7 +39,8 @@ def strains(toy: Capture, timesteps: set[int]) -> np.ndarray:
 
 
 def test_a_run_writes_the_range_of_what_it_trained(toy: Capture, tmp_path: Path) -> None:
-    """Catches a range of held-out expressions too, one that clips what was trained, and one where nothing needs it."""
+    """Catches a range of held-out expressions too, one that clips what was trained, and one where
+    nothing needs it."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
     settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
     found = read_avatar(train(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
@@ -51,7 +58,13 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
     """Catches an avatar that forgets expressions because only one frame was refined."""
     count = len(toy.faces)
     limits = np.broadcast_to(np.array([[-0.5], [0.01]], np.float32), (count, 2, 3)).copy()
-    parent = Avatar(random_splats(20, count), "stga", toy.neutral.astype(np.float32), toy.faces, strain_range=limits)
+    parent = Avatar(
+        random_splats(20, count),
+        "stga",
+        toy.neutral.astype(np.float32),
+        toy.faces,
+        strain_range=limits,
+    )
     write_avatar(tmp_path / "avatar.npz", parent)
     continuation = Continuation(tmp_path, "", 0, 0)
     alone = trained_strain_range(toy, lambda t: deformed(toy, t), None)
@@ -59,7 +72,8 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
     assert alone is not None
     assert both is not None
     np.testing.assert_array_equal(both[:, 0], np.minimum(alone[:, 0], -0.5))
-    np.testing.assert_array_equal(both[:, 1, :2], np.float32(-MIN_COMPRESSION))  # its parent followed stretch
+    # its parent followed stretch
+    np.testing.assert_array_equal(both[:, 1, :2], np.float32(-MIN_COMPRESSION))
     np.testing.assert_array_equal(both[:, 1, 2], np.maximum(alone[:, 1, 2], np.float32(0.01)))
     write_avatar(tmp_path / "avatar.npz", replace(parent, strain_range=None))
     unlimited = trained_strain_range(toy, lambda t: deformed(toy, t), continuation)
@@ -67,11 +81,14 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
 
 
 def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> None:
-    """Catches wrinkles of compressed skin that show with the opposite sign where it is stretched, or that begin with
-    the least compression, in the frames that training renders or in the avatar's range."""
+    """Catches wrinkles of compressed skin that show with the opposite sign where it is stretched,
+    or that begin with the least compression, in the frames that training renders or in the avatar's
+    range."""
     basis = FrameStore(toy, "stga", strain=True).strain
     assert basis is not None
-    larger, little, smaller = (face_strain(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.985, 0.9))
+    larger, little, smaller = (
+        face_strain(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.985, 0.9)
+    )
     np.testing.assert_array_equal(larger[:, :2], np.float32(-MIN_COMPRESSION))
     np.testing.assert_array_equal(little[:, :2], np.float32(-MIN_COMPRESSION))
     assert (smaller[:, :2] < -0.4).all()
@@ -85,8 +102,8 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> Non
 
 @pytest.mark.parametrize("limited", [True, False])
 def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, limited: bool) -> None:
-    """Catches a run of an earlier version that is resumed, which changes all its colors at once, and one that is
-    finished but cannot be opened."""
+    """Catches a run of an earlier version that is resumed, which changes all its colors at once,
+    and one that is finished but cannot be opened."""
     settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     path = train(toy, out, run, report=lambda progress: progress.figures().get("iteration", 0) == 2)
@@ -94,7 +111,10 @@ def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, lim
     wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 3)).copy()
     write_avatar(path, replace(avatar, strain_range=wider if limited else None))
     before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
-    with pytest.raises(StgaError, match=r"avatar\.npz: colors follow strain as in an earlier version; train it anew"):
+    with pytest.raises(
+        StgaError,
+        match=r"avatar\.npz: colors follow strain as in an earlier version; train it anew",
+    ):
         train(toy, out, run, resume=True)
     assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
     write_avatar(path, avatar)
@@ -104,7 +124,8 @@ def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, lim
 
 
 def test_the_range_covers_an_expression_of_few_timesteps(toy: Capture) -> None:
-    """Catches a blink of six frames in twelve hundred that is trained, but clipped out of the avatar."""
+    """Catches a blink of six frames in twelve hundred that is trained, but clipped out of the
+    avatar."""
     view, blink = toy.views["train"][0], range(1003, 1009)
     views = {"train": tuple(replace(view, timestep=timestep) for timestep in range(1200))}
 
@@ -116,21 +137,30 @@ def test_the_range_covers_an_expression_of_few_timesteps(toy: Capture) -> None:
     assert (limits[:, 0] <= face_strain(basis, mesh(blink[0]))).all()
 
 
-def test_evaluation_while_training_measures_the_avatar_that_is_written(toy: Capture, tmp_path: Path) -> None:
+def test_evaluation_while_training_measures_the_avatar_that_is_written(
+    toy: Capture, tmp_path: Path
+) -> None:
     """Catches metrics of an avatar that follows held-out expressions further than the file does."""
     strong = {view.timestep for view in toy.views["val"]} - {0}
 
     def mesh(timestep: int) -> np.ndarray:
         return np.asarray(toy.neutral) * (0.8 if timestep in strong else 1.0)
 
-    views = {**toy.views, "train": tuple(view for view in toy.views["train"] if view.timestep not in strong)}
+    views = {
+        **toy.views,
+        "train": tuple(view for view in toy.views["train"] if view.timestep not in strong),
+    }
     rates = Rates(strain_color=0.5)
-    settings = quick_settings("global", iterations=20, lattice=0, strain_color=True, sh_degree=0, sh_steps=())
+    settings = quick_settings(
+        "global", iterations=20, lattice=0, strain_color=True, sh_degree=0, sh_steps=()
+    )
     run = Run(toy.root, None, "vhap", replace(settings, rates=rates, ema_share=1.0))
     capture = replace(toy, mesh=mesh, views=views)
     path = train(capture, tmp_path / "run", run)
     best = min(read_metrics(tmp_path / "run"), key=lambda line: line["detail_difference"])
-    assert evaluate_avatar(read_avatar(path), capture, "val").psnr == pytest.approx(best["psnr"], abs=1e-3)
+    assert evaluate_avatar(read_avatar(path), capture, "val").psnr == pytest.approx(
+        best["psnr"], abs=1e-3
+    )
 
 
 def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ def selective(**changes: object) -> SelectiveStrategy:
 
 @pytest.mark.parametrize("interval", [1, 2, 20])
 def test_global_iteration_after_every_so_many_local_ones(interval: int) -> None:
-    """Catches an off-by-one: `interval` local iterations, then a global one, from the first iteration on."""
+    """Catches an off-by-one: `interval` local iterations, then a global one, from the first
+    iteration on."""
     strategy = selective(global_interval=interval, global_unit="iteration", warm_up_share=0.0)
     kinds = [strategy.triangles(n, 0, 0, 0.5) is None for n in range(3 * (interval + 1))]
     assert kinds == ([False] * interval + [True]) * 3
@@ -32,7 +33,8 @@ def test_global_visit_after_every_so_many_frames() -> None:
 
 
 def test_warm_up_and_empty_selections_are_global() -> None:
-    """Catches local iterations before the head has taken shape, and iterations that train nothing."""
+    """Catches local iterations before the head has taken shape, and iterations that train
+    nothing."""
     strategy = selective(warm_up_share=0.3)
     assert all(strategy.triangles(n, n, 0, 0.29) is None for n in range(6))
     assert strategy.triangles(0, 0, 0, 0.3) is MOUTH

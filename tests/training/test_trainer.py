@@ -1,4 +1,5 @@
-"""One step of training: what a local iteration may touch, and that its gradient is the whole image's."""
+"""One step of training: what a local iteration may touch, and that its gradient is the whole
+image's."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -56,9 +57,12 @@ def view_of(capture: Capture, timestep: int, camera: int = 1) -> View:
 
 
 def large(view: View, factor: float = 3.0) -> tuple[View, np.ndarray]:
-    """The view in a larger image, and a noisy target for it: many tiles and a gradient everywhere."""
+    """The view in a larger image, and a noisy target for it: many tiles and a gradient
+    everywhere."""
     view = replace(view, camera=view.camera.scaled(factor))
-    target = np.random.default_rng(0).integers(0, 256, (view.camera.height, view.camera.width, 3), np.uint8)
+    target = np.random.default_rng(0).integers(
+        0, 256, (view.camera.height, view.camera.width, 3), np.uint8
+    )
     return view, target
 
 
@@ -71,7 +75,8 @@ def disturb(trainer: Trainer) -> None:
 
 
 def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
-    """Catches momentum, limits, decay or statistics that reach rows which the frame does not select."""
+    """Catches momentum, limits, decay or statistics that reach rows which the frame does not
+    select."""
     trainer = make_trainer(toy, distance_weight=0.1, distance_limit=0.01, scale_limit=0.1)
     view = view_of(toy, 1)
     target = read_image(view)
@@ -95,7 +100,8 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> Non
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("camera", [0, 2])
 def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: int) -> None:
-    """Catches tiles left out around the selection, and pixels read that no tile rendered (all buffers hold NaN)."""
+    """Catches tiles left out around the selection, and pixels read that no tile rendered (all
+    buffers hold NaN)."""
     trainer = make_trainer(toy)
     disturb(trainer)
     view, target = large(view_of(toy, 1, camera))
@@ -122,7 +128,8 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
 
 
 def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
-    """Catches a restriction that restricts nothing, with which the test above would hold of itself."""
+    """Catches a restriction that restricts nothing, with which the test above would hold of
+    itself."""
     trainer = make_trainer(toy)
     view, _ = large(view_of(toy, 1))
     focus = toy.regions["mouth"][trainer.state.face]
@@ -136,7 +143,8 @@ def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
 
 @pytest.mark.parametrize("timestep", [0, 4])
 def test_a_frame_that_selects_nothing_trains_globally(toy: Capture, timestep: int) -> None:
-    """Catches iterations that train nothing, for an empty selection and for a timestep that has none."""
+    """Catches iterations that train nothing, for an empty selection and for a timestep that has
+    none."""
     trainer = make_trainer(toy)
     view = view_of(toy, timestep)
     loss = trainer.step(view, read_image(view), 0.5)
@@ -149,12 +157,16 @@ def test_a_frame_that_selects_nothing_trains_globally(toy: Capture, timestep: in
 
 
 def test_kinds_of_iterations(toy: Capture) -> None:
-    """Catches a schedule that the trainer does not follow: by iterations, by visits of frames, and in the warm-up."""
+    """Catches a schedule that the trainer does not follow: by iterations, by visits of frames, and
+    in the warm-up."""
     views = [view_of(toy, timestep, camera) for timestep in (1, 3, 1, 3) for camera in (0, 1)]
     images = [read_image(view) for view in views]
 
     def kinds(trainer: Trainer, share: float = 0.5) -> list[bool]:
-        return [trainer.step(view, image, share) is not None for view, image in zip(views, images, strict=True)]
+        return [
+            trainer.step(view, image, share) is not None
+            for view, image in zip(views, images, strict=True)
+        ]
 
     assert kinds(make_trainer(toy)) == [False, False, True, False, False, True, False, False]
     # Two local visits of frames with two views each, then a global visit.
@@ -166,8 +178,11 @@ def test_kinds_of_iterations(toy: Capture) -> None:
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
-    """Catches a gradient of the wrong sign, rates that are not applied, and a strategy that does not learn."""
-    trainer = make_trainer(toy, strategy, lattice=1 if strategy != "gaussian-avatars" else 0, warm_up_share=0.3)
+    """Catches a gradient of the wrong sign, rates that are not applied, and a strategy that does
+    not learn."""
+    trainer = make_trainer(
+        toy, strategy, lattice=1 if strategy != "gaussian-avatars" else 0, warm_up_share=0.3
+    )
     views, losses = toy.views["train"], []
     images = {view.name: read_image(view) for view in views}
     before = [psnr(trainer.render(view, 0.0), images[view.name]) for view in views]
@@ -181,8 +196,14 @@ def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
 
 
 def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
-    """Catches maintenance that never runs, runs outside its span, or grows beyond what was allowed."""
-    options = {"density_interval": 2, "density_span": (0.2, 0.6), "growth": 0.05, "stray_reset_interval": 5}
+    """Catches maintenance that never runs, runs outside its span, or grows beyond what was
+    allowed."""
+    options = {
+        "density_interval": 2,
+        "density_span": (0.2, 0.6),
+        "growth": 0.05,
+        "stray_reset_interval": 5,
+    }
     trainer = make_trainer(toy, "global", **options)
     view = view_of(toy, 1)
     image, counts = read_image(view), []
@@ -191,7 +212,12 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     assert not trainer.state.unbound[7]
     for n in range(10):
         if n == 4:
-            assert np.linalg.norm(trainer.state.parameters.xyz[trainer.state.face == int(face[7])], axis=1).max() > 0.9
+            assert (
+                np.linalg.norm(
+                    trainer.state.parameters.xyz[trainer.state.face == int(face[7])], axis=1
+                ).max()
+                > 0.9
+            )
         trainer.step(view, image, n / 10)
         counts.append(len(trainer.state))
     first = trainer.initial_count
@@ -202,7 +228,8 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
 
 
 def test_screen_gradients_are_accumulated_by_global_iterations_only(toy: Capture) -> None:
-    """Catches selected regions that are split more because they are drawn more often, not because they are worse."""
+    """Catches selected regions that are split more because they are drawn more often, not because
+    they are worse."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
     for expected in (0, 0, 1, 1, 1, 2):
@@ -211,7 +238,8 @@ def test_screen_gradients_are_accumulated_by_global_iterations_only(toy: Capture
 
 
 def test_initial_splats_with_hull_points(tmp_path: Path) -> None:
-    """Catches hull points that are mixed up with the lattice, which would be exempt from its limits then."""
+    """Catches hull points that are mixed up with the lattice, which would be exempt from its limits
+    then."""
     hairy = open_capture(factory.write_mesh_capture(tmp_path / "hairy"))
     rows, columns = np.mgrid[: factory.HEIGHT, : factory.WIDTH] + 0.5
     mask = np.hypot(columns - factory.CX, rows - factory.CY) < 29  # the ball itself: 20 pixels
@@ -227,9 +255,12 @@ def test_initial_splats_with_hull_points(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(full, name)[: len(bare)], value)
 
 
-@pytest.mark.parametrize(("triangles", "splats"), [(MAX_FINE_TRIANGLES, 6), (MAX_FINE_TRIANGLES + 1, 3)])
+@pytest.mark.parametrize(
+    ("triangles", "splats"), [(MAX_FINE_TRIANGLES, 6), (MAX_FINE_TRIANGLES + 1, 3)]
+)
 def test_splats_of_a_triangle_by_the_mesh(toy: Capture, triangles: int, splats: int) -> None:
-    """Catches a fine mesh that starts with twice the splats, and a lattice that was chosen and is not used."""
+    """Catches a fine mesh that starts with twice the splats, and a lattice that was chosen and is
+    not used."""
     rows = np.resize(np.arange(len(toy.faces)), triangles)
     fine = replace(toy, faces=toy.faces[rows])
     assert len(initial_splats(fine, quick_settings(lattice=None))) == splats * triangles
@@ -237,26 +268,36 @@ def test_splats_of_a_triangle_by_the_mesh(toy: Capture, triangles: int, splats: 
 
 
 def test_unseen_share(toy: Capture) -> None:
-    """Catches seen taken for unseen, a camera of another timestep, pixels off the image, and shares of bound splats."""
+    """Catches seen taken for unseen, a camera of another timestep, pixels off the image, and shares
+    of bound splats."""
     splats = initial_splats(toy, quick_settings(lattice=0))
     splats.unbound[::2] = True
     splats.xyz[:] += np.random.default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
     found = unseen_share(toy, "stga", splats)
     first = toy.views["train"][0].timestep
-    world = to_world(splats, face_frames(toy.mesh(first), toy.faces, toy.neutral, "stga")).xyz.astype(np.float64)
+    world = to_world(
+        splats, face_frames(toy.mesh(first), toy.faces, toy.neutral, "stga")
+    ).xyz.astype(np.float64)
     unseen = []
     for view in (view for view in toy.views["train"] if view.timestep == first):
         camera = view.camera
         x, y, z = camera.world_to_camera[:3, :3] @ world.T + camera.world_to_camera[:3, 3:]
         column, row = camera.fl_x * x / z + camera.cx, camera.fl_y * y / z + camera.cy
-        unseen.append((z < 0.01) | (column < 0) | (column >= camera.width) | (row < 0) | (row >= camera.height))
+        unseen.append(
+            (z < 0.01)
+            | (column < 0)
+            | (column >= camera.width)
+            | (row < 0)
+            | (row >= camera.height)
+        )
     np.testing.assert_allclose(found[::2], np.mean(unseen, axis=0)[::2], atol=1e-6)
     assert not found[1::2].any()
     assert 0.05 < found[::2].mean() < 0.95
 
 
 def test_nothing_beside_the_mesh_gives_no_hull_points(toy: Capture) -> None:
-    """Catches the hull's phantom volumes behind the head, which few cameras on one side cannot contradict."""
+    """Catches the hull's phantom volumes behind the head, which few cameras on one side cannot
+    contradict."""
     full = initial_splats(toy, quick_settings(lattice=2, hull_points=True))
     assert not full.unbound.any()
 
@@ -284,7 +325,8 @@ def test_render_returns_a_copy(toy: Capture) -> None:
 
 
 def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
-    """Catches limits in meters applied to GaussianAvatars' triangle units, and an area without its factor two."""
+    """Catches limits in meters applied to GaussianAvatars' triangle units, and an area without its
+    factor two."""
     areas = trimesh.Trimesh(toy.neutral, toy.faces, process=False).area_faces
     np.testing.assert_allclose(FrameStore(toy, "stga").units, np.sqrt(2 * areas), rtol=1e-5)
     np.testing.assert_array_equal(FrameStore(toy, "gaussian_avatars").units, 1)
@@ -292,7 +334,8 @@ def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_scale_limits_in_meters(toy: Capture, convention: str) -> None:
-    """Catches bound and unbound limits that are mixed up, and hull points limited in triangles instead of meters."""
+    """Catches bound and unbound limits that are mixed up, and hull points limited in triangles
+    instead of meters."""
     settings = quick_settings(convention=convention, scale_limit=3.0, unbound_scale_limit=2.0)
     store = FrameStore(toy, convention)
     bound, unbound = store.scale_limits(settings)

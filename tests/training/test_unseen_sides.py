@@ -21,15 +21,24 @@ CAMERA = 3
 @pytest.fixture(scope="module")
 def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     capture, _ = write_head(tmp_path_factory.mktemp("side"), error=0.0)
-    views = [view for view in capture.views["train"] if view.camera_index == CAMERA and view.timestep == 0]
+    views = [
+        view
+        for view in capture.views["train"]
+        if view.camera_index == CAMERA and view.timestep == 0
+    ]
     return replace(capture, views={"train": views})
 
 
 def test_what_is_hidden_and_what_it_looks_like(from_one_side: Capture) -> None:
-    """Catches a side taken for another, a normal turned inside, and a mirror at a wrong plane: against the ball."""
+    """Catches a side taken for another, a normal turned inside, and a mirror at a wrong plane:
+    against the ball."""
     capture, sides = from_one_side, unseen_sides(from_one_side)
-    neutral, posed = (mesh[capture.faces].mean(1) - mesh.mean(0) for mesh in (capture.neutral, capture.mesh(0)))
-    direction, turned = (own / np.linalg.norm(own, axis=1, keepdims=True) for own in (neutral, posed))
+    neutral, posed = (
+        mesh[capture.faces].mean(1) - mesh.mean(0) for mesh in (capture.neutral, capture.mesh(0))
+    )
+    direction, turned = (
+        own / np.linalg.norm(own, axis=1, keepdims=True) for own in (neutral, posed)
+    )
     cosine = turned @ factory.pose(PLACES[CAMERA])[:3, 2]
     assert sides.triangles[cosine < -0.3].mean() > 0.95
     assert sides.triangles[cosine > 0.1].mean() < 0.05  # the expression makes dents
@@ -41,10 +50,12 @@ def test_what_is_hidden_and_what_it_looks_like(from_one_side: Capture) -> None:
 
 
 def test_training_leaves_them_their_color(from_one_side: Capture) -> None:
-    """Catches splats of the far side that take any color, where they shine through the near side, and a near side that
-    is reset."""
+    """Catches splats of the far side that take any color, where they shine through the near side,
+    and a near side that is reset."""
     capture = from_one_side
-    trainer = Trainer(capture, quick_settings("global", iterations=200, lattice=1, sh_degree=1, sh_steps=()), {})
+    trainer = Trainer(
+        capture, quick_settings("global", iterations=200, lattice=1, sh_degree=1, sh_steps=()), {}
+    )
     view = capture.views["train"][0]
     image = read_image(view)
     for n in range(200):

@@ -1,4 +1,5 @@
-"""What stands still behind a person: clean plates, splats that show them, and what is rendered and measured so."""
+"""What stands still behind a person: clean plates, splats that show them, and what is rendered and
+measured so."""
 
 import json
 from pathlib import Path
@@ -24,7 +25,8 @@ WALL_M = 1.0
 
 
 def wall(camera: Camera, texture: np.ndarray) -> np.ndarray:
-    """(H, W, 3): what a camera sees of a textured wall at z = −WALL_M, one texel to a centimeter, by its rays."""
+    """(H, W, 3): what a camera sees of a textured wall at z = −WALL_M, one texel to a centimeter,
+    by its rays."""
     y, x = np.mgrid[: camera.height, : camera.width]
     origin = camera.position
     toward = camera.unproject(np.stack([x.ravel(), y.ravel()], 1) + 0.5, np.ones(x.size)) - origin
@@ -42,11 +44,14 @@ def camera_at(degrees: float) -> Camera:
 
 def plates_of(texture: np.ndarray) -> list[CleanPlate]:
     cameras = [camera_at(degrees) for degrees in (-24, -8, 8, 24)]
-    return [CleanPlate(camera, wall(camera, texture), np.ones((160, 120), bool)) for camera in cameras]
+    return [
+        CleanPlate(camera, wall(camera, texture), np.ones((160, 120), bool)) for camera in cameras
+    ]
 
 
 def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
-    """Catches a wall at a wrong distance, and splats that show it from the cameras of the plates alone."""
+    """Catches a wall at a wrong distance, and splats that show it from the cameras of the plates
+    alone."""
     noise = np.random.default_rng(0).random((512, 512, 3))
     texture = gaussian_filter(noise, (4, 4, 0), mode="wrap")
     texture = (texture - texture.min()) / (texture.max() - texture.min())
@@ -59,14 +64,19 @@ def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
 
 
 def test_a_wall_of_one_color() -> None:
-    """Catches a distance that is read from noise, and a wall that is darker between its splats or at its border."""
+    """Catches a distance that is read from noise, and a wall that is darker between its splats or
+    at its border."""
     plates = plates_of(np.full((512, 512, 3), 0.6))
     assert shell_radius(plates, np.zeros(3)) == pytest.approx(3 * 1.1, rel=0.01)
     splats = trained_on(plates, np.zeros(3))
     assert all(abs(render(splats, plate.camera) - 0.6).max() < 0.02 for plate in plates)
 
 
-STRIPES = (np.array([110, 90, 150]) + 50 * np.cos(np.arange(factory.WIDTH)[None, :, None] / 3)).round().astype(np.uint8)
+STRIPES = (
+    (np.array([110, 90, 150]) + 50 * np.cos(np.arange(factory.WIDTH)[None, :, None] / 3))
+    .round()
+    .astype(np.uint8)
+)
 """(1, W, 3): what stands behind the ball, the same for every camera."""
 
 
@@ -92,7 +102,8 @@ def run(walled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_plates_without_the_person(walled: Path) -> None:
-    """Catches a person who remains in a plate, a wall that is blurred, and holes without a color."""
+    """Catches a person who remains in a plate, a wall that is blurred, and holes without a
+    color."""
     for plate in clean_plates(open_capture(walled)):
         stripes = np.broadcast_to(STRIPES, plate.image.shape) / 255
         assert 0.3 < plate.seen.mean() < 1
@@ -103,13 +114,29 @@ def test_plates_without_the_person(walled: Path) -> None:
         assert (hidden <= stripes.max((0, 1)) + 1e-6).all()
 
 
-def test_measured_with_the_world(walled: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches figures of matted images that are called those of whole ones: the same from `stga render --world`."""
+def test_measured_with_the_world(
+    walled: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches figures of matted images that are called those of whole ones: the same from `stga
+    render --world`."""
     assert main(["eval", str(run), "--split", "train"]) == 0
     assert "in front of its world, against whole images as recorded" in capsys.readouterr().out
     found = json.loads((run / "quality_train.json").read_text())["psnr_recorded"]
     cameras = walled / "transforms_train.json"
-    assert main(["render", str(run), "--world", "--cameras", str(cameras), "--out", str(run / "pictures")]) == 0
+    assert (
+        main(
+            [
+                "render",
+                str(run),
+                "--world",
+                "--cameras",
+                str(cameras),
+                "--out",
+                str(run / "pictures"),
+            ]
+        )
+        == 0
+    )
     errors = []
     for view in open_capture(walled).views["train"]:
         rendered, recorded = (
@@ -121,8 +148,11 @@ def test_measured_with_the_world(walled: Path, run: Path, capsys: pytest.Capture
     assert found > 18
 
 
-def test_no_world(walled: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a traceback where there is no world, and one that is asked for where nothing tells it apart."""
+def test_no_world(
+    walled: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a traceback where there is no world, and one that is asked for where nothing tells it
+    apart."""
     avatar, cameras = tmp_path / "avatar.npz", walled / "transforms_test.json"
     avatar.write_bytes((run / "avatar.npz").read_bytes())
     asked = ("--world", "--capture", walled, "--cameras", cameras, "--out", tmp_path / "out")
@@ -135,7 +165,8 @@ def test_no_world(walled: Path, run: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_many_cameras_before_a_busy_wall() -> None:
-    """Catches a search for larger blocks that never ends, because they are as large as they may be."""
+    """Catches a search for larger blocks that never ends, because they are as large as they may
+    be."""
     noise = np.random.default_rng(0).random((512, 512, 3))
     plates = plates_of(noise)[:1] * 3
     with patch.object(world_splats, "MAX_FIRST_SPLATS", 10):

@@ -43,6 +43,11 @@ def quick_settings(strategy: str = "selective", **changes: Any) -> TrainingSetti
 
 
 def bits(state: TrainState) -> dict[str, np.ndarray]:
-    """A copy of every array as bytes per row, so that NaN and −0 compare by their bits; gradients left out."""
-    arrays = {name: array for name, array in arrays_of(state).items() if not name.startswith("gradients")}
-    return {name: array.copy().reshape(len(state), -1).view(np.uint8) for name, array in arrays.items()}
+    """A copy of every array as bytes per row, so that NaN and −0 compare by their bits; gradients
+    left out."""
+    arrays = {
+        name: array for name, array in arrays_of(state).items() if not name.startswith("gradients")
+    }
+    return {
+        name: array.copy().reshape(len(state), -1).view(np.uint8) for name, array in arrays.items()
+    }

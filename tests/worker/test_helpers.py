@@ -40,8 +40,12 @@ def takes_long(seconds, step):
 
 
 def is_own(value, function, step):
-    """A value and a function of the package as it is called here, and an error of it where they are another's."""
-    if (type(value).__module__, function.__module__) != ("stga_addon.progress", "stga_addon.format"):
+    """A value and a function of the package as it is called here, and an error of it where they are
+    another's."""
+    if (type(value).__module__, function.__module__) != (
+        "stga_addon.progress",
+        "stga_addon.format",
+    ):
         raise ZeroDivisionError
     if function(value.share) != "45 s":
         raise StgaError("expected 45 seconds")
@@ -52,8 +56,8 @@ PARTS = [(first, first + 3) for first in range(0, 21, 3)]
 
 
 def test_results_are_those_of_one_process_in_order():
-    """Catches parts that are lost, exchanged or done twice, what libraries print in the stream of answers, and helpers
-    that are started anew for every task."""
+    """Catches parts that are lost, exchanged or done twice, what libraries print in the stream of
+    answers, and helpers that are started anew for every task."""
     pids = set()
     with Helpers(3) as helpers:
         for _ in range(2):
@@ -67,7 +71,9 @@ def test_results_are_those_of_one_process_in_order():
     assert 1 <= len(pids) <= 3
     with Helpers(1) as alone:
         told = []
-        assert {pid for part in alone.map(squares, PARTS, told.append) for _, pid in part} == {os.getpid()}
+        assert {pid for part in alone.map(squares, PARTS, told.append) for _, pid in part} == {
+            os.getpid()
+        }
         assert told == list(range(1, 22))
         assert {pid for _, pid in alone.run(squares, (0, 3), told.append)} == {os.getpid()}
 
@@ -82,8 +88,8 @@ def halves(numbers, folder, step):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_was_found_is_not_worked_on_again(tmp_path, count):
-    """Catches an interrupted tracking that begins anew, one that takes results of other arguments, and a progress that
-    lacks what was kept."""
+    """Catches an interrupted tracking that begins anew, one that takes results of other arguments,
+    and a progress that lacks what was kept."""
     called = tmp_path / "called"
     called.mkdir()
     parts = [(np.arange(3.0) + number, called) for number in range(4)]
@@ -99,7 +105,9 @@ def test_what_was_found_is_not_worked_on_again(tmp_path, count):
     calls = len(list(called.iterdir()))
     with Helpers(count, tmp_path / "kept") as helpers:
         found = helpers.map(halves, parts, told.append, keep=True)
-        np.testing.assert_array_equal([own["half"] for own in found], [part[0] / 2 for part in parts])
+        np.testing.assert_array_equal(
+            [own["half"] for own in found], [part[0] / 2 for part in parts]
+        )
         assert told[-1] == 12
         assert len(list(called.iterdir())) == calls + 4 - before
         helpers.map(halves, [(np.arange(3.0) + 9, called), parts[0]], told.append, keep=True)
@@ -115,21 +123,28 @@ def test_what_was_found_is_not_worked_on_again(tmp_path, count):
     ],
 )
 def test_failures_reach_who_asked(work, parts, error, says):
-    """Catches a caller that waits forever for a helper that failed or was killed, as for want of memory."""
+    """Catches a caller that waits forever for a helper that failed or was killed, as for want of
+    memory."""
     with pytest.raises(error, match=says), Helpers(2) as helpers:
         helpers.map(work, parts, lambda steps: None)
 
 
 def test_a_package_of_another_name_is_the_helpers_own(monkeypatch):
-    """Catches work that no helper can import: inside of Blender, this package is `bl_ext.….stga.stga_addon`."""
+    """Catches work that no helper can import: inside of Blender, this package is
+    `bl_ext.….stga.stga_addon`."""
     package = ModuleType("installed")
     package.__path__ = [str(Path(__file__).parents[2])]
     monkeypatch.setitem(sys.modules, "installed", package)
     modules = ("worker.helpers", "progress", "format", "errors")
-    helpers, progress, texts, errors = (import_module(f"installed.stga_addon.{name}") for name in modules)
+    helpers, progress, texts, errors = (
+        import_module(f"installed.stga_addon.{name}") for name in modules
+    )
     right, wrong = progress.Progress(45.0), progress.Progress(44.0)
     with helpers.Helpers(2) as two:
-        assert two.map(is_own, [(right, texts.format_duration)] * 2, lambda steps: None) == [right, right]
+        assert two.map(is_own, [(right, texts.format_duration)] * 2, lambda steps: None) == [
+            right,
+            right,
+        ]
         with pytest.raises(errors.StgaError, match="expected 45 seconds"):
             two.map(is_own, [(wrong, texts.format_duration)] * 2, lambda steps: None)
 
@@ -146,7 +161,9 @@ def test_cancelling_does_not_wait_for_what_is_being_done():
     assert time.monotonic() - since < 30
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere, a helper works to the end of its part")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="elsewhere, a helper works to the end of its part"
+)
 def test_helpers_end_with_a_process_that_is_killed():
     """Catches helpers that go on for nobody."""
     script = (
@@ -155,8 +172,13 @@ def test_helpers_end_with_a_process_that_is_killed():
         "helpers.map(takes_long, [(60,), (60,)], lambda steps: "
         "print(*(process.pid for process in helpers._processes), flush=True))"
     )
-    variables = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parents[1])])}
-    asking = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=variables)
+    variables = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parents[1])]),
+    }
+    asking = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=variables
+    )
     pids = [int(pid) for pid in asking.stdout.readline().split()]
     asking.kill()
     asking.communicate()

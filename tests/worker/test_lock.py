@@ -40,7 +40,9 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     """Catches a worker that is reported alive forever after kill -9."""
     path = tmp_path / "worker.lock"
     command = [sys.executable, "-c", HOLD, str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         assert is_locked(path)
@@ -68,7 +70,8 @@ def test_symbolic_link_is_not_followed(tmp_path: Path) -> None:
 
 @contextmanager
 def probed(path: Path) -> Iterator[None]:
-    """Hold the lock for a moment in another thread, as a probe of another process does, while the block runs."""
+    """Hold the lock for a moment in another thread, as a probe of another process does, while the
+    block runs."""
     begun = threading.Event()
 
     def hold() -> None:
@@ -85,7 +88,8 @@ def probed(path: Path) -> Iterator[None]:
 
 
 def test_probes_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a free lock that one probe reports as held because another probe has it for a moment."""
+    """Catches a free lock that one probe reports as held because another probe has it for a
+    moment."""
     monkeypatch.setattr(lock, "PROBE_TIMEOUT_S", 10.0)
     with probed(tmp_path / "worker.lock"):
         assert not is_locked(tmp_path / "worker.lock")
@@ -120,7 +124,8 @@ def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
-    """Catches workers that cannot run on such storage, two in one folder, and a lock that outlives its worker."""
+    """Catches workers that cannot run on such storage, two in one folder, and a lock that outlives
+    its worker."""
     path = tmp_path / "worker.lock"
     with hold_lock(path):
         assert lock_owner(path) == os.getpid()
@@ -133,7 +138,9 @@ def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
     lease = tmp_path / "worker.lock.lease"
     assert not lease.exists()
     with hold_lock(path):
-        left = lease.read_text().replace(f"{os.getpid()}", "123").replace(platform.node(), "elsewhere")
+        left = (
+            lease.read_text().replace(f"{os.getpid()}", "123").replace(platform.node(), "elsewhere")
+        )
     lease.write_text(left)  # what a process that was killed on another machine leaves
     assert is_locked(path)
     os.utime(lease, (time.time() - 2, time.time() - 2))
@@ -147,6 +154,9 @@ def test_a_worker_on_storage_without_locks(tmp_path: Path, without_locks: None) 
     with status_writer(tmp_path / "job") as writer:
         writer.update(0.5, "Working")
         assert inspect_worker(tmp_path / "job").state == WorkerState.WORKING
-        with pytest.raises(StgaError, match="another worker is running here"), status_writer(tmp_path / "job"):
+        with (
+            pytest.raises(StgaError, match="another worker is running here"),
+            status_writer(tmp_path / "job"),
+        ):
             pass
     assert inspect_worker(tmp_path / "job").state == WorkerState.FINISHED

@@ -6,7 +6,9 @@ from pathlib import Path
 
 from stga_addon.worker.training_python import GPU_REQUIREMENT, REQUIREMENTS, package_name
 
-PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())[
+    "project"
+]
 
 
 def test_environment_and_project_require_the_same():

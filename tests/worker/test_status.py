@@ -1,4 +1,5 @@
-"""Workers and their status folder, without Blender: start, progress, cancel, failure, and workers that are killed."""
+"""Workers and their status folder, without Blender: start, progress, cancel, failure, and workers
+that are killed."""
 
 import errno
 import json
@@ -72,7 +73,9 @@ def start(tmp_path, monkeypatch):
     packages.mkdir()
     (packages / "counting.py").write_text(WORKER)
     path = os.pathsep.join([str(ROOT), str(packages)])
-    monkeypatch.setattr(launch, "worker_environment", lambda variables, python: {**variables, "PYTHONPATH": path})
+    monkeypatch.setattr(
+        launch, "worker_environment", lambda variables, python: {**variables, "PYTHONPATH": path}
+    )
     running: list[subprocess.Popen[bytes]] = []
 
     def run(action: str = "work") -> tuple[Path, "subprocess.Popen[bytes]"]:
@@ -115,24 +118,31 @@ def wait(condition: Callable[[], bool], seconds: float = 20.0) -> None:
     ],
 )
 def test_state_is_derived(state, alive, cancel_requested, started, expected):
-    """Catches a living worker reported as dead, or one that wrote its final status reported as alive."""
+    """Catches a living worker reported as dead, or one that wrote its final status reported as
+    alive."""
     status = None if state is None else WorkerStatus(state)
     assert derive_state(status, alive, cancel_requested, started) == expected
 
 
 def test_worker_is_cancelled(start):
-    """Catches figures that do not arrive, a cancel request that is ignored, and a second worker in the folder."""
+    """Catches figures that do not arrive, a cancel request that is ignored, and a second worker in
+    the folder."""
     folder, process = start()
     assert inspect_worker(folder, process).state.is_alive
     wait(lambda: inspect_worker(folder, process).state == WorkerState.WORKING)
-    wait(lambda: inspect_worker(folder).status.progress > 0)  # as a Blender sees it that did not start the worker
+    # as a Blender sees it that did not start the worker
+    wait(lambda: inspect_worker(folder).status.progress > 0)
     snapshot = inspect_worker(folder)
     assert snapshot.state == WorkerState.WORKING
     assert (snapshot.status.message, snapshot.status.detail) == ("counting", "on time")
     assert list(snapshot.status.figures) == ["n"]
     if os.name != "nt":
-        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(os.getpriority(os.PRIO_PROCESS, 0) + 5, 19)
-    with pytest.raises(StgaError, match=f"another worker is running here \\(process {process.pid}\\)"):
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(
+            os.getpriority(os.PRIO_PROCESS, 0) + 5, 19
+        )
+    with pytest.raises(
+        StgaError, match=f"another worker is running here \\(process {process.pid}\\)"
+    ):
         prepare_status_folder(folder)
     with pytest.raises(StgaError, match="another worker"):
         remove_status_folder(folder)
@@ -196,12 +206,17 @@ def test_exit_status_is_reported(start):
     """Catches a worker that ends before its first status and leaves an exit status alone."""
     folder, process = start("exit")
     process.wait(20)
-    assert inspect_worker(folder, process).status.error == "Worker exited with status 7: a line of the log"
+    assert (
+        inspect_worker(folder, process).status.error
+        == "Worker exited with status 7: a line of the log"
+    )
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell closes the descriptors")
 @pytest.mark.parametrize("action", ["done", "sentence"])
-@pytest.mark.parametrize("streams", [">&- 2>&-", "<&- >&- 2>&-", ">/dev/full 2>/dev/full", "| true"])
+@pytest.mark.parametrize(
+    "streams", [">&- 2>&-", "<&- >&- 2>&-", ">/dev/full 2>/dev/full", "| true"]
+)
 def test_final_status_without_output_streams(tmp_path, streams, action):
     """Catches a worker without a final status where its output is closed, full or a broken pipe."""
     script = WORKER.replace('print("a line of the log", flush=True)', "time.sleep(0.2)")
@@ -216,7 +231,8 @@ def test_final_status_without_output_streams(tmp_path, streams, action):
 
 
 def test_interpreter_that_does_not_exist(tmp_path):
-    """Catches a traceback for a mistyped path, and files of a person removed with the status folder."""
+    """Catches a traceback for a mistyped path, and files of a person removed with the status
+    folder."""
     folder = tmp_path / "job"
     for own in (True, False):
         prepare_status_folder(folder)
@@ -234,7 +250,8 @@ def test_interpreter_that_does_not_exist(tmp_path):
 
 
 def test_only_own_files_are_removed(tmp_path):
-    """Catches a folder removed with a person's files, and one that is not a folder taken for an error."""
+    """Catches a folder removed with a person's files, and one that is not a folder taken for an
+    error."""
     with status_writer(tmp_path / "job") as writer:
         writer.update(0.5, "working")
     (tmp_path / "job" / "notes.txt").write_text("mine")
@@ -296,7 +313,9 @@ def test_damaged_status_is_ignored(tmp_path, text):
 def test_status_round_trip(tmp_path, monkeypatch):
     """Catches a field that is lost between worker and panel."""
     figures, machine = {"psnr": 30.5}, platform.node()
-    expected = WorkerStatus(WorkerState.WORKING, 0.25, "training", "enough", "", "", figures, machine, 0.25)
+    expected = WorkerStatus(
+        WorkerState.WORKING, 0.25, "training", "enough", "", "", figures, machine, 0.25
+    )
     now = 100.0
     monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))
     with status_writer(tmp_path) as writer:
@@ -310,7 +329,9 @@ def test_status_round_trip(tmp_path, monkeypatch):
 def test_status_is_written_rarely(tmp_path, monkeypatch):
     """Catches a status written in every iteration, and a new message that is delayed."""
     written = []
-    monkeypatch.setattr(status, "write_json", lambda path, value, **options: written.append(value["message"]))
+    monkeypatch.setattr(
+        status, "write_json", lambda path, value, **options: written.append(value["message"])
+    )
     writer = StatusWriter(tmp_path)
     for message in ("a", "a", "b", "b"):
         writer.update(0, message)
@@ -318,7 +339,8 @@ def test_status_is_written_rarely(tmp_path, monkeypatch):
 
 
 def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
-    """Catches a worker that fails because its status cannot be written, and a cause that is not reported."""
+    """Catches a worker that fails because its status cannot be written, and a cause that is not
+    reported."""
 
     def full(path: Path, value: object, **options: object) -> None:
         raise StgaError(f"{path}: cannot be written ({os.strerror(errno.ENOSPC)})")
@@ -339,7 +361,10 @@ def test_folder_that_cannot_be_written(tmp_path):
     for use in (prepare_status_folder, request_cancel):
         with pytest.raises(StgaError, match=r"file.*cannot be written"):
             use(tmp_path / "file" / "status")
-    with pytest.raises(StgaError, match=r"cannot be written"), status_writer(tmp_path / "file" / "status"):
+    with (
+        pytest.raises(StgaError, match=r"cannot be written"),
+        status_writer(tmp_path / "file" / "status"),
+    ):
         pass
 
 
@@ -353,7 +378,8 @@ def test_one_worker_per_folder(tmp_path):
 
 
 def test_worker_environment():
-    """Catches a worker with Blender's own standard library, or one that writes into the extension's folder."""
+    """Catches a worker with Blender's own standard library, or one that writes into the extension's
+    folder."""
     variables = {"PATH": "/bin", "PYTHONHOME": "/blender/python", "PYTHONPATH": "/other"}
     made = worker_environment(variables, "/usr/bin/python3")
     assert made["PATH"] == "/bin"
@@ -363,7 +389,8 @@ def test_worker_environment():
 
 
 def test_bytecode_of_the_own_interpreter(monkeypatch, tmp_path):
-    """Catches a worker that compiles the packages of an extension at every start, or writes among their files.
+    """Catches a worker that compiles the packages of an extension at every start, or writes among
+    their files.
 
     Another interpreter has bytecode of its own packages, which it would not find with a prefix.
     """
@@ -386,16 +413,24 @@ def test_own_interpreter_finds_the_bundled_packages(monkeypatch):
 
 
 def test_own_interpreter_is_isolated(monkeypatch, tmp_path):
-    """Catches a worker of Blender's Python that imports from the user's site-packages or runs the user's settings."""
+    """Catches a worker of Blender's Python that imports from the user's site-packages or runs the
+    user's settings."""
     theirs = tmp_path / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
     theirs.mkdir(parents=True)
     (theirs / "strange_package.py").touch()
     variables = {**os.environ, "PYTHONUSERBASE": str(tmp_path), "PYTHONWARNINGS": "ignore"}
-    looking = "import importlib.util as u, sys; sys.exit(3 if u.find_spec('strange_package') else 0)"
+    looking = (
+        "import importlib.util as u, sys; sys.exit(3 if u.find_spec('strange_package') else 0)"
+    )
     variables["PYTHONPATH"] = str(theirs)
     for environment, code in ((variables, 3), (worker_environment(variables, sys.executable), 0)):
         command = [sys.executable, "-c", looking]
-        assert subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, check=False).returncode == code
+        assert (
+            subprocess.run(
+                command, env=environment, stdin=subprocess.DEVNULL, check=False
+            ).returncode
+            == code
+        )
     assert "PYTHONWARNINGS" in worker_environment(variables, "/usr/bin/python3")
 
 
@@ -416,7 +451,9 @@ def test_own_python(monkeypatch, tmp_path):
 
 def test_log_lines(tmp_path):
     """Catches progress bars, which use carriage returns, and a character that is cut in half."""
-    (tmp_path / LOG_FILE).write_bytes("ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n")
+    (tmp_path / LOG_FILE).write_bytes(
+        "ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n"
+    )
     assert log_lines(tmp_path, 2) == ["second", "third"]
     assert log_lines(tmp_path / "none", 2) == []
 

@@ -19,7 +19,8 @@ messages.flush()
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_only_messages_reach_standard_output(closed: bool) -> None:
-    """Catches output of libraries between the messages, and a closed standard error that ends the process."""
+    """Catches output of libraries between the messages, and a closed standard error that ends the
+    process."""
     done = subprocess.run([sys.executable, "-c", SCRIPT.format(closed=closed)], capture_output=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout == b"message"

@@ -22,32 +22,43 @@ IS_WINDOWS = os.name == "nt"
 
 
 class LocalEngine:
-    """Starts a worker process per job, as Blender's panel does; a worker outlives the batch's process.
+    """Starts a worker process per job, as Blender's panel does; a worker outlives the batch's
+    process.
 
-    cores, memory_gb   for all workers together; by default what this process may use, and what is free
+    cores, memory_gb   for all workers together; by default what this process may use, and what is
+                       free
     """
 
     takes_all = False
     interval_s = 0.1
 
-    def __init__(self, cores: int | None = None, memory_gb: float | None = None, python: str | None = None) -> None:
+    def __init__(
+        self, cores: int | None = None, memory_gb: float | None = None, python: str | None = None
+    ) -> None:
         self._cores = cores or processors()
         self._memory_gb = MEMORY_SHARE * free_memory_gb() if memory_gb is None else memory_gb
         self._python = python or training_python()
         self._jobs: dict[str, tuple[Job, subprocess.Popen[bytes] | None]] = {}
 
     def has_room(self, job: Job) -> bool:
-        """Whether it fits beside what is running; a job that is larger than the machine runs alone."""
+        """Whether it fits beside what is running; a job that is larger than the machine runs
+        alone."""
         if not self._jobs:
             return True
         wanted = [job.resources, *(other.resources for other, _ in self._jobs.values())]
         threads = sum(resources.threads or self._cores for resources in wanted)
         memory = sum(resources.memory_gb for resources in wanted)
-        return threads <= self._cores and memory <= self._memory_gb and sum(r.gpu for r in wanted) <= GPUS
+        return (
+            threads <= self._cores
+            and memory <= self._memory_gb
+            and sum(r.gpu for r in wanted) <= GPUS
+        )
 
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
-            arguments = worker_arguments(job.request_folder, job.resources.threads or None, resume=True)
+            arguments = worker_arguments(
+                job.request_folder, job.resources.threads or None, resume=True
+            )
             self._jobs[job.name] = job, start_worker(job.request_folder, self._python, arguments)
 
     def adopt(self, job: Job) -> None:
@@ -75,7 +86,8 @@ class LocalEngine:
 
 
 def _is_kill(code: int | None) -> bool:
-    """Whether an exit status, of a worker without a final status, is that of a kill; a mistake's is 2, a bug's 1."""
+    """Whether an exit status, of a worker without a final status, is that of a kill; a mistake's is
+    2, a bug's 1."""
     return not code or code < 0 or (IS_WINDOWS and code != 2)
 
 
@@ -85,4 +97,7 @@ def free_memory_gb() -> float:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
         return math.inf
-    return next((int(line.split()[1]) * 1024 / 1e9 for line in lines if line.startswith("MemAvailable:")), math.inf)
+    return next(
+        (int(line.split()[1]) * 1024 / 1e9 for line in lines if line.startswith("MemAvailable:")),
+        math.inf,
+    )

@@ -1,7 +1,8 @@
-"""Engine of a Ray cluster: one that runs already (its address), or one that is started on this machine.
+"""Engine of a Ray cluster: one that runs already (its address), or one that is started on this
+machine.
 
-A task runs `stga perform` on the job's folder, so that only the command and the exit code go through Ray's object
-store. https://docs.ray.io/en/latest/ray-core/tasks.html
+A task runs `stga perform` on the job's folder, so that only the command and the exit code go
+through Ray's object store. https://docs.ray.io/en/latest/ray-core/tasks.html
 """
 
 import logging
@@ -38,17 +39,26 @@ class RayEngine:
         Raises StgaError where Ray is not installed, or the cluster cannot be reached.
         """
         if find_spec("ray") is None:
-            raise StgaError("--engine ray: the package ray is not installed (it is the extra `ray` of stga-addon)")
-        if not address and TOKEN_MODE not in os.environ:  # other users of this machine cannot submit to it
+            raise StgaError(
+                "--engine ray: the package ray is not installed (it is the extra `ray` of stga-addon)"
+            )
+        # other users of this machine cannot submit to it
+        if not address and TOKEN_MODE not in os.environ:
             os.environ.update({TOKEN_MODE: "token", TOKEN: secrets.token_hex(32)})
         import ray  # reads the environment
 
         try:
             # "local": also where another cluster is running on this machine
-            own: dict[str, Any] = {} if address else {"num_cpus": processors(), "include_dashboard": False}
-            ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own)
+            own: dict[str, Any] = (
+                {} if address else {"num_cpus": processors(), "include_dashboard": False}
+            )
+            ray.init(
+                address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own
+            )
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-            raise StgaError(f"--address {address or 'local'}: Ray cannot be reached ({error})") from error
+            raise StgaError(
+                f"--address {address or 'local'}: Ray cannot be reached ({error})"
+            ) from error
         self._ray = ray
         self._task = ray.remote(max_retries=NODE_RETRIES)(_task(PYTHON_VARIABLE))
         self._adopted: dict[str, Job] = {}
@@ -60,7 +70,11 @@ class RayEngine:
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
             needs = job.resources
-            options = {"num_cpus": needs.threads or 1, "num_gpus": int(needs.gpu), "memory": needs.memory_gb * 1e9}
+            options = {
+                "num_cpus": needs.threads or 1,
+                "num_gpus": int(needs.gpu),
+                "memory": needs.memory_gb * 1e9,
+            }
             task = self._task.options(name=job.name, **options)
             log = str(job.request_folder / LOG_FILE)
             self._jobs[task.remote(job_command(job), str(PACKAGES_FOLDER), log)] = job
@@ -69,7 +83,8 @@ class RayEngine:
         self._adopted[job.name] = job
 
     def running(self) -> Mapping[str, str]:
-        """The jobs that have written a status: Ray does not tell cheaply which tasks wait for a machine."""
+        """The jobs that have written a status: Ray does not tell cheaply which tasks wait for a
+        machine."""
         jobs = [*self._jobs.values(), *self._adopted.values()]
         begun = [job for job in jobs if read_status(job.request_folder) is not None]
         return dict.fromkeys((job.name for job in begun), "")
@@ -95,13 +110,16 @@ class RayEngine:
     def _end(self, task: Any, job: Job) -> Ended:
         try:
             code = self._ray.get(task)
-        except self._ray.exceptions.RayError:  # its machine or Ray's worker has gone, more often than NODE_RETRIES
+        # its machine or Ray's worker has gone, more often than NODE_RETRIES
+        except self._ray.exceptions.RayError:
             code = -1
         return Ended(inspect_worker(job.request_folder), code < 0)
 
     def withdraw(self) -> Sequence[str]:
         """Take back the tasks that have not begun."""
-        waiting = [task for task, job in self._jobs.items() if read_status(job.request_folder) is None]
+        waiting = [
+            task for task, job in self._jobs.items() if read_status(job.request_folder) is None
+        ]
         for task in waiting:
             self._ray.cancel(task)
         return [self._jobs.pop(task).name for task in waiting]
@@ -111,12 +129,13 @@ class RayEngine:
 
 
 def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
-    """The function that Ray carries out. It is sent to the machine as it is, which need not have this package in the
-    Python that Ray runs in: it uses nothing from outside itself."""
+    """The function that Ray carries out. It is sent to the machine as it is, which need not have
+    this package in the Python that Ray runs in: it uses nothing from outside itself."""
 
     def run_command(command: list[str], packages: str, log: str) -> int:
-        """Run a command with its output in a log; returns its exit code. On Linux it ends with Ray's worker, so that
-        a node that Ray has given up does not go on beside the one that takes over."""
+        """Run a command with its output in a log; returns its exit code. On Linux it ends with
+        Ray's worker, so that a node that Ray has given up does not go on beside the one that takes
+        over."""
         import ctypes
         import os
         import signal
@@ -127,12 +146,19 @@ def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
 
         variables = {**os.environ, "PYTHONPATH": packages}
         command = [variables.get(python_variable) or command[0], *command[1:]]
-        for name in ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES"):  # Ray's own settings; the command has its --threads
+        # Ray's own settings; the command has its --threads
+        for name in ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES"):
             variables.pop(name, None)
-        end_with_this = None if prctl is None else lambda: prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+        # PR_SET_PDEATHSIG
+        end_with_this = None if prctl is None else lambda: prctl(1, signal.SIGKILL)
         with open(log, "ab") as out:
             return subprocess.call(
-                command, env=variables, stdin=subprocess.DEVNULL, stdout=out, stderr=out, preexec_fn=end_with_this
+                command,
+                env=variables,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+                preexec_fn=end_with_this,
             )
 
     return run_command

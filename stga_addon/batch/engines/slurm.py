@@ -1,8 +1,10 @@
-"""Engine of a SLURM cluster: an sbatch array of jobs of the same kind and needs, with dependencies between the arrays.
+"""Engine of a SLURM cluster: an sbatch array of jobs of the same kind and needs, with dependencies
+between the arrays.
 
-https://slurm.schedmd.com/sbatch.html. The jobs of a machine that dies are put back into the queue (--requeue), and
-continue from their checkpoints. Liveness is squeue's, state and figures are those of the jobs' folders. The batch's
-folder `slurm` has the scripts, and SUBMITTED: what the next start watches in the queue and does not submit again.
+https://slurm.schedmd.com/sbatch.html. The jobs of a machine that dies are put back into the queue
+(--requeue), and continue from their checkpoints. Liveness is squeue's, state and figures are those
+of the jobs' folders. The batch's folder `slurm` has the scripts, and SUBMITTED: what the next start
+watches in the queue and does not submit again.
 """
 
 import re
@@ -29,7 +31,8 @@ ON_MACHINE = ("RUNNING", "COMPLETING", "CONFIGURING", "STAGE_OUT")
 GRACE_S = 10.0
 """Seconds after its submission in which a job that squeue does not list yet is not gone."""
 MAX_SILENCE_S = 600.0
-"""How long squeue may fail, as while the controller is started anew, before the batch ends; its jobs go on."""
+"""How long squeue may fail, as while the controller is started anew, before the batch ends; its
+jobs go on."""
 FOLDER, SUBMITTED = "slurm", "submitted.json"
 
 
@@ -50,9 +53,13 @@ class SlurmEngine:
 
     def __init__(self) -> None:
         """Raises StgaError where SLURM's programs are missing."""
-        missing = next((name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None)
+        missing = next(
+            (name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None
+        )
         if missing is not None:
-            raise StgaError(f"--engine slurm: the program {missing} was not found; start it where SLURM is installed")
+            raise StgaError(
+                f"--engine slurm: the program {missing} was not found; start it where SLURM is installed"
+            )
         self._jobs: dict[str, _Submitted] = {}
         self._names: dict[str, str] | None = None
         self._states: dict[str, tuple[str, str]] | None = None
@@ -64,7 +71,8 @@ class SlurmEngine:
     def submit(self, jobs: Sequence[Job]) -> None:
         """Submit the jobs but those that are in the queue since an earlier start.
 
-        Raises StgaError with the words of sbatch where it refuses an array, and where squeue does not answer.
+        Raises StgaError with the words of sbatch where it refuses an array, and where squeue does
+        not answer.
         """
         names = {job.name: self._name(job) for job in jobs}
         if self._states is None and any(names.values()):
@@ -90,7 +98,9 @@ class SlurmEngine:
         script = jobs[0].folder.parent / FOLDER / f"{kind}-{time.time_ns()}.sh"
         with replacing(script) as partial:
             partial.write_text(_script(jobs), encoding="utf-8")
-        names = {self._jobs[other].name for job in jobs for other in job.after if other in self._jobs}
+        names = {
+            self._jobs[other].name for job in jobs for other in job.after if other in self._jobs
+        }
         waits = sorted({_array(name) for name in names if name})
         command = [
             "sbatch", "--parsable", "--requeue", f"--job-name=stga-{kind}", f"--array=0-{len(jobs) - 1}",
@@ -102,18 +112,24 @@ class SlurmEngine:
         array = _call(command).strip().partition(";")[0]
         for index, job in enumerate(jobs):
             self._jobs[job.name] = _Submitted(job, f"{array}_{index}", time.monotonic())
-        self._names = {**(self._names or {}), **{job.name: self._jobs[job.name].name for job in jobs}}
+        self._names = {
+            **(self._names or {}),
+            **{job.name: self._jobs[job.name].name for job in jobs},
+        }
         write_json(script.with_name(SUBMITTED), self._names)
 
     def adopt(self, job: Job) -> None:
         self._jobs[job.name] = _Submitted(job, self._name(job), time.monotonic())
 
     def running(self) -> Mapping[str, str]:
-        found = {name: (self._states or {}).get(one.name, ("", "")) for name, one in self._jobs.items()}
+        found = {
+            name: (self._states or {}).get(one.name, ("", "")) for name, one in self._jobs.items()
+        }
         return {name: machine for name, (state, machine) in found.items() if state in ON_MACHINE}
 
     def _ask(self) -> bool:
-        """Ask what is in the queue; False where squeue does not answer. Raises StgaError after MAX_SILENCE_S."""
+        """Ask what is in the queue; False where squeue does not answer. Raises StgaError after
+        MAX_SILENCE_S."""
         try:
             self._states = _queue()
         except StgaError:
@@ -132,7 +148,9 @@ class SlurmEngine:
                 continue
             snapshot = inspect_worker(one.job.request_folder)
             is_new = one.name and time.monotonic() - one.since < GRACE_S
-            if snapshot.state.is_alive or (is_new and snapshot.state in (WorkerState.NONE, WorkerState.LOST)):
+            if snapshot.state.is_alive or (
+                is_new and snapshot.state in (WorkerState.NONE, WorkerState.LOST)
+            ):
                 continue
             del self._jobs[name]
             found[name] = Ended(snapshot, is_lost=True)
@@ -142,9 +160,19 @@ class SlurmEngine:
         """Take back the jobs that wait in the queue."""
         self._ask()
         states = self._states or {}
-        waiting = [name for name, one in self._jobs.items() if states.get(one.name, ("", ""))[0] == "PENDING"]
+        waiting = [
+            name
+            for name, one in self._jobs.items()
+            if states.get(one.name, ("", ""))[0] == "PENDING"
+        ]
         if waiting:
-            _call(["scancel", "--state=PENDING", *sorted({_array(self._jobs[name].name) for name in waiting})])
+            _call(
+                [
+                    "scancel",
+                    "--state=PENDING",
+                    *sorted({_array(self._jobs[name].name) for name in waiting}),
+                ]
+            )
         for name in waiting:
             del self._jobs[name]
         return waiting
@@ -159,8 +187,9 @@ def _array(name: str) -> str:
 
 
 def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
-    """The jobs, which follow those that they come after, in arrays of the same kind and needs, in an order in which no
-    array waits for a later one: jobs of an array are as many steps from the first."""
+    """The jobs, which follow those that they come after, in arrays of the same kind and needs, in
+    an order in which no array waits for a later one: jobs of an array are as many steps from the
+    first."""
     step: dict[str, int] = {}
     arrays: dict[tuple[int, str, Resources, int], list[Job]] = {}
     for job in jobs:
@@ -173,7 +202,8 @@ def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
 
 
 def _script(jobs: Sequence[Job]) -> str:
-    """What each job of an array runs: the command of its index, with its output in the job's own log."""
+    """What each job of an array runs: the command of its index, with its output in the job's own
+    log."""
     packages = shlex.quote(str(PACKAGES_FOLDER))
     lines = ["#!/bin/sh", "# A batch of stga; each job continues what it began before."]
     lines += [f"export PYTHONPATH={packages}", "case $SLURM_ARRAY_TASK_ID in"]
@@ -185,7 +215,9 @@ def _script(jobs: Sequence[Job]) -> str:
 
 def _queue() -> dict[str, tuple[str, str]]:
     """Job in SLURM -> state and machine, of this user's jobs."""
-    lines = _call(["squeue", "--me", "--noheader", "--array", f"--format={QUEUE_FORMAT}"]).splitlines()
+    lines = _call(
+        ["squeue", "--me", "--noheader", "--array", f"--format={QUEUE_FORMAT}"]
+    ).splitlines()
     rows = [line.split("|") for line in lines if line.count("|") == 2]
     return {job: (state, machine) for job, state, machine in rows if re.fullmatch(r"\d+_\d+", job)}
 

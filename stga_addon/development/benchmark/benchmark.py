@@ -1,4 +1,5 @@
-"""Benchmark of variants trained for the same wall time, as a plan of a batch, and its report, table and chart."""
+"""Benchmark of variants trained for the same wall time, as a plan of a batch, and its report, table
+and chart."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -55,31 +56,40 @@ Unfitted: without fitted exposure."""
 
 
 def benchmark_jobs(name: str, request: Benchmark, seeds: int) -> dict[str, Any]:
-    """Jobs of a plan that carry out a benchmark: a slice for each seed, called NAME-seed0 and so on.
+    """Jobs of a plan that carry out a benchmark: a slice for each seed, called NAME-seed0 and so
+    on.
 
-    request: its folder counts for nothing, and its seed. Raises StgaError for unknown variants, and too many seeds.
+    request: its folder counts for nothing, and its seed. Raises StgaError for unknown variants, and
+    too many seeds.
     """
     if seeds > MAX_SEEDS:
         raise StgaError(f"--seeds {seeds}: expected up to {MAX_SEEDS}")
     count = len(variants_of(request))
-    given = {key: value for key, value in to_json(request).items() if key not in ("out", "seed", "flame")}
+    given = {
+        key: value for key, value in to_json(request).items() if key not in ("out", "seed", "flame")
+    }
     if request.flame is not None:
         given["flame"] = str(request.flame)
     needs = {"minutes": count * request.seconds / 60, "resources": {"memory_gb": MEMORY_GB * count}}
-    return {f"{name}-seed{seed}": {"request": "benchmark", **given, "seed": seed, **needs} for seed in range(seeds)}
+    return {
+        f"{name}-seed{seed}": {"request": "benchmark", **given, "seed": seed, **needs}
+        for seed in range(seeds)
+    }
 
 
 def slices_of(plan: Plan, name: str) -> list[Benchmark]:
     """The slices of a benchmark of the plan, by seed."""
     found = [
-        job.request for job in plan.jobs if isinstance(job.request, Benchmark) and job.name.startswith(f"{name}-seed")
+        job.request
+        for job in plan.jobs
+        if isinstance(job.request, Benchmark) and job.name.startswith(f"{name}-seed")
     ]
     return sorted(found, key=lambda request: request.seed)
 
 
 def write_report(slices: Sequence[Benchmark], out: Path) -> str:
-    """Write report.txt, benchmark.json, benchmark.csv and benchmark.png of what is finished so far into a folder;
-    returns the report."""
+    """Write report.txt, benchmark.json, benchmark.csv and benchmark.png of what is finished so far
+    into a folder; returns the report."""
     first, names = slices[0], list(variants_of(slices[0]))
     found = [outcome_of(name, one.seed, one.out / name) for name in names for one in slices]
     outcomes = [outcome for outcome in found if outcome is not None]
@@ -90,7 +100,9 @@ def write_report(slices: Sequence[Benchmark], out: Path) -> str:
     write_json(out / "benchmark.json", _as_json(outcomes, first.seconds))
     _write_csv(out / "benchmark.csv", outcomes)
     if curves:
-        fitted = any("psnr_unmatched" in figures for one in outcomes for figures in one.quality.values())
+        fitted = any(
+            "psnr_unmatched" in figures for one in outcomes for figures in one.quality.values()
+        )
         views = "held-out views, exposure not fitted" if fitted else "held-out views"
         title = f"{first.capture.name}: PSNR on {views}, {len(slices)} seeds; bold: Pareto front"
         with replacing(out / "benchmark.png") as partial:
@@ -98,7 +110,9 @@ def write_report(slices: Sequence[Benchmark], out: Path) -> str:
     return report
 
 
-def report_text(outcomes: Sequence[Outcome], curves: Mapping[str, MeanCurve], seconds: float, capture: Path) -> str:
+def report_text(
+    outcomes: Sequence[Outcome], curves: Mapping[str, MeanCurve], seconds: float, capture: Path
+) -> str:
     """Table and conclusions, as Markdown."""
     table = summarize(outcomes)
     runs = [outcome for outcome in outcomes if outcome.quality]
@@ -113,14 +127,25 @@ def report_text(outcomes: Sequence[Outcome], curves: Mapping[str, MeanCurve], se
         "",
         *_comparisons(table),
     ]
-    spans = [f"{name} {format_duration(start)}–{format_duration(end)}" for name, start, end in pareto_front(curves)]
+    spans = [
+        f"{name} {format_duration(start)}–{format_duration(end)}"
+        for name, start, end in pareto_front(curves)
+    ]
     hit, checked = count_forecasts(runs)
     if any("val_psnr_unmatched" in row for row in table.values()):
-        lines.append("The exposure of held-out cameras is fitted for all variants, but not in columns called unfitted.")
+        lines.append(
+            "The exposure of held-out cameras is fitted for all variants, but not in columns called unfitted."
+        )
     lines += [f"Pareto front of PSNR over time: {', '.join(spans)}."] if spans else []
-    lines += [f"Forecasts correct within their error: {hit} of {checked} ({hit / checked:.0%})."] if checked else []
+    lines += (
+        [f"Forecasts correct within their error: {hit} of {checked} ({hit / checked:.0%})."]
+        if checked
+        else []
+    )
     share = float(np.mean([evaluation_share(outcome.lines) for outcome in runs]))
-    lines.append(f"Evaluation while training took {share:.1%} of the training time, which excludes it.")
+    lines.append(
+        f"Evaluation while training took {share:.1%} of the training time, which excludes it."
+    )
     return "\n".join(lines)
 
 
@@ -134,12 +159,15 @@ def table_lines(table: Mapping[str, Mapping[str, Spread]]) -> list[str]:
     for variant, row in table.items():
         cells = [variant, *(_cell(row.get(name), COLUMNS[name][1]) for name in shown)]
         if reference is not None:
-            cells.append(f"{row['val_psnr'].mean - reference.mean:+.2f}" if "val_psnr" in row else "")
+            cells.append(
+                f"{row['val_psnr'].mean - reference.mean:+.2f}" if "val_psnr" in row else ""
+            )
         rows.append(cells)
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     rows.insert(1, ["-" * width for width in widths])
     return [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
+        for row in rows
     ]
 
 
@@ -153,7 +181,8 @@ def _cell(value: Spread | None, decimals: int) -> str:
 def _comparisons(table: Mapping[str, Mapping[str, Spread]]) -> list[str]:
     """Neighbors in the ranking by held-out PSNR that differ by no more than their spread."""
     ranked = sorted(
-        ((row["val_psnr"], name) for name, row in table.items() if "val_psnr" in row), key=lambda pair: -pair[0].mean
+        ((row["val_psnr"], name) for name, row in table.items() if "val_psnr" in row),
+        key=lambda pair: -pair[0].mean,
     )
     if any(value.count < 2 for value, _ in ranked):
         return ["One seed gives no spread: differences below about 0.3 dB are not significant."]
@@ -182,7 +211,11 @@ def _as_json(outcomes: Iterable[Outcome], seconds: float) -> dict[str, object]:
 def _write_csv(path: Path, outcomes: Sequence[Outcome]) -> None:
     """One row per evaluation, with all values of its metrics line."""
     rows = [
-        {"variant": outcome.variant, "seed": outcome.seed, **{k: v for k, v in line.items() if k != "forecast"}}
+        {
+            "variant": outcome.variant,
+            "seed": outcome.seed,
+            **{k: v for k, v in line.items() if k != "forecast"},
+        }
         for outcome in outcomes
         for line in outcome.lines
     ]

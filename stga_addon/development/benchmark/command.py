@@ -1,5 +1,5 @@
-"""The command `benchmark`. Each seed is a job of a batch (docs/batch.md): one after another on this machine, at once on
-several."""
+"""The command `benchmark`. Each seed is a job of a batch (docs/batch.md): one after another on this
+machine, at once on several."""
 
 from argparse import Namespace
 from dataclasses import dataclass
@@ -24,7 +24,9 @@ class BenchmarkOptions:
     capture: Path = like(Train, "capture")
     flame: Path | None = like(Train, "flame")
     principal_point: str = like(Train, "principal_point")
-    seconds: float = option("of each run (default 3m)", 180.0, flag="--budget", metavar="TIME", parse=duration)
+    seconds: float = option(
+        "of each run (default 3m)", 180.0, flag="--budget", metavar="TIME", parse=duration
+    )
     seeds: int = option("runs of each variant", 3, 1)
     knobs: bool = like(Benchmark, "knobs")
     only: tuple[str, ...] = option("one of the variants; may be repeated", (), metavar="VARIANT")

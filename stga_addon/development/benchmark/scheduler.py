@@ -52,15 +52,20 @@ class BenchmarkRun:
         run, asked = read_run(self.out), self.request
         before = run.capture, run.flame, run.principal_point, without_choices(run.settings)
         if before != (asked.capture, asked.flame, asked.principal_point, asked.settings):
-            raise StgaError(f"{self.out}: holds a run with other settings; choose another --out, or delete it")
+            raise StgaError(
+                f"{self.out}: holds a run with other settings; choose another --out, or delete it"
+            )
 
 
-def train_in_turns(runs: Sequence[BenchmarkRun], say: Say, report: Report = ignore) -> dict[str, str]:
+def train_in_turns(
+    runs: Sequence[BenchmarkRun], say: Say, report: Report = ignore
+) -> dict[str, str]:
     """Train all runs, `TURN_S` at a time, in a random order that changes with every round.
 
-    Each run has a process, of which one trains at a time. Finished runs are skipped and interrupted ones resumed, so
-    the same call continues where the last one ended. Returns name -> error of the runs that failed, which does not
-    stop the others. Raises Cancelled where the report stops it; then, and on KeyboardInterrupt, every run is saved.
+    Each run has a process, of which one trains at a time. Finished runs are skipped and interrupted
+    ones resumed, so the same call continues where the last one ended. Returns name -> error of the
+    runs that failed, which does not stop the others. Raises Cancelled where the report stops it;
+    then, and on KeyboardInterrupt, every run is saved.
     """
     workers = [_Worker(run) for run in runs if not run.finished]
     try:
@@ -68,7 +73,9 @@ def train_in_turns(runs: Sequence[BenchmarkRun], say: Say, report: Report = igno
             say(f"Starting {worker.name}")
             report(Progress(stage="Starting", detail=worker.name))
             worker.start()
-        rounds = max((math.ceil((run.request.settings.seconds or 0) / TURN_S) for run in runs), default=1)
+        rounds = max(
+            (math.ceil((run.request.settings.seconds or 0) / TURN_S) for run in runs), default=1
+        )
         rng = random.Random(0)
         for turn in range(1, rounds + 1):
             say(f"Training, turn {turn} of {rounds}")
@@ -149,6 +156,7 @@ class _Worker:
         reply = json.loads(line) if line else {"error": f"Worker exited unexpectedly. Log: {log}"}
         self._ready = "share" in reply
         self.error = reply.get("error", "")
-        if not self._ready:  # it ends: left unawaited, it would stay a process until the last run is trained
+        # it ends: left unawaited, it would stay a process until the last run is trained
+        if not self._ready:
             self.stop()
             self.wait()

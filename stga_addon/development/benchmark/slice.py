@@ -16,8 +16,8 @@ from .variants import settings_of, variants_of, without_choices
 def train_slice(request: Benchmark, report: Report, say: Say) -> Written:
     """Train and measure the runs that are not finished.
 
-    Raises Cancelled when the report stops it and the runs are saved, and StgaError where a run has failed; then the
-    others are finished.
+    Raises Cancelled when the report stops it and the runs are saved, and StgaError where a run has
+    failed; then the others are finished.
     """
     report(Progress(stage="Deciding effects"))
     runs = runs_of(request)
@@ -30,18 +30,26 @@ def train_slice(request: Benchmark, report: Report, say: Say) -> Written:
 
 
 def runs_of(request: Benchmark) -> list[BenchmarkRun]:
-    """A run of each variant; a variant with the settings of an earlier one is left out. Effects are decided as for
-    every other seed."""
+    """A run of each variant; a variant with the settings of an earlier one is left out. Effects are
+    decided as for every other seed."""
     decided: dict[str, TrainingSettings] = {}
     for name, changes in variants_of(request).items():
-        undecided = _training(request, request.out / "undecided" / name, settings_of(changes, request.seconds))
+        undecided = _training(
+            request, request.out / "undecided" / name, settings_of(changes, request.seconds)
+        )
         settings = without_choices(prepare(undecided, ignore, lambda line: None).run.settings)
         if not any(replace(settings, preset=other.preset) == other for other in decided.values()):
             decided[name] = settings
-    fits = any(settings.exposure for settings in decided.values())  # for all variants or none, so that they compare
+    # for all variants or none, so that they compare
+    fits = any(settings.exposure for settings in decided.values())
     seeded = {name: replace(settings, seed=request.seed) for name, settings in decided.items()}
-    return [BenchmarkRun(_training(request, request.out / name, settings), fits) for name, settings in seeded.items()]
+    return [
+        BenchmarkRun(_training(request, request.out / name, settings), fits)
+        for name, settings in seeded.items()
+    ]
 
 
 def _training(request: Benchmark, run: Path, settings: TrainingSettings) -> Train:
-    return Train(run, request.capture, settings, request.flame, request.principal_point, device="cpu")
+    return Train(
+        run, request.capture, settings, request.flame, request.principal_point, device="cpu"
+    )

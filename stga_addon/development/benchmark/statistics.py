@@ -76,7 +76,11 @@ def summarize(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Spread]]:
     """variant -> column -> mean and spread, over its finished runs."""
     table: dict[str, dict[str, Spread]] = {}
     for variant in dict.fromkeys(outcome.variant for outcome in outcomes):
-        rows = [outcome.figures() for outcome in outcomes if outcome.variant == variant and outcome.quality]
+        rows = [
+            outcome.figures()
+            for outcome in outcomes
+            if outcome.variant == variant and outcome.quality
+        ]
         columns = [name for name in (rows[0] if rows else {}) if all(name in row for row in rows)]
         if rows:
             table[variant] = {name: spread_of([row[name] for row in rows]) for name in columns}
@@ -85,7 +89,11 @@ def summarize(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Spread]]:
 
 def spread_of(values: Sequence[float]) -> Spread:
     several = len(values) > 1
-    return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if several else float("nan"), len(values))
+    return Spread(
+        float(np.mean(values)),
+        float(np.std(values, ddof=1)) if several else float("nan"),
+        len(values),
+    )
 
 
 def within_spread(a: Spread, b: Spread) -> bool:
@@ -97,11 +105,15 @@ def mean_curves(outcomes: Sequence[Outcome]) -> dict[str, MeanCurve]:
     """variant -> its curve over the time that all of its runs cover."""
     curves = {}
     for variant in dict.fromkeys(outcome.variant for outcome in outcomes):
-        runs = [_unfitted_curve(outcome.lines) for outcome in outcomes if outcome.variant == variant]
+        runs = [
+            _unfitted_curve(outcome.lines) for outcome in outcomes if outcome.variant == variant
+        ]
         runs = [run for run in runs if len(run) > 1]
         if not runs:
             continue
-        seconds = np.linspace(max(run[0][0] for run in runs), min(run[-1][0] for run in runs), CURVE_POINTS)
+        seconds = np.linspace(
+            max(run[0][0] for run in runs), min(run[-1][0] for run in runs), CURVE_POINTS
+        )
         values = np.array([np.interp(seconds, *np.array(run).T) for run in runs])
         curves[variant] = MeanCurve(seconds, values.mean(0), values.min(0), values.max(0))
     return curves
@@ -109,15 +121,28 @@ def mean_curves(outcomes: Sequence[Outcome]) -> dict[str, MeanCurve]:
 
 def _unfitted_curve(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
     """`curve_of` PSNR without fitted exposure."""
-    return curve_of([{**line, "psnr": line.get(UNMATCHED, line["psnr"])} if "psnr" in line else line for line in lines])
+    return curve_of(
+        [
+            {**line, "psnr": line.get(UNMATCHED, line["psnr"])} if "psnr" in line else line
+            for line in lines
+        ]
+    )
 
 
 def pareto_front(curves: Mapping[str, MeanCurve]) -> list[tuple[str, float, float]]:
-    """(variant, from, to) in seconds: the variant with the highest PSNR, while that exceeds every earlier PSNR."""
+    """(variant, from, to) in seconds: the variant with the highest PSNR, while that exceeds every
+    earlier PSNR."""
     if not curves:
         return []
-    seconds = np.linspace(min(c.seconds[0] for c in curves.values()), max(c.seconds[-1] for c in curves.values()), 400)
-    heights = np.array([np.interp(seconds, c.seconds, c.mean, left=-np.inf, right=-np.inf) for c in curves.values()])
+    seconds = np.linspace(
+        min(c.seconds[0] for c in curves.values()), max(c.seconds[-1] for c in curves.values()), 400
+    )
+    heights = np.array(
+        [
+            np.interp(seconds, c.seconds, c.mean, left=-np.inf, right=-np.inf)
+            for c in curves.values()
+        ]
+    )
     best, names = heights.argmax(0), list(curves)
     spans: list[tuple[str, float, float]] = []
     for second, winner, is_higher in zip(
@@ -133,7 +158,8 @@ def pareto_front(curves: Mapping[str, MeanCurve]) -> list[tuple[str, float, floa
 
 
 def count_forecasts(outcomes: Sequence[Outcome]) -> tuple[int, int]:
-    """Forecasts of all runs that were correct within their error, and those that could be checked."""
+    """Forecasts of all runs that were correct within their error, and those that could be
+    checked."""
     pairs = [checked_forecasts(outcome.lines) for outcome in outcomes]
     return sum(hit for hit, _ in pairs), sum(count for _, count in pairs)
 

@@ -46,8 +46,8 @@ SETTING_VARIANTS: dict[str, Changes] = {
 
 
 def settings_of(changes: Changes, seconds: float) -> TrainingSettings:
-    """Settings as `stga train` makes them: effects are decided from the capture, except for the paper settings and
-    GaussianAvatars, which fix them."""
+    """Settings as `stga train` makes them: effects are decided from the capture, except for the
+    paper settings and GaussianAvatars, which fix them."""
     fixed = changes.get("schedule") == "paper" or changes.get("strategy") == "gaussian-avatars"
     return make_settings(**{"seconds": seconds, "effects": None if fixed else {}, **changes})
 
@@ -59,11 +59,14 @@ def without_choices(settings: TrainingSettings) -> TrainingSettings:
 
 def variants_of(request: Benchmark) -> dict[str, Changes]:
     """The variants that are compared. Raises StgaError for unknown names."""
-    return select_variants(SETTING_VARIANTS if request.knobs else MAIN_VARIANTS, list(request.only) or None)
+    return select_variants(
+        SETTING_VARIANTS if request.knobs else MAIN_VARIANTS, list(request.only) or None
+    )
 
 
 def select_variants(variants: dict[str, Changes], only: list[str] | None) -> dict[str, Changes]:
-    """The variants named in `only`, in the order of the table; all without it. Raises StgaError for unknown names."""
+    """The variants named in `only`, in the order of the table; all without it. Raises StgaError for
+    unknown names."""
     unknown = sorted(set(only or ()) - set(variants))
     if unknown:
         raise StgaError(f"--only: '{unknown[0]}' is not one of {', '.join(variants)}")

@@ -2,9 +2,10 @@
 
     python -m stga_addon.development.benchmark.worker FOLDER --threads=N [--fit-exposure]
 
-Trains as the request in FOLDER asks (`jobs.folder`), or resumes the run in FOLDER. Each line on stdin is a share
-of the budget to train up to; the end of stdin means save and end. Each line, and the start, is answered by a line of
-JSON on stdout: {"share": …, "iteration": …} when ready for the next, {"done": …} at the end, or {"error": …}.
+Trains as the request in FOLDER asks (`jobs.folder`), or resumes the run in FOLDER. Each line on
+stdin is a share of the budget to train up to; the end of stdin means save and end. Each line, and
+the start, is answered by a line of JSON on stdout: {"share": …, "iteration": …} when ready for the
+next, {"done": …} at the end, or {"error": …}.
 """
 
 import json
@@ -29,7 +30,8 @@ WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
 FIT_EXPOSURE, THREADS = "--fit-exposure", "--threads"
 QUALITY = "quality.json"
-"""Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the file exists."""
+"""Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the
+file exists."""
 
 
 class Turns:
@@ -62,7 +64,8 @@ class Turns:
 
 
 def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool = False) -> None:
-    """Train the folder's run in turns and measure its avatar, with fitted exposure of cameras that were not trained."""
+    """Train the folder's run in turns and measure its avatar, with fitted exposure of cameras that
+    were not trained."""
     from ...avatar.file import read_avatar
     from ...jobs.train import prepare
     from ...training.evaluate.metrics import evaluate_avatar
@@ -71,7 +74,11 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
 
     turns = Turns(requests, replies)
     try:
-        request = Resume(folder, device="cpu") if has_run(folder) else read_request(request_folder(folder))
+        request = (
+            Resume(folder, device="cpu")
+            if has_run(folder)
+            else read_request(request_folder(folder))
+        )
         assert isinstance(request, Train | Resume)
         prepared = prepare(request, ignore, partial(print, file=sys.stderr))
         capture = prepared.capture
@@ -80,7 +87,10 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
         if not turns.stopped:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
             trained = with_refined_tracking(capture, folder)
-            found = {split: evaluate_avatar(avatar, trained, split, True, fits_exposure) for split in splits}
+            found = {
+                split: evaluate_avatar(avatar, trained, split, True, fits_exposure)
+                for split in splits
+            }
             quality = {split: figures.as_json() for split, figures in found.items()}
             write_json(folder / QUALITY, quality)
         turns.reply({"done": not turns.stopped})
@@ -92,4 +102,9 @@ if __name__ == "__main__":
     from ...raster.cpu.threads import set_threads
 
     set_threads(next(int(text.partition("=")[2]) for text in sys.argv if text.startswith(THREADS)))
-    work(Path(sys.argv[1]), sys.stdin, TextIOWrapper(claim_stdout(), encoding="utf-8"), FIT_EXPOSURE in sys.argv)
+    work(
+        Path(sys.argv[1]),
+        sys.stdin,
+        TextIOWrapper(claim_stdout(), encoding="utf-8"),
+        FIT_EXPOSURE in sys.argv,
+    )

@@ -12,7 +12,8 @@ CAPTURE = Path(__file__).with_name("head_capture.zip")
 
 
 def unpack_capture(folder: Path) -> None:
-    """Write the demo's capture, with its head model, into `folder`. Raises StgaError where it cannot be written."""
+    """Write the demo's capture, with its head model, into `folder`. Raises StgaError where it
+    cannot be written."""
     try:
         with ZipFile(CAPTURE) as archive:
             archive.extractall(folder)

@@ -10,7 +10,8 @@ from ...options import given_options, like, option
 from ...training.settings import TrainingSettings
 
 SECONDS = 12.0
-"""Of a training; with it, the demo takes less than a minute on two cores that have compiled nothing yet."""
+"""Of a training; with it, the demo takes less than a minute on two cores that have compiled nothing
+yet."""
 
 
 @dataclass(frozen=True)
@@ -38,4 +39,8 @@ def run(options: Namespace, head: object) -> None:
         avatar_from_footage(given.out, seconds, given.device)
 
 
-COMMAND = Command("Train an avatar on a capture of a generated person and show it in Blender.", run, (DemoOptions,))
+COMMAND = Command(
+    "Train an avatar on a capture of a generated person and show it in Blender.",
+    run,
+    (DemoOptions,),
+)

@@ -1,8 +1,9 @@
-"""Makes the demo's capture, `head_capture.zip`: a person of the bundled head model, path-traced by Cycles.
+"""Makes the demo's capture, `head_capture.zip`: a person of the bundled head model, path-traced by
+Cycles.
 
-python -m stga_addon.development.demo.make_capture ict_facekit.npz, which `bundled_head.py` describes.
-Needs Blender's bpy. The pictures show more than the bundled head has: twice as many vertices,
-hair, lashes, pores.
+python -m stga_addon.development.demo.make_capture ict_facekit.npz, which `bundled_head.py`
+describes. Needs Blender's bpy. The pictures show more than the bundled head has: twice as many
+vertices, hair, lashes, pores.
 """
 
 import sys
@@ -68,7 +69,11 @@ TRAIN_ACTS = (
     ),
 )  # fmt: skip
 TEST_ACTS = (
-    Act({"mouthSmile": 0.8, "jawOpen": 0.3, "browOuterUp": 0.5, "cheekSquint": 0.4}, turn=(-4, -1), gaze=(6, 0)),
+    Act(
+        {"mouthSmile": 0.8, "jawOpen": 0.3, "browOuterUp": 0.5, "cheekSquint": 0.4},
+        turn=(-4, -1),
+        gaze=(6, 0),
+    ),
     Act({"mouthFunnel": 0.6, "jawOpen": 0.15, "browInnerUp": 0.6, "mouthSmile": 0}, neck=(5, 0)),
 )
 
@@ -81,7 +86,9 @@ def main(source: Path) -> None:
         with replacing(CAPTURE) as partial, ZipFile(partial, "w", ZIP_DEFLATED) as archive:
             for file in sorted(path for path in folder.rglob("*") if path.is_file()):
                 # Of no date: equal files give an equal zip.
-                archive.writestr(ZipInfo(file.relative_to(folder).as_posix()), file.read_bytes(), ZIP_DEFLATED)
+                archive.writestr(
+                    ZipInfo(file.relative_to(folder).as_posix()), file.read_bytes(), ZIP_DEFLATED
+                )
 
 
 def write_capture(out: Path, source: Path) -> None:
@@ -96,7 +103,11 @@ def write_capture(out: Path, source: Path) -> None:
             studio.pose(flame_forward(person.model, person.shape, frame))
             for number, image in enumerate(studio.pictures(cameras)):
                 with replacing(out / _name(timestep, number)) as partial:
-                    options = {"quality": WEBP_QUALITY, "alpha_quality": WEBP_ALPHA_QUALITY, "method": 6}
+                    options = {
+                        "quality": WEBP_QUALITY,
+                        "alpha_quality": WEBP_ALPHA_QUALITY,
+                        "method": 6,
+                    }
                     image.save(partial, format="WEBP", **options)
                 bar.update()
     _write_transforms(out, cameras)
@@ -105,7 +116,11 @@ def write_capture(out: Path, source: Path) -> None:
 def frame_of_act(act: Act, names: tuple[str, ...]) -> FlameFrame:
     """The bundled head's parameters of an act; a weight without side is of both."""
     weights = RELAXED | act.weights
-    sided = {f"{name}{side}": weight for name, weight in weights.items() for side in ("", "Left", "Right")}
+    sided = {
+        f"{name}{side}": weight
+        for name, weight in weights.items()
+        for side in ("", "Left", "Right")
+    }
     expr = np.array([sided.get(name, 0.0) for name in names])
     yaw, pitch, inwards = np.radians([*act.gaze, CONVERGENCE_DEG])
 
@@ -130,7 +145,9 @@ def rig() -> list[Camera]:
         elevation = np.radians(ELEVATIONS_DEG[number % len(ELEVATIONS_DEG)])
         level = np.cos(elevation)
         ahead = np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
-        cameras.append(look_at((AIM_M + DISTANCE_M * ahead).tolist(), AIM_M, WIDTH, HEIGHT, FOCAL * WIDTH))
+        cameras.append(
+            look_at((AIM_M + DISTANCE_M * ahead).tolist(), AIM_M, WIDTH, HEIGHT, FOCAL * WIDTH)
+        )
     return cameras
 
 

@@ -1,4 +1,5 @@
-"""The person of the demo's capture: ICT-FaceKit's whole head with an identity, painted, and hair."""
+"""The person of the demo's capture: ICT-FaceKit's whole head with an identity, painted, and
+hair."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -44,7 +45,8 @@ PARTS = (
 )
 LIP_LINE_CM, LIP_HALF_WIDTH_CM, UPPER_LIP_CM, LOWER_LIP_CM = -3.35, 2.35, 0.98, 1.28
 NECKLINE_CM, NECKLINE_SLOPE = -10.6, 0.30
-"""Height above which there is no cloth, on the axis of the head, and by how much it falls to the front."""
+"""Height above which there is no cloth, on the axis of the head, and by how much it falls to the
+front."""
 HEAD_AXIS_Z_CM = -1.0
 HAIRLINE = (
     (0, 35, 55, 68, 78, 88, 97, 106, 115, 130, 150, 180),
@@ -111,7 +113,9 @@ def make_person(arrays: Mapping[str, np.ndarray]) -> Person:
     """The demo's person, of the ICT-FaceKit arrays that `bundled_head.py` takes."""
     model = whole_head(arrays)
     shape = np.zeros(model.n_identity)
-    shape[:IDENTITIES] = np.random.default_rng(IDENTITY_SEED).normal(0, IDENTITY_DEVIATION, IDENTITIES)
+    shape[:IDENTITIES] = np.random.default_rng(IDENTITY_SEED).normal(
+        0, IDENTITY_DEVIATION, IDENTITIES
+    )
     shape[EYES_IDENTITY] = EYES
     neutral = flame_forward(model, shape, neutral_frame(model))
     paint = _Paint(model)
@@ -138,7 +142,9 @@ def whole_head(arrays: Mapping[str, np.ndarray]) -> FlameModel:
     bundled = flame_model(None)
     neutral = arrays["neutral"].astype(np.float64)
     names, expression = arkit_displacements(arrays)
-    displacements = np.concatenate([arrays["identity"][: bundled.n_identity].astype(np.float64), expression])
+    displacements = np.concatenate(
+        [arrays["identity"][: bundled.n_identity].astype(np.float64), expression]
+    )
     template = METERS_PER_UNIT * neutral
     regressor = np.zeros((len(JOINTS), len(template)))
     regressor[:, cKDTree(template).query(bundled.v_template)[1]] = bundled.j_regressor
@@ -163,11 +169,17 @@ def _step(values: np.ndarray, low: float | np.ndarray, high: float | np.ndarray)
 
 def _spot(at: np.ndarray, center: tuple[float, float], size: tuple[float, float]) -> np.ndarray:
     """(N,) a soft spot on both sides of the face, in centimeters of x and y."""
-    return np.asarray(np.exp(-(((abs(at[:, 0]) - center[0]) / size[0]) ** 2) - ((at[:, 1] - center[1]) / size[1]) ** 2))
+    return np.asarray(
+        np.exp(
+            -(((abs(at[:, 0]) - center[0]) / size[0]) ** 2)
+            - ((at[:, 1] - center[1]) / size[1]) ** 2
+        )
+    )
 
 
 class _Paint:
-    """Colors and densities of hair on ICT-FaceKit's neutral head, whose positions are in centimeters here."""
+    """Colors and densities of hair on ICT-FaceKit's neutral head, whose positions are in
+    centimeters here."""
 
     def __init__(self, model: FlameModel) -> None:
         self.at = at = model.v_template / METERS_PER_UNIT
@@ -180,14 +192,17 @@ class _Paint:
         bow = np.clip(1 - (across / LIP_HALF_WIDTH_CM) ** 2, 0, 1) ** 0.6
         upper = UPPER_LIP_CM * bow - 0.13 * np.exp(-((across / 0.35) ** 2))
         height = np.where(above > 0, upper, LOWER_LIP_CM * bow)
-        self.lips = (1 - _step(abs(above) - height, -0.12, 0.06)) * (at[:, 2] > 9.5) * self.within(FACE)
+        self.lips = (
+            (1 - _step(abs(above) - height, -0.12, 0.06)) * (at[:, 2] > 9.5) * self.within(FACE)
+        )
         self.front = _step(at[:, 2], 3.0, 6.0) * self.within(FACE)
 
     def within(self, part: tuple[int, int]) -> np.ndarray:
         return (self.ids >= part[0]) & (self.ids < part[1])
 
     def surface(self) -> np.ndarray:
-        """(F,) index into SURFACES; -1 for what is not rendered: second shells, tear films, lashes' cards."""
+        """(F,) index into SURFACES; -1 for what is not rendered: second shells, tear films, lashes'
+        cards."""
         of = np.full(len(self.at), -1)
         for name, part in PARTS:
             of[slice(*part)] = SURFACES.index(name)
@@ -201,7 +216,9 @@ class _Paint:
         def mix(color: np.ndarray, amount: np.ndarray) -> None:
             tint[:] += np.clip(amount, 0, 1)[:, None] * (color - tint)
 
-        cheeks = _spot(at, (ex + 1.2, ey - 4.0), (2.4, 2.0)) + 0.6 * _spot(at, (0, ey - 4.2), (1.3, 1.2))
+        cheeks = _spot(at, (ex + 1.2, ey - 4.0), (2.4, 2.0)) + 0.6 * _spot(
+            at, (0, ey - 4.2), (1.3, 1.2)
+        )
         mix(SKIN_COLOR * FLUSH, 0.55 * self.front * cheeks)
         mix(SKIN_COLOR * SHADOW, 0.45 * self.front * _spot(at, (ex, ey - 0.1), (2.2, 1.3)))
         mix(LIP_COLOR, 0.85 * self.lips)
@@ -212,13 +229,19 @@ class _Paint:
 
     def roughness(self) -> np.ndarray:
         ey = self.eye_at[1]
-        shine = 0.10 * self.front * (_spot(self.at, (0, ey + 3.5), (4, 2.5)) + _spot(self.at, (0, ey - 2.5), (1, 3)))
+        shine = (
+            0.10
+            * self.front
+            * (_spot(self.at, (0, ey + 3.5), (4, 2.5)) + _spot(self.at, (0, ey - 2.5), (1, 3)))
+        )
         roughness = 0.47 - shine - 0.14 * self.lips
         return np.where(self.within(TEETH), 0.15, np.where(self.within(GUMS), 0.25, roughness))
 
     def freckles(self) -> np.ndarray:
         ex, ey = self.eye_at[:2]
-        spots = _spot(self.at, (ex, ey - 3.4), (2.6, 1.5)) + _spot(self.at, (0, ey - 2.6), (2.0, 1.6))
+        spots = _spot(self.at, (ex, ey - 3.4), (2.6, 1.5)) + _spot(
+            self.at, (0, ey - 2.6), (2.0, 1.6)
+        )
         return np.asarray(np.clip(spots, 0, 1) * self.front * (1 - self.lips))
 
     def eye(self) -> np.ndarray:
@@ -241,18 +264,22 @@ class _Paint:
         return np.asarray(inside * (along > -0.02) * (along < 1) * (at[:, 2] > 3))
 
     def lid_edges(self, at: np.ndarray) -> np.ndarray:
-        """Density (N,) of lashes at points (N, 3): 1 where the upper lids' skin touches the eyeball."""
+        """Density (N,) of lashes at points (N, 3): 1 where the upper lids' skin touches the
+        eyeball."""
         away = at - np.where(at[:, :1] > 0, self.eye_at, self.eye_at * [-1, 1, 1])
         gap = np.linalg.norm(away, axis=1) - self.eye_radius
         return np.asarray(
-            ((gap < LID_EDGE_CM) & (abs(away[:, 0]) < LID_HALF_WIDTH_CM) & (away[:, 1] > 0)).astype(float)
+            ((gap < LID_EDGE_CM) & (abs(away[:, 0]) < LID_HALF_WIDTH_CM) & (away[:, 1] > 0)).astype(
+                float
+            )
         )
 
 
 def _scatter(
     paint: _Paint, density: Callable[[np.ndarray], np.ndarray], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (N,) and barycentric coordinates (N, 3) of `count` points on the skin, by density."""
+    """Triangles (N,) and barycentric coordinates (N, 3) of `count` points on the skin, by
+    density."""
     skin = np.flatnonzero((paint.faces < MOUTH_INSIDE[0]).all(1))
     corners = paint.at[paint.faces[skin]]
     share = density(corners.mean(1)) * face_areas(paint.at, paint.faces[skin])
@@ -266,9 +293,11 @@ def _scatter(
 class _Growth:
     """How hair of one kind grows; roots (N, 3) are in centimeters on ICT-FaceKit's neutral head.
 
-    heading    (roots, normals (N, 3) of the skin below) -> directions (N, 3), of which the part along the skin counts
+    heading    (roots, normals (N, 3) of the skin below) -> directions (N, 3), of which the part
+               along the skin counts
     length     roots -> (N,) meters
-    rise       degrees over the skin at the root, which `lift` (roots -> (N,)) scales, and at the tip
+    rise       degrees over the skin at the root, which `lift` (roots -> (N,)) scales, and at the
+               tip
     disorder   standard deviation of each hair's own direction
     clump      share by which tips gather at that of one in HAIRS_PER_CLUMP hairs
     clearance  meters that tips keep from the skin
@@ -310,17 +339,24 @@ def _grow(
         along -= (along * normal).sum(1, keepdims=True) * normal
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
         share = (number - 1) / (POINTS_PER_HAIR - 2)
-        rise = np.radians(growth.rise[0] * growth.lift(root_cm) * (1 - share) + growth.rise[1] * share)[:, None]
+        rise = np.radians(
+            growth.rise[0] * growth.lift(root_cm) * (1 - share) + growth.rise[1] * share
+        )[:, None]
         at = at + step[:, None] * (np.cos(rise) * along + np.sin(rise) * normal)
         height = ((at - neutral[near]) * normal).sum(1)
-        at = at + np.maximum(growth.clearance * number / POINTS_PER_HAIR - height, 0)[:, None] * normal
+        at = (
+            at
+            + np.maximum(growth.clearance * number / POINTS_PER_HAIR - height, 0)[:, None] * normal
+        )
         points.append(at)
     hairs = np.stack(points, 1)
     if growth.clump:
         guides = rng.choice(len(root), max(1, len(root) // HAIRS_PER_CLUMP), replace=False)
         guide = guides[cKDTree(root[guides]).query(root)[1]]
         gathered = hairs[guide] + 0.25 * (root - root[guide])[:, None]
-        hairs += growth.clump * np.linspace(0, 1, POINTS_PER_HAIR)[:, None] ** 1.3 * (gathered - hairs)
+        hairs += (
+            growth.clump * np.linspace(0, 1, POINTS_PER_HAIR)[:, None] ** 1.3 * (gathered - hairs)
+        )
     return np.asarray(hairs)
 
 
@@ -352,7 +388,14 @@ def _all_strands(paint: _Paint, neutral: np.ndarray) -> tuple[Strands, ...]:
         melanin: float,
     ) -> Strands:
         triangle, inside = _scatter(paint, density, count, rng)
-        return Strands(name, _grow(paint, neutral, triangle, inside, growth, rng), triangle, radius_m, melanin, REDNESS)
+        return Strands(
+            name,
+            _grow(paint, neutral, triangle, inside, growth, rng),
+            triangle,
+            radius_m,
+            melanin,
+            REDNESS,
+        )
 
     def top(root: np.ndarray) -> np.ndarray:
         return _step(root[:, 1] - paint.eye_at[1], 3.5, 8.0)

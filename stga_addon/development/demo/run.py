@@ -44,11 +44,12 @@ MAX_POSITION_ERROR_M = 1e-5
 def run_demo(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
     """Unpack the demo's capture, import it into Blender, select, train, and show the avatar.
 
-    budget: the setting that limits training, `seconds` or `iterations`; device: one of `choose_device`.
+    budget: the setting that limits training, `seconds` or `iterations`; device: one of
+    `choose_device`.
 
-    Leaves avatar.npz, avatar.html, demo.blend, comparison.png, selection.png and metrics.json in `out`. Needs Blender's
-    bpy.
-    Raises StgaError where the folder cannot be written or Blender places a splat elsewhere than numpy does.
+    Leaves avatar.npz, avatar.html, demo.blend, comparison.png, selection.png and metrics.json in
+    `out`. Needs Blender's bpy. Raises StgaError where the folder cannot be written or Blender
+    places a splat elsewhere than numpy does.
     """
     begin = perf_counter()
     if device == "cpu":
@@ -61,31 +62,53 @@ def run_demo(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
     error = _show(capture, avatar, head, out / "demo.blend")
     _picture(capture, avatar, selection, out)
     _page(capture, avatar, selection, out / "avatar.html")
-    metrics = {split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")}
-    write_json(out / "metrics.json", {**metrics, "splats": len(avatar.splats), "blender_position_error_m": error})
+    metrics = {
+        split: evaluate_avatar(avatar, capture, split).as_json() for split in ("val", "test")
+    }
+    write_json(
+        out / "metrics.json",
+        {**metrics, "splats": len(avatar.splats), "blender_position_error_m": error},
+    )
     for split, values in metrics.items():
-        fitted = f" (exposure fitted; {values['psnr_unmatched']:.2f} without)" if "psnr_unmatched" in values else ""
+        fitted = (
+            f" (exposure fitted; {values['psnr_unmatched']:.2f} without)"
+            if "psnr_unmatched" in values
+            else ""
+        )
         print(f"{split}: PSNR {values['psnr']:.2f} dB{fitted}, SSIM {values['ssim']:.4f}")
     print(f"Blender places the splats within {error:.1e} m of numpy")
-    print(f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)")
+    print(
+        f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)"
+    )
 
 
 def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
-    """Make an avatar in OUT/footage from the images and cameras of the demo's capture, without its meshes.
+    """Make an avatar in OUT/footage from the images and cameras of the demo's capture, without its
+    meshes.
 
     Raises StgaError.
     """
     from ...cli.commands import COMMANDS
 
     cameras = ["--cameras", str(out / "capture/transforms.json")]
-    more = ["--out", str(out / "footage"), "--budget", f"{seconds}s", "--seed", str(SEED), "--device", device]
+    more = [
+        "--out",
+        str(out / "footage"),
+        "--budget",
+        f"{seconds}s",
+        "--seed",
+        str(SEED),
+        "--device",
+        device,
+    ]
     parser = ArgumentParser()
     COMMANDS["avatar"].add_arguments(parser, None)
     COMMANDS["avatar"].carry_out(parser.parse_args([str(out / "capture"), *cameras, *more]), None)
 
 
 def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]:
-    """Make a Blender scene with head, cameras and a vertex group per frame; returns head and selection read back."""
+    """Make a Blender scene with head, cameras and a vertex group per frame; returns head and
+    selection read back."""
     from ...scene.avatar_scene import set_up_head
     from ...scene.blend_file import new_file
     from ...scene.vertex_groups import read_selection, write_selection
@@ -97,7 +120,11 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
 
 
 def _train(
-    capture: Capture, out: Path, budget: Mapping[str, Any], selection: dict[int, np.ndarray], device: str
+    capture: Capture,
+    out: Path,
+    budget: Mapping[str, Any],
+    selection: dict[int, np.ndarray],
+    device: str,
 ) -> Avatar:
     # The capture's heads are exact, and Blender shows them unrefined.
     settings = make_settings(**budget, seed=SEED, effects={"tracking": "off"})
@@ -111,7 +138,8 @@ def _train(
 
 
 def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
-    """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat from numpy's."""
+    """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat
+    from numpy's."""
     from ...scene.avatar_scene import show_on_head
     from ...scene.blend_file import go_to_frame, object_named, open_file, save_file
     from ...scene.display.splat_object import evaluated_splats
@@ -133,7 +161,8 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
 
 
 def _picture(capture: Capture, avatar: Avatar, selection: dict[int, np.ndarray], out: Path) -> None:
-    """Write comparison.png (ground truth and rendering of a held-out view and of an unseen expression) and
+    """Write comparison.png (ground truth and rendering of a held-out view and of an unseen
+    expression) and
     selection.png (the held-out view of the frame that selects most)."""
     pictures = []
     for view in (capture.views["val"][-1], capture.views["test"][len(capture.views["test"]) // 2]):
@@ -162,8 +191,11 @@ def _save(path: Path, pixels: np.ndarray) -> None:
         Image.fromarray(pixels).save(partial, format="PNG")
 
 
-def selection_picture(avatar: Avatar, mesh: np.ndarray, camera: Camera, selected: np.ndarray) -> np.ndarray:
-    """The avatar with splats of selected triangles in color and all others gray; (3, H, W) float32 on white.
+def selection_picture(
+    avatar: Avatar, mesh: np.ndarray, camera: Camera, selected: np.ndarray
+) -> np.ndarray:
+    """The avatar with splats of selected triangles in color and all others gray; (3, H, W) float32
+    on white.
 
     mesh (V, 3) drives the avatar; selected (F,) bool.
     """
@@ -176,7 +208,8 @@ def selection_picture(avatar: Avatar, mesh: np.ndarray, camera: Camera, selected
 
 
 def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
-    """Pictures (H, W, 3) uint8 of one height in a row, with a white gap of six pixels between them."""
+    """Pictures (H, W, 3) uint8 of one height in a row, with a white gap of six pixels between
+    them."""
     gap = np.full((len(pictures[0]), 6, 3), 255, np.uint8)
     spaced = [part for picture in pictures for part in (picture, gap)]
     return np.concatenate(spaced[:-1], axis=1)

@@ -24,7 +24,13 @@ from .person import SURFACES, Person, Strands
 
 # Soft boxes around the head: azimuth and elevation in degrees (0, 0 is straight ahead), watts, and
 # their edge in meters.
-SOFT_BOXES = ((-38, 34, 14.0, 0.7), (58, 18, 5.0, 0.9), (0, -35, 1.5, 0.8), (150, 40, 4.0, 0.5), (-140, 30, 3.0, 0.5))
+SOFT_BOXES = (
+    (-38, 34, 14.0, 0.7),
+    (58, 18, 5.0, 0.9),
+    (0, -35, 1.5, 0.8),
+    (150, 40, 4.0, 0.5),
+    (-140, 30, 3.0, 0.5),
+)
 BOX_DISTANCE_M = 1.3
 AMBIENT = 0.30
 MAX_BOUNCES, NOISE_THRESHOLD = 4, 0.03
@@ -50,7 +56,9 @@ class Studio:
         self.cloth.modifiers.new("smooth", "SUBSURF").render_levels = 1
         thickness = self.cloth.modifiers.new("thickness", "DISPLACE")
         thickness.strength, thickness.mid_level = CLOTH_M, 0.0
-        self.hair = [bpy.data.objects.new(strands.name, _curves(strands)) for strands in person.strands]
+        self.hair = [
+            bpy.data.objects.new(strands.name, _curves(strands)) for strands in person.strands
+        ]
         for thing in (self.camera, self.body, self.cloth, *self.hair):
             self.scene.collection.objects.link(thing)
         self.scene.camera = self.camera
@@ -70,7 +78,10 @@ class Studio:
         with TemporaryDirectory() as folder:
             self.scene.render.filepath = path = str(Path(folder) / "view.png")
             for view in cameras:
-                self.scene.render.resolution_x, self.scene.render.resolution_y = view.width, view.height
+                self.scene.render.resolution_x, self.scene.render.resolution_y = (
+                    view.width,
+                    view.height,
+                )
                 set_intrinsics(self.camera.data, view)
                 self.camera.matrix_world = Matrix(view.camera_to_world_gl.tolist())
                 with _silent():
@@ -81,7 +92,8 @@ class Studio:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Hide what Blender prints on standard output for every picture, which breaks a progress bar."""
+    """Hide what Blender prints on standard output for every picture, which breaks a progress
+    bar."""
     sys.stdout.flush()
     kept = os.dup(1)
     try:
@@ -119,7 +131,9 @@ def _soft_box(scene: Any, azimuth: float, elevation: float, watts: float, size: 
     box = bpy.data.objects.new("soft box", light)
     scene.collection.objects.link(box)
     # A light shines along its own -z: turn +z to look from the subject at the box, and step back.
-    turn = Matrix.Rotation(np.radians(azimuth), 4, "Y") @ Matrix.Rotation(np.radians(-elevation), 4, "X")
+    turn = Matrix.Rotation(np.radians(azimuth), 4, "Y") @ Matrix.Rotation(
+        np.radians(-elevation), 4, "X"
+    )
     box.matrix_world = turn @ Matrix.Translation((0, 0, BOX_DISTANCE_M))
 
 
@@ -152,8 +166,15 @@ def _curves(strands: Strands) -> Any:
     melanin, redness = strands.melanin, strands.redness
 
     def shader(nodes: Nodes) -> Any:
-        inputs = {"Melanin": melanin, "Melanin Redness": redness, "Roughness": 0.32, "Random Color": 0.4}
-        return nodes.out("ShaderNodeBsdfHairPrincipled", inputs, model="CHIANG", parametrization="MELANIN")
+        inputs = {
+            "Melanin": melanin,
+            "Melanin Redness": redness,
+            "Roughness": 0.32,
+            "Random Color": 0.4,
+        }
+        return nodes.out(
+            "ShaderNodeBsdfHairPrincipled", inputs, model="CHIANG", parametrization="MELANIN"
+        )
 
     curves.materials.append(new_material(strands.name, shader))
     return curves
@@ -168,7 +189,9 @@ def _skin(nodes: Nodes) -> Any:
     spot = _range(nodes, cells["Distance"], (0.12, 0.34), (1.0, 0.0))
     chosen = _range(nodes, nodes.components(cells["Color"])[0], (0.45, 0.75), (0.0, 1.0))
     freckle = nodes.math("MULTIPLY", nodes.math("MULTIPLY", spot, chosen), freckles)
-    paler = nodes.combine(*(nodes.math("SUBTRACT", 1.0, nodes.math("MULTIPLY", freckle, d)) for d in (0.3, 0.5, 0.6)))
+    paler = nodes.combine(
+        *(nodes.math("SUBTRACT", 1.0, nodes.math("MULTIPLY", freckle, d)) for d in (0.3, 0.5, 0.6))
+    )
     pores = _noise(nodes, rest, 700.0, 3.0)
     inputs = {
         "Base Color": nodes.vector("MULTIPLY", nodes.scale(tint, mottle), paler),
@@ -177,7 +200,9 @@ def _skin(nodes: Nodes) -> Any:
         "Subsurface Radius": (1.0, 0.35, 0.2),
         "Subsurface Scale": 0.006,
         "Specular IOR Level": 0.45,
-        "Normal": nodes.out("ShaderNodeBump", {"Strength": 0.35, "Distance": 0.0005, "Height": pores}),
+        "Normal": nodes.out(
+            "ShaderNodeBump", {"Strength": 0.35, "Distance": 0.0005, "Height": pores}
+        ),
     }
     return nodes.out("ShaderNodeBsdfPrincipled", inputs)
 
@@ -195,7 +220,9 @@ def _wet(nodes: Nodes) -> Any:
 def _eye(nodes: Nodes) -> Any:
     """Pupil, iris with fibers, limbus and sclera by the angle from the eye's axis."""
     x, y, z = nodes.components(_attribute(nodes, "eye")["Vector"])
-    radius = nodes.math("SQRT", nodes.math("ADD", nodes.math("MULTIPLY", x, x), nodes.math("MULTIPLY", y, y)))
+    radius = nodes.math(
+        "SQRT", nodes.math("ADD", nodes.math("MULTIPLY", x, x), nodes.math("MULTIPLY", y, y))
+    )
     away = nodes.math("ADD", radius, nodes.math("MULTIPLY", nodes.math("LESS_THAN", z, 0.0), 2.0))
     ramp = nodes.add("ShaderNodeValToRGB", {"Fac": away})
     elements = ramp.color_ramp.elements
@@ -205,11 +232,15 @@ def _eye(nodes: Nodes) -> Any:
         element.position, element.color = place, (*color, 1)
     around = nodes.math("ARCTAN2", y, x)
     fibers = nodes.combine(
-        nodes.math("COSINE", around), nodes.math("SINE", around), nodes.math("MULTIPLY", radius, 0.3)
+        nodes.math("COSINE", around),
+        nodes.math("SINE", around),
+        nodes.math("MULTIPLY", radius, 0.3),
     )
     noise = _range(nodes, _noise(nodes, fibers, 14.0, 4.0), (0.3, 0.7), (0.55, 1.5))
     inside = nodes.math("LESS_THAN", away, IRIS)
-    shade = nodes.math("ADD", 1.0, nodes.math("MULTIPLY", inside, nodes.math("SUBTRACT", noise, 1.0)))
+    shade = nodes.math(
+        "ADD", 1.0, nodes.math("MULTIPLY", inside, nodes.math("SUBTRACT", noise, 1.0))
+    )
     inputs = {
         "Base Color": nodes.scale(ramp.outputs["Color"], shade),
         "Roughness": 0.25,
@@ -258,24 +289,37 @@ def _knitwear(nodes: Nodes) -> Any:
     collar = nodes.math("GREATER_THAN", neckline, -COLLAR_CM)
     ribs = nodes.math("SINE", nodes.math("MULTIPLY", around, 110.0))
     rows = nodes.math("SINE", nodes.math("MULTIPLY", neckline, 26.0))
-    height = nodes.out("ShaderNodeMix", {"Factor": collar, "A": nodes.math("MULTIPLY", ribs, rows), "B": ribs})
+    height = nodes.out(
+        "ShaderNodeMix", {"Factor": collar, "A": nodes.math("MULTIPLY", ribs, rows), "B": ribs}
+    )
     inputs = {
         "Base Color": nodes.scale(CLOTH_COLOR, _range(nodes, height, (-1.0, 1.0), (0.75, 1.15))),
         "Roughness": 0.9,
         "Sheen Weight": 0.3,
         "Alpha": nodes.math("LESS_THAN", neckline, 0.0),
-        "Normal": nodes.out("ShaderNodeBump", {"Strength": 0.5, "Distance": 0.001, "Height": height}),
+        "Normal": nodes.out(
+            "ShaderNodeBump", {"Strength": 0.5, "Distance": 0.001, "Height": height}
+        ),
     }
     return nodes.out("ShaderNodeBsdfPrincipled", inputs)
 
 
-def _range(nodes: Nodes, value: Any, source: tuple[float, float], target: tuple[float, float]) -> Any:
-    limits = {"From Min": source[0], "From Max": source[1], "To Min": target[0], "To Max": target[1]}
+def _range(
+    nodes: Nodes, value: Any, source: tuple[float, float], target: tuple[float, float]
+) -> Any:
+    limits = {
+        "From Min": source[0],
+        "From Max": source[1],
+        "To Min": target[0],
+        "To Max": target[1],
+    }
     return nodes.out("ShaderNodeMapRange", {"Value": value, **limits})
 
 
 def _noise(nodes: Nodes, position: Any, scale: float, detail: float) -> Any:
-    return nodes.add("ShaderNodeTexNoise", {"Vector": position, "Scale": scale, "Detail": detail}).outputs[0]
+    return nodes.add(
+        "ShaderNodeTexNoise", {"Vector": position, "Scale": scale, "Detail": detail}
+    ).outputs[0]
 
 
 def _attribute(nodes: Nodes, name: str) -> Any:

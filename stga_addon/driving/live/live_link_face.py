@@ -11,18 +11,25 @@ MAX_TEXT_BYTES = 512
 ROTATIONS = 9
 """Yaw, pitch and roll of the head and of both eyes, after the shapes."""
 _TIME = struct.Struct(">ifii")
-_EXCHANGED = {"jawRight": "jawLeft", "jawLeft": "jawRight", "mouthRight": "mouthLeft", "mouthLeft": "mouthRight"}
+_EXCHANGED = {
+    "jawRight": "jawLeft",
+    "jawLeft": "jawRight",
+    "mouthRight": "mouthLeft",
+    "mouthLeft": "mouthRight",
+}
 PACKET_SHAPES = tuple(_EXCHANGED.get(name, name) for name in ARKIT_SHAPES)
-"""In the order of the packets, which have the left of jaw and mouth first, unlike the app's CSV files."""
+"""In the order of the packets, which have the left of jaw and mouth first, unlike the app's CSV
+files."""
 _PACKET_COLUMNS = np.array([COLUMN[name] for name in PACKET_SHAPES])
 
 
 def decode(data: bytes) -> FacePacket | None:
     """The frame of a packet, or None for bytes that are none.
 
-    Layout, big-endian: u8 version; device and subject, each i32 length and UTF-8; i32 frame, f32 subframe, i32 rate,
-    i32 denominator; u8 count, then count f32: 61, or as few as the 51 or 52 shapes. Without a face, the packet ends
-    before the count, or counts 0. Source: Unreal Engine's AppleARKitFaceSupport.
+    Layout, big-endian: u8 version; device and subject, each i32 length and UTF-8; i32 frame, f32
+    subframe, i32 rate, i32 denominator; u8 count, then count f32: 61, or as few as the 51 or 52
+    shapes. Without a face, the packet ends before the count, or counts 0. Source: Unreal Engine's
+    AppleARKitFaceSupport.
     """
     if not data or data[0] != VERSION:
         return None
@@ -37,7 +44,11 @@ def decode(data: bytes) -> FacePacket | None:
         return None
     frame, part, rate, denominator = _TIME.unpack_from(data, at)
     at += _TIME.size
-    time = (frame + part) * denominator / rate if rate > 0 and denominator > 0 and np.isfinite(part) else None
+    time = (
+        (frame + part) * denominator / rate
+        if rate > 0 and denominator > 0 and np.isfinite(part)
+        else None
+    )
     subject = texts[1] or texts[0]
     count = data[at] if len(data) > at else 0
     if count == 0:
@@ -51,7 +62,11 @@ def decode(data: bytes) -> FacePacket | None:
 
 
 def _packet(values: np.ndarray, subject: str, time: float | None) -> FacePacket:
-    names = PACKET_SHAPES if len(values) >= COUNT else tuple(name for name in PACKET_SHAPES if name not in OPTIONAL)
+    names = (
+        PACKET_SHAPES
+        if len(values) >= COUNT
+        else tuple(name for name in PACKET_SHAPES if name not in OPTIONAL)
+    )
     weights = np.zeros(COUNT)
     weights[_PACKET_COLUMNS[: len(names)]] = values[: len(names)]
     head = None

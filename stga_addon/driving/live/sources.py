@@ -1,4 +1,5 @@
-"""Live sources: their sockets, read without waiting, whose packets count, how well they arrive, and recordings."""
+"""Live sources: their sockets, read without waiting, whose packets count, how well they arrive, and
+recordings."""
 
 import ipaddress
 import socket
@@ -27,8 +28,10 @@ class Source:
     """A protocol on UDP.
 
     port     usual port
-    decode   datagram and what is known of its sender (None at first) -> `Decoded`; None for bytes of another kind
-    request  what is sent to the phone to make it send, on the same port; b"" for sources that send by themselves
+    decode   datagram and what is known of its sender (None at first) -> `Decoded`; None for bytes
+             of another kind
+    request  what is sent to the phone to make it send, on the same port; b"" for sources that send
+             by themselves
     hint     what a user has to know
     """
 
@@ -75,7 +78,8 @@ SOURCES = {
 LOOPBACK = "127.0.0.1"
 MAX_DATAGRAM_BYTES = 1 << 16
 MAX_DATAGRAMS = 256
-"""Read at once: more than a usual socket keeps, so that the newest is among them. A flood does not hold Blender up."""
+"""Read at once: more than a usual socket keeps, so that the newest is among them. A flood does not
+hold Blender up."""
 REQUEST_INTERVAL_S = 1.0
 """At which a phone that is silent is asked again."""
 
@@ -83,7 +87,9 @@ REQUEST_INTERVAL_S = 1.0
 class Receiver:
     """An open UDP socket. Close it with `close`."""
 
-    def __init__(self, source: Source, address: str = LOOPBACK, port: int = 0, phone: str = "") -> None:
+    def __init__(
+        self, source: Source, address: str = LOOPBACK, port: int = 0, phone: str = ""
+    ) -> None:
         """Listen on `address` and `port` (0: the source's usual one) of this machine.
 
         phone  address of the phone that a source with a request asks for packets
@@ -93,7 +99,9 @@ class Receiver:
         self.phone = str(checked_address("phone's address", phone)) if source.request else ""
         where = checked_address("address to listen on", address)
         self._asked = float("-inf")
-        self._socket = socket.socket(socket.AF_INET6 if where.version == 6 else socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket = socket.socket(
+            socket.AF_INET6 if where.version == 6 else socket.AF_INET, socket.SOCK_DGRAM
+        )
         try:
             self._socket.setblocking(False)
             self._socket.bind((str(where), self.port))
@@ -106,7 +114,8 @@ class Receiver:
         self.port = self._socket.getsockname()[1]
 
     def read(self) -> list[tuple[str, bytes]]:
-        """The sender's address and the bytes of each datagram that is waiting, at most MAX_DATAGRAMS."""
+        """The sender's address and the bytes of each datagram that is waiting, at most
+        MAX_DATAGRAMS."""
         found: list[tuple[str, bytes]] = []
         while len(found) < MAX_DATAGRAMS:
             try:
@@ -138,7 +147,8 @@ def checked_address(what: str, text: str) -> ipaddress.IPv4Address | ipaddress.I
 
 
 def leaves_this_machine(source: Source, address: str, phone: str) -> bool:
-    """Whether listening there, or asking the phone, involves other machines. Raises StgaError as `Receiver` does."""
+    """Whether listening there, or asking the phone, involves other machines. Raises StgaError as
+    `Receiver` does."""
     if not checked_address("address to listen on", address).is_loopback:
         return True
     return bool(source.request) and not checked_address("phone's address", phone).is_loopback
@@ -170,8 +180,9 @@ class Health:
     lost     packets that never came, by the source's clock; None: it sends no clock
     late     packets that came after later ones, or twice
     foreign  datagrams that are none of this source's
-    delay_s  seconds that the last packet came later, by the source's clock, than the quickest of the last seconds: what
-             the network adds to its shortest time, which cannot be measured from one side; None without a clock
+    delay_s  seconds that the last packet came later, by the source's clock, than the quickest of
+             the last seconds: what the network adds to its shortest time, which cannot be measured
+             from one side; None without a clock
     """
 
     rate: float = 0.0
@@ -204,10 +215,13 @@ class Stream:
     _known: OrderedDict[str, Any] = field(default_factory=OrderedDict)
     _time: float | None = None
     _steps: deque[float] = field(default_factory=lambda: deque(maxlen=STEPS))
-    _arrivals: deque[tuple[float, float | None]] = field(default_factory=lambda: deque(maxlen=ARRIVALS))
+    _arrivals: deque[tuple[float, float | None]] = field(
+        default_factory=lambda: deque(maxlen=ARRIVALS)
+    )
 
     def receive(self, address: str, data: bytes, now: float) -> FacePacket | None:
-        """Take a datagram; the frame that it holds, where it counts: of the followed sender, with a face, in order."""
+        """Take a datagram; the frame that it holds, where it counts: of the followed sender, with a
+        face, in order."""
         decoded = self.source.decode(data, self._known.get(address))
         if decoded is None:
             self.foreign += 1
@@ -259,7 +273,8 @@ class Stream:
         self._arrivals.clear()
 
     def _is_next(self, time: float | None) -> bool:
-        """Whether a packet of the source's `time` is later than those before; counts what is lost between them."""
+        """Whether a packet of the source's `time` is later than those before; counts what is lost
+        between them."""
         if time is None:
             return True
         before = self._time
@@ -291,8 +306,8 @@ RESTING_PACKETS = 15
 MIN_STEP_S = 2 / MAX_FPS
 """Between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
 MAX_LEAD_S = 5.0
-"""By which a source's clock may be ahead of the packets' arrival: a usual socket keeps packets for 4 s while Blender is
-busy. Beyond it, the clock was set, or is another's."""
+"""By which a source's clock may be ahead of the packets' arrival: a usual socket keeps packets for
+4 s while Blender is busy. Beyond it, the clock was set, or is another's."""
 
 
 def row_of(packet: FacePacket) -> Performance:
@@ -307,11 +322,16 @@ def resting(packets: list[FacePacket]) -> Performance:
     rows = [row_of(packet) for packet in packets]
     heads = [row.head for row in rows if row.head is not None]
     weights = np.mean([row.weights for row in rows], axis=0)
-    return replace(rows[-1], weights=weights, head=np.mean(heads, axis=0) if len(heads) == len(rows) else None)
+    return replace(
+        rows[-1], weights=weights, head=np.mean(heads, axis=0) if len(heads) == len(rows) else None
+    )
 
 
-def eased(before: Performance | None, row: Performance, step_s: float, smoothing_s: float) -> Performance:
-    """The row, drawn towards the one before it: a low-pass filter of time constant `smoothing_s`."""
+def eased(
+    before: Performance | None, row: Performance, step_s: float, smoothing_s: float
+) -> Performance:
+    """The row, drawn towards the one before it: a low-pass filter of time constant
+    `smoothing_s`."""
     if before is None or smoothing_s <= 0:
         return row
     share = 1 - np.exp(-step_s / smoothing_s)
@@ -323,7 +343,8 @@ def eased(before: Performance | None, row: Performance, step_s: float, smoothing
 
 @dataclass
 class Recording:
-    """Packets of a take with their times: steps of the source's clock, or of arrival where it has none or jumps.
+    """Packets of a take with their times: steps of the source's clock, or of arrival where it has
+    none or jumps.
 
     start  Blender frame at which it began
     rest   the performer's resting face, which is taken off; None: nothing is
@@ -337,13 +358,16 @@ class Recording:
     _arrived: float = 0.0
 
     def add(self, packet: FacePacket, now: float) -> None:
-        """Take a packet that arrived at `now`; of more than a performance may have, the rest are left out."""
+        """Take a packet that arrived at `now`; of more than a performance may have, the rest are
+        left out."""
         time = now
         if self._packets:
             before, last, step = self._times[-1], self._packets[-1], now - self._arrived
             if packet.time is not None:
                 own = -1.0 if last.time is None else packet.time - last.time
-                has_jumped = own <= 0 or before + own > now + MAX_LEAD_S or packet.subject != last.subject
+                has_jumped = (
+                    own <= 0 or before + own > now + MAX_LEAD_S or packet.subject != last.subject
+                )
                 step = max(step, MIN_STEP_S) if has_jumped else own
             time = before + step
             if step < MIN_STEP_S or len(self._times) >= MAX_ROWS:

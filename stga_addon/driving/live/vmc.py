@@ -1,4 +1,5 @@
-"""The Virtual Motion Capture protocol: blend shapes and bones as messages of Open Sound Control 1.0."""
+"""The Virtual Motion Capture protocol: blend shapes and bones as messages of Open Sound Control
+1.0."""
 
 import math
 import struct
@@ -18,7 +19,8 @@ _CONSTANTS: dict[str, Value] = {"T": True, "F": False, "N": None, "I": float("in
 
 
 def messages(data: bytes) -> list[Message] | None:
-    """Address and arguments of every message of a datagram, those of bundles in their order; None for other bytes."""
+    """Address and arguments of every message of a datagram, those of bundles in their order; None
+    for other bytes."""
     found: list[Message] = []
     return found if _read(data, found, 0) else None
 
@@ -101,7 +103,8 @@ class Received:
     """What a sender said so far: values come one by one, and count when they are applied.
 
     time       its latest; applied: that of the last frame
-    has_clock  whether each frame had a new time: of some senders it stands still, or comes more seldom
+    has_clock  whether each frame had a new time: of some senders it stands still, or comes more
+               seldom
     """
 
     weights: np.ndarray = field(default_factory=lambda: np.zeros(COUNT))
@@ -113,9 +116,11 @@ class Received:
 
 
 def decode(data: bytes, before: Received) -> tuple[FacePacket | None, Received] | None:
-    """The frame that a datagram applies, if any, and what is known after it; None for bytes that are no VMC.
+    """The frame that a datagram applies, if any, and what is known after it; None for bytes that
+    are no VMC.
 
-    before: what was known from this sender's earlier datagrams. Shapes have ARKit's names in any spelling; VRM's own
+    before: what was known from this sender's earlier datagrams. Shapes have ARKit's names in any
+    spelling; VRM's own
     expressions (A, Joy, …) are left out. Source: the protocol's specification (protocol.vmc.info).
     """
     found = messages(data)
@@ -144,7 +149,12 @@ def _with(known: Received, message: Message) -> Received:
         return replace(known, weights=weights, names=known.names | {name})
     if address == TIME and len(values) == 1 and _number(values[0]) is not None:
         return replace(known, time=_number(values[0]))
-    if address == BONE and len(values) == 8 and isinstance(values[0], str) and values[0].lower() == HEAD_BONE:
+    if (
+        address == BONE
+        and len(values) == 8
+        and isinstance(values[0], str)
+        and values[0].lower() == HEAD_BONE
+    ):
         head = _head(values[4:])
         return known if head is None else replace(known, head=head)
     return known
@@ -153,7 +163,8 @@ def _with(known: Received, message: Message) -> Received:
 def _head(values: Sequence[Value]) -> tuple[float, float, float] | None:
     """Yaw, pitch and roll of Unity's quaternion (x, y, z, w).
 
-    Unity's axes are left-handed, with x to the face's right: mirrored in x, rotations about y and z change their sign.
+    Unity's axes are left-handed, with x to the face's right: mirrored in x, rotations about y and z
+    change their sign.
     """
     numbers = [value for value in map(_number, values) if value is not None]
     length = math.sqrt(sum(value * value for value in numbers))

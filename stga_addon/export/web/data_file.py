@@ -1,4 +1,5 @@
-"""Web data files: an avatar, a linear rig that moves it, and cameras, quantized, in a container (docs/formats.md)."""
+"""Web data files: an avatar, a linear rig that moves it, and cameras, quantized, in a container
+(docs/formats.md)."""
 
 import gzip
 import json
@@ -39,8 +40,8 @@ class FixedPoint:
 def pack(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray | FixedPoint]) -> bytes:
     """A data file: `header` and `arrays`, which are integers, float32 or `FixedPoint`.
 
-    Integers are stored exactly. Equal contents give equal bytes. Raises ValueError where a value is not finite, or too
-    many steps from zero.
+    Integers are stored exactly. Equal contents give equal bytes. Raises ValueError where a value is
+    not finite, or too many steps from zero.
     """
     entries: dict[str, Any] = {}
     blocks = []
@@ -49,7 +50,9 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray | FixedPoint
         blocks.append(block)
     complete = {"format": FORMAT, "version": VERSION, **header, "arrays": entries}
     text = json.dumps(complete, ensure_ascii=False, allow_nan=False).encode("utf-8")
-    raw = b"".join((MAGIC, VERSION.to_bytes(4, "little"), len(text).to_bytes(4, "little"), text, *blocks))
+    raw = b"".join(
+        (MAGIC, VERSION.to_bytes(4, "little"), len(text).to_bytes(4, "little"), text, *blocks)
+    )
     return gzip.compress(raw, GZIP_LEVEL, mtime=0)
 
 
@@ -58,21 +61,33 @@ def _entry(name: str, array: np.ndarray | FixedPoint) -> tuple[dict[str, Any], b
     if isinstance(array, FixedPoint):
         steps = np.rint(np.asarray(array.values, np.float64) / array.step)
         if not (np.abs(steps) < MAX_STEPS).all():
-            raise ValueError(f"{name} holds a value that is not finite, or beyond {MAX_STEPS * array.step:g}")
+            raise ValueError(
+                f"{name} holds a value that is not finite, or beyond {MAX_STEPS * array.step:g}"
+            )
         planes, low, block = _planes(steps.astype(np.int64))
-        return {"type": "fixed", "shape": list(steps.shape), "planes": planes, "low": low, "step": array.step}, block
+        return {
+            "type": "fixed",
+            "shape": list(steps.shape),
+            "planes": planes,
+            "low": low,
+            "step": array.step,
+        }, block
     if array.dtype.kind in "iub":
         planes, low, block = _planes(array.astype(np.int64))
         return {"type": "integer", "shape": list(array.shape), "planes": planes, "low": low}, block
     if not np.isfinite(array).all():
         raise ValueError(f"{name} holds a value that is not finite")
-    return {"type": "float32", "shape": list(array.shape)}, np.ascontiguousarray(array, "<f4").tobytes()
+    return {"type": "float32", "shape": list(array.shape)}, np.ascontiguousarray(
+        array, "<f4"
+    ).tobytes()
 
 
 def _planes(integers: np.ndarray) -> tuple[int, int, bytes]:
-    """(count, lowest value, bytes) of integers above their lowest: byte planes, least significant first.
+    """(count, lowest value, bytes) of integers above their lowest: byte planes, least significant
+    first.
 
-    Within a plane the last axis varies slowest, so that equal quantities lie side by side: gzip gains a fifth.
+    Within a plane the last axis varies slowest, so that equal quantities lie side by side: gzip
+    gains a fifth.
     """
     low = int(integers.min()) if integers.size else 0
     above = np.ascontiguousarray(np.moveaxis(integers - low, -1, 0)).ravel()
@@ -80,7 +95,11 @@ def _planes(integers: np.ndarray) -> tuple[int, int, bytes]:
     count = max(1, (largest.bit_length() + 7) // 8)
     if count > MAX_PLANES:
         raise ValueError(f"values from {low} to {low + largest} do not fit {MAX_PLANES} bytes")
-    return count, low, b"".join(((above >> 8 * plane) & 255).astype(np.uint8).tobytes() for plane in range(count))
+    return (
+        count,
+        low,
+        b"".join(((above >> 8 * plane) & 255).astype(np.uint8).tobytes() for plane in range(count)),
+    )
 
 
 BAKE_TOLERANCE_M = 5e-6
@@ -89,12 +108,14 @@ BAKE_TOLERANCE_M = 5e-6
 
 @dataclass(frozen=True)
 class WebRig:
-    """Blend shapes, skeleton and motion: V vertices, R blend shapes, J joints, T frames; meters and radians.
+    """Blend shapes, skeleton and motion: V vertices, R blend shapes, J joints, T frames; meters and
+    radians.
 
     base         (V, 3) vertices before blend shapes
     basis        (R, V, 3); the first `expressions` are sliders, which have the
                  `expression_names` or, without any, numbers
-    correctives  (9·(J − 1), V, 3), factors: the entries of the rotations of joints 1… minus identity
+    correctives  (9·(J − 1), V, 3), factors: the entries of the rotations of joints 1… minus
+                 identity
     joints       (J, 3); they move with the blend shapes by joint_basis (R, J, 3)
     parents      of the joints, -1 for the root
     weights      (V, J) of linear blend skinning
@@ -117,7 +138,8 @@ class WebRig:
 
 
 def flame_rig(sequence: FlameSequence) -> WebRig:
-    """The FLAME model of a sequence with the person's identity baked in; dynamic offsets become blend shapes."""
+    """The FLAME model of a sequence with the person's identity baked in; dynamic offsets become
+    blend shapes."""
     person = with_identity(sequence)
     model = person.model
     frames = [person.frame(timestep) for timestep in person.timesteps]
@@ -126,7 +148,9 @@ def flame_rig(sequence: FlameSequence) -> WebRig:
     offsets = [frame.dynamic_offset for frame in frames]
     if any(offset is not None for offset in offsets):
         zero = np.zeros_like(model.v_template)
-        shapes, factors = principal_shapes(np.stack([zero if offset is None else offset for offset in offsets]))
+        shapes, factors = principal_shapes(
+            np.stack([zero if offset is None else offset for offset in offsets])
+        )
         expressions = np.concatenate([expressions, shapes])
         coefficients = np.concatenate([coefficients, factors], axis=1)
     return WebRig(
@@ -147,7 +171,8 @@ def flame_rig(sequence: FlameSequence) -> WebRig:
 
 
 def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
-    """Posed meshes (V, 3) as one rigid motion and the principal components of what is left: a rig without sliders.
+    """Posed meshes (V, 3) as one rigid motion and the principal components of what is left: a rig
+    without sliders.
 
     Raises ValueError where there is none.
     """
@@ -177,14 +202,18 @@ def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
 
 
 def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes (R, V, 3) and coefficients (T, R) in −1…1 whose products are offsets (T, V, 3) to BAKE_TOLERANCE_M."""
+    """Shapes (R, V, 3) and coefficients (T, R) in −1…1 whose products are offsets (T, V, 3) to
+    BAKE_TOLERANCE_M."""
     frames, vertices = offsets.shape[:2]
     flat = offsets.reshape(frames, -1)
     _, directions = np.linalg.eigh(flat @ flat.T)
     directions = directions[:, ::-1]  # largest first
     shapes, rest = [], flat.copy()
     for column in directions.T:
-        if not frames or np.linalg.norm(rest.reshape(frames, vertices, 3), axis=2).max() <= BAKE_TOLERANCE_M:
+        if (
+            not frames
+            or np.linalg.norm(rest.reshape(frames, vertices, 3), axis=2).max() <= BAKE_TOLERANCE_M
+        ):
             break
         shapes.append(column @ flat)
         rest -= np.outer(column, shapes[-1])
@@ -196,8 +225,8 @@ def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 Arrays = dict[str, np.ndarray | FixedPoint]
 
-# Steps of fixed-point values: half of one is the largest error. Together they leave a picture of large
-# random splats 55 dB PSNR at least (tests/export/web/test_page.py).
+# Steps of fixed-point values: half of one is the largest error. Together they leave a picture of
+# large random splats 55 dB PSNR at least (tests/export/web/test_page.py).
 POSITION_STEP_M = 4e-6
 ROTATION_STEP = 1 / 724
 """The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each."""
@@ -208,12 +237,14 @@ COLOR_STEP = 0.004
 SH_STEP = 0.005
 STRAIN_COLOR_STEP = 0.008
 STRAIN_RANGE_STEP = 0.002
-"""Of the ends of a triangle's range, where strain is clipped: positions that follow it by 2 mm a unit err by 2 µm."""
+"""Of the ends of a triangle's range, where strain is clipped: positions that follow it by 2 mm a
+unit err by 2 µm."""
 OFFSET_STEPS_M = {"strain_position": POSITION_STEP_M / 16}
-"""Driven offset that the player has a signal for (`player/face_frames.js`) -> step of its coefficients.
+"""Driven offset that the player has a signal for (`player/face_frames.js`) -> step of its
+coefficients.
 
-Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a splat by 0.75 µm
-along an axis at most, where half of POSITION_STEP_M is 2 µm."""
+Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a
+splat by 0.75 µm along an axis at most, where half of POSITION_STEP_M is 2 µm."""
 TRANSFER_STEP = 2.0**-12
 """Of irradiance over radiance, which is at most π."""
 SHARE_STEP = 1 / 255
@@ -236,10 +267,12 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     """
     relighter = None if avatar.light is None else Relighter(avatar)
     surface = avatar.splats.face if relighter is None else relighter.face
-    order = np.lexsort((surface, avatar.splats.face))  # equal triangles side by side, which gzip likes
+    # equal triangles side by side, which gzip likes
+    order = np.lexsort((surface, avatar.splats.face))
     splats = avatar.splats.rows(order)
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
-    unit = float(frames.scale.max(initial=1e-6))  # meters of a unit of the splats' local frames, where it is largest
+    # meters of a unit of the splats' local frames, where it is largest
+    unit = float(frames.scale.max(initial=1e-6))
     arrays = _splat_arrays(splats, unit) | _driven_arrays(avatar, unit)
     arrays |= {
         "faces": avatar.faces,
@@ -254,11 +287,16 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
     if exact:
-        arrays = {name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a for name, a in arrays.items()}
+        arrays = {
+            name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a
+            for name, a in arrays.items()
+        }
     return pack(_header(avatar, rig, playback, relighter), arrays)
 
 
-def _header(avatar: Avatar, rig: WebRig, playback: Playback, relighter: Relighter | None) -> dict[str, Any]:
+def _header(
+    avatar: Avatar, rig: WebRig, playback: Playback, relighter: Relighter | None
+) -> dict[str, Any]:
     controls = playback.controls if rig.expressions else None
     return {
         "title": playback.title,
@@ -274,7 +312,13 @@ def _header(avatar: Avatar, rig: WebRig, playback: Playback, relighter: Relighte
         **(
             {}
             if controls is None
-            else {"shapes": {"names": list(controls.names), "opens": controls.opens, "limited": controls.limited}}
+            else {
+                "shapes": {
+                    "names": list(controls.names),
+                    "opens": controls.opens,
+                    "limited": controls.limited,
+                }
+            }
         ),
         **({} if relighter is None else {"light": _light(relighter)}),
         "views": [
@@ -296,7 +340,10 @@ def _sliders(rig: WebRig) -> list[dict[str, Any]]:
     used = rig.coefficients[:, : rig.expressions]
     reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
     order = np.argsort(-used.std(0), kind="stable") if len(used) else np.arange(rig.expressions)
-    return [{"name": names[k], "component": k, "reach": round(float(reach[k]), 2)} for k in order.tolist()]
+    return [
+        {"name": names[k], "component": k, "reach": round(float(reach[k]), 2)}
+        for k in order.tolist()
+    ]
 
 
 def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
@@ -312,13 +359,16 @@ def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
     if splats.sh.shape[1] > 1:
         arrays["sh"] = FixedPoint(splats.sh[:, 1:].reshape(len(splats), -1), SH_STEP)
     if splats.strain_color.shape[1]:
-        arrays["strain_color"] = FixedPoint(splats.strain_color.reshape(len(splats), -1), STRAIN_COLOR_STEP)
+        arrays["strain_color"] = FixedPoint(
+            splats.strain_color.reshape(len(splats), -1), STRAIN_COLOR_STEP
+        )
     return arrays
 
 
 def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index (N,) of the part of largest magnitude of quaternions (N, 4), and the others (N, 3) in order, of the unit
-    quaternion whose largest part is positive. A zero quaternion counts as the identity."""
+    """Index (N,) of the part of largest magnitude of quaternions (N, 4), and the others (N, 3) in
+    order, of the unit quaternion whose largest part is positive. A zero quaternion counts as the
+    identity."""
     q = normalized(rotation)
     largest = np.abs(q).argmax(1)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
@@ -340,14 +390,19 @@ def _driven_arrays(avatar: Avatar, local_unit: float) -> Arrays:
 
 
 def _light(relighter: Relighter) -> dict[str, Any]:
-    """What is one for the whole head: how much albedo is drawn to its mean, that, and the light of the capture."""
+    """What is one for the whole head: how much albedo is drawn to its mean, that, and the light of
+    the capture."""
     recorded = relighter.recorded_light.ravel().tolist()
-    return {"damping": relighter.light.damping, "typical": relighter.typical_albedo.tolist(), "recorded": recorded}
+    return {
+        "damping": relighter.light.damping,
+        "typical": relighter.typical_albedo.tolist(),
+        "recorded": recorded,
+    }
 
 
 def _light_arrays(relighter: Relighter | None, order: np.ndarray, local_unit: float) -> Arrays:
-    """How the vertices receive light, what the capture's light gave them, on which triangles the splats lie, and
-    lashes."""
+    """How the vertices receive light, what the capture's light gave them, on which triangles the
+    splats lie, and lashes."""
     if relighter is None:
         return {}
     light, lashes, faces = relighter.light, relighter.lashes, len(relighter.avatar.faces)
@@ -357,9 +412,12 @@ def _light_arrays(relighter: Relighter | None, order: np.ndarray, local_unit: fl
         "light_occlusion": FixedPoint(light.occlusion, SHARE_STEP),
         "light_irradiance": FixedPoint(light.irradiance, largest / IRRADIANCE_STEPS),
         "light_roughness": FixedPoint(light.roughness, SHARE_STEP),
-        "light_face": ((relighter.face - relighter.avatar.splats.face) % faces)[order],  # of most splats 0: their own
+        # of most splats 0: their own
+        "light_face": ((relighter.face - relighter.avatar.splats.face) % faces)[order],
         "light_lash_face": lashes.face,
-        "light_lash_corners": FixedPoint(lashes.corners.reshape(-1, 12), POSITION_STEP_M / local_unit),
+        "light_lash_corners": FixedPoint(
+            lashes.corners.reshape(-1, 12), POSITION_STEP_M / local_unit
+        ),
     }
 
 

@@ -1,4 +1,5 @@
-"""The web page of an avatar: player, styles and data in one HTML file, or data and player for a server."""
+"""The web page of an avatar: player, styles and data in one HTML file, or data and player for a
+server."""
 
 import base64
 import html
@@ -33,7 +34,8 @@ TYPES = re.compile(
 
 @cache
 def element_script() -> str:
-    """The custom element as one module: the player's files without their imports and exports, under their licence."""
+    """The custom element as one module: the player's files without their imports and exports, under
+    their licence."""
     licence = (PLAYER / "LICENSE").read_text(encoding="utf-8")
     return "/*!\n" + licence + "*/\n" + "\n".join(map(_source, modules()))
 
@@ -46,7 +48,8 @@ def modules(name: str = ELEMENT) -> tuple[str, ...]:
 
 
 def _source(name: str) -> str:
-    """A module without its imports, exports and types, and with the GLSL that it shares with Blender's shaders."""
+    """A module without its imports, exports and types, and with the GLSL that it shares with
+    Blender's shaders."""
     source = (PLAYER / name).read_text(encoding="utf-8")
     for comment in (IMPORT, EXPORT, TYPES):
         source = comment.sub("", source)
@@ -55,7 +58,8 @@ def _source(name: str) -> str:
 
 
 def page(title: str, notice: str, data: bytes) -> str:
-    """The HTML of a page that plays `data` (`data_file`); `notice`: a sentence on its licence, or ""."""
+    """The HTML of a page that plays `data` (`data_file`); `notice`: a sentence on its licence, or
+    ""."""
     template = (PLAYER / "page.html").read_text(encoding="utf-8")
     parts = {
         "title": html.escape(title),
@@ -68,10 +72,9 @@ def page(title: str, notice: str, data: bytes) -> str:
 
 
 BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
-"""About what a splat, and a coefficient of its color, takes in a page: compressed, then written as text."""
-BUNDLED_NOTICE = (
-    "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for Creative Technologies."
-)
+"""About what a splat, and a coefficient of its color, takes in a page: compressed, then written as
+text."""
+BUNDLED_NOTICE = "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for Creative Technologies."
 RIG_NOTICE = (
     "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides "
     "who may receive them."
@@ -89,14 +92,19 @@ def write_web(
     meshes: Iterable[np.ndarray] = (),
     sequence: FlameSequence | None = None,
 ) -> list[Path]:
-    """Write a page that plays the avatar, or an .stga data file with the player beside it; returns the files.
+    """Write a page that plays the avatar, or an .stga data file with the player beside it; returns
+    the files.
 
-    sequence  the FLAME motion, whose rig and sliders go along unless `playback.motion_only`; else the posed `meshes`
-              (V, 3) meters are baked, of which there is one at least
+    sequence  the FLAME motion, whose rig and sliders go along unless `playback.motion_only`; else
+              the posed `meshes` (V, 3) meters are baked, of which there is one at least
     Raises StgaError where there is no pose, or a file cannot be written.
     """
     try:
-        rig = baked_rig(list(meshes)) if playback.motion_only or sequence is None else flame_rig(sequence)
+        rig = (
+            baked_rig(list(meshes))
+            if playback.motion_only or sequence is None
+            else flame_rig(sequence)
+        )
         data = data_file(avatar, rig, playback)
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
@@ -112,7 +120,8 @@ def write_web(
 
 
 def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bool) -> str:
-    """What a page of the avatar holds of a head model, and whose licence that has; "" for a head of the user's own.
+    """What a page of the avatar holds of a head model, and whose licence that has; "" for a head of
+    the user's own.
 
     Without a sequence, FLAME's mesh is known by its number of vertices.
     """
@@ -126,5 +135,7 @@ def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bo
 
 def web_bytes(avatar: Avatar) -> int:
     """About the size of a page of the avatar."""
-    colors = avatar.splats.sh[0].size + avatar.splats.strain_color[0].size if len(avatar.splats) else 0
+    colors = (
+        avatar.splats.sh[0].size + avatar.splats.strain_color[0].size if len(avatar.splats) else 0
+    )
     return round((BYTES_PER_SPLAT + BYTES_PER_COEFFICIENT * colors) * len(avatar.splats))

@@ -21,7 +21,8 @@ def render_differentiable(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Differentiable rendering of float32 torch tensors.
 
-    Without frames and face the splats are world-space ones. Returns rgb (3, H, W) premultiplied on black,
+    Without frames and face the splats are world-space ones. Returns rgb (3, H, W) premultiplied on
+    black,
     alpha (H, W), and depth (H, W) = Σ weight · camera z.
     """
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
@@ -45,7 +46,12 @@ class _Blend(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         rendering = render_forward(
-            splats, face, camera_frames, degree, depth_as_color=depth_as_color, antialiased=antialiased
+            splats,
+            face,
+            camera_frames,
+            degree,
+            depth_as_color=depth_as_color,
+            antialiased=antialiased,
         )
         ctx.saved = camera_frames, face, splats, rendering
         return torch.from_numpy(rendering.image), torch.from_numpy(rendering.transmittance)
@@ -56,4 +62,11 @@ class _Blend(torch.autograd.Function):
         gradients = Parameters(*(np.zeros_like(a) for a in splats if a is not None))
         v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
         render_backward(rendering, splats, face, camera_frames, v_rgb, gradients, v_t)
-        return None, None, None, None, None, *(torch.from_numpy(g) for g in gradients if g is not None)
+        return (
+            None,
+            None,
+            None,
+            None,
+            None,
+            *(torch.from_numpy(g) for g in gradients if g is not None),
+        )

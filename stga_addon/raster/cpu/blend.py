@@ -1,22 +1,37 @@
 """Alpha blending of the splats of each 16×16 tile, forward and backward.
 
-A pixel takes splats front to back and stops before the one whose transmittance would be ≤ 1e-4. The forward
-stores each pixel's last contributing pair and the backward obeys it, so transmittance never underflows behind
-many opaque splats.
+A pixel takes splats front to back and stops before the one whose transmittance would be ≤ 1e-4. The
+forward stores each pixel's last contributing pair and the backward obeys it, so transmittance never
+underflows behind many opaque splats.
 
-The unit of work is a block of 4×4 pixels that a splat reaches. The blocks of several splats are listed first, and each
-step then is one loop over the list: loops over the pixels of one splat are so short that the processor loses more time
-where they end than in them. A block's 16 pixels are one to four vectors on every processor.
+The unit of work is a block of 4×4 pixels that a splat reaches. The blocks of several splats are
+listed first, and each step then is one loop over the list: loops over the pixels of one splat are
+so short that the processor loses more time where they end than in them. A block's 16 pixels are one
+to four vectors on every processor.
 
-Loops over pixels neither load nor store under a condition: NEON and AVX2 have no fast instruction for either, so LLVM
-would emit masked stores or no vectors at all. Both sides of a choice are computed, and every pixel is stored.
+Loops over pixels neither load nor store under a condition: NEON and AVX2 have no fast instruction
+for either, so LLVM would emit masked stores or no vectors at all. Both sides of a choice are
+computed, and every pixel is stored.
 """
 
 import numpy as np
 
 from . import inline_jit, kernel_jit, part_jit
 from .elementary import prefetch
-from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PIXELS, PRECISION_X, PRECISION_Y, PROJECTED, RED, SHEAR, TILE
+from .layout import (
+    BLUE,
+    GREEN,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    PIXELS,
+    PRECISION_X,
+    PRECISION_Y,
+    PROJECTED,
+    RED,
+    SHEAR,
+    TILE,
+)
 from .outline import outline, rows_within
 from .threads import next_piece, parallel
 
@@ -32,14 +47,15 @@ BLOCKS_ALONG = TILE // SIDE
 BLOCKS = BLOCKS_ALONG * BLOCKS_ALONG
 """Of a tile, column by column; the pixels of each are stored one after the other, row by row."""
 
-# Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be negative wraps
-# around in Python, and the test for it keeps LLVM from vectorizing (12 times slower).
-# The first values are the transmittance: in the forward pass negative once the pixel has stopped.
+# Where a pixel's values lie in the tile's flat array. Unsigned, because a signed index that may be
+# negative wraps around in Python, and the test for it keeps LLVM from vectorizing (12 times
+# slower). The first values are the transmittance: in the forward pass negative once the pixel has
+# stopped.
 SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, BEHIND = (np.uint64(n * PIXELS) for n in range(1, 8))
 V_RED, V_GREEN, V_BLUE = SUM_RED, SUM_GREEN, SUM_BLUE
 PAIRS_PER_GROUP = 8
-"""Splats whose blocks are listed together; after each group, the forward pass looks again which blocks are not yet
-behind something opaque."""
+"""Splats whose blocks are listed together; after each group, the forward pass looks again which
+blocks are not yet behind something opaque."""
 LISTED = PAIRS_PER_GROUP * BLOCKS
 """Blocks that a list holds at most."""
 # Behind the tile's values, those of the listed blocks; the forward pass has only the first.
@@ -49,8 +65,9 @@ LISTED = PAIRS_PER_GROUP * BLOCKS
 FORWARD_SIZE = 8 * PIXELS + LISTED * BLOCK_PIXELS
 BACKWARD_SIZE = 8 * PIXELS + 7 * LISTED * BLOCK_PIXELS
 
-# A tile's splats are copied a batch at a time, while memory is asked for the next ones, which lie all over it. The
-# blocks that a batch reaches are computed in vectors. Column c of splat q lies at c·BATCH_PAIRS + q of a flat array.
+# A tile's splats are copied a batch at a time, while memory is asked for the next ones, which lie
+# all over it. The blocks that a batch reaches are computed in vectors. Column c of splat q lies at
+# c·BATCH_PAIRS + q of a flat array.
 BATCH_PAIRS = 32
 (AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN, AT_BLUE, AT_EXTENT_Y,
  AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip
@@ -62,7 +79,8 @@ RUN_TILES = 4
 
 @inline_jit
 def _exp2(x):
-    """2^x for x ≤ 0 to 2e-7 relative: exponent bits by shift, the fraction by a degree-5 polynomial."""
+    """2^x for x ≤ 0 to 2e-7 relative: exponent bits by shift, the fraction by a degree-5
+    polynomial."""
     x = max(x, np.float32(-120.0))
     whole = np.floor(x)
     f = x - whole
@@ -77,7 +95,8 @@ def _exp2(x):
 
 @part_jit
 def _prefetch_batch(pair_splat, first, past, projected):
-    """Ask memory for the projected splats of the pairs from `first` to `past`: each in one or two cache lines."""
+    """Ask memory for the projected splats of the pairs from `first` to `past`: each in one or two
+    cache lines."""
     for j in range(np.uint64(first), np.uint64(past)):
         row = np.uint64(pair_splat[j]) * np.uint64(PROJECTED)
         prefetch(projected, row)
@@ -86,12 +105,22 @@ def _prefetch_batch(pair_splat, first, past, projected):
 
 @part_jit
 def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
-    """Copy the projected splats of `count` pairs from `first` on; centers relative to the tile's corner (x0, y0)."""
+    """Copy the projected splats of `count` pairs from `first` on; centers relative to the tile's
+    corner (x0, y0)."""
     for q in range(np.uint64(count)):
         i = np.uint64(pair_splat[np.uint64(first) + q])
-        batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q] = projected[i, MEAN_X] - x0, projected[i, MEAN_Y] - y0
-        batch[AT_PRECISION_X + q], batch[AT_SHEAR + q] = projected[i, PRECISION_X], projected[i, SHEAR]
-        batch[AT_PRECISION_Y + q], batch[AT_OPACITY + q] = projected[i, PRECISION_Y], projected[i, OPACITY]
+        batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q] = (
+            projected[i, MEAN_X] - x0,
+            projected[i, MEAN_Y] - y0,
+        )
+        batch[AT_PRECISION_X + q], batch[AT_SHEAR + q] = (
+            projected[i, PRECISION_X],
+            projected[i, SHEAR],
+        )
+        batch[AT_PRECISION_Y + q], batch[AT_OPACITY + q] = (
+            projected[i, PRECISION_Y],
+            projected[i, OPACITY],
+        )
         batch[AT_RED + q], batch[AT_GREEN + q] = projected[i, RED], projected[i, GREEN]
         batch[AT_BLUE + q] = projected[i, BLUE]
         batch[AT_RATE_X + q] = np.float32(-0.5) * LOG2E * projected[i, PRECISION_X]
@@ -111,7 +140,9 @@ def _find_blocks(count, batch):
         for column in range(BLOCKS_ALONG):
             first, past = rows_within(ellipse, np.float32(column * SIDE), side, rows)
             low, high = np.int32(np.floor(first / side)), np.int32(np.ceil(past / side))
-            reached = np.int32(max(np.int32(0), np.int32(np.int32(one << high) - np.int32(one << low))))
+            reached = np.int32(
+                max(np.int32(0), np.int32(np.int32(one << high) - np.int32(one << low)))
+            )
             bits = np.int32(bits | np.int32(reached << np.int32(column * BLOCKS_ALONG)))
         batch[AT_BLOCKS + q] = np.float32(bits)  # of 16 bits, exact
 
@@ -130,8 +161,9 @@ def _blocks_alive(s):
 
 @part_jit
 def _list_blocks(listed, count, q, reached):
-    """Append the blocks of splat q of a batch to the list; returns how many it then holds. One is q·256 + the index of
-    its first pixel. Without a branch: the processor could not foresee which bits are set."""
+    """Append the blocks of splat q of a batch to the list; returns how many it then holds. One is
+    q·256 + the index of its first pixel. Without a branch: the processor could not foresee which
+    bits are set."""
     for block in range(np.uint64(BLOCKS)):
         listed[count] = np.uint16(q * np.uint64(PIXELS) + block * np.uint64(BLOCK_PIXELS))
         count += (np.uint64(reached) >> block) & np.uint64(1)
@@ -151,13 +183,16 @@ def _set_coordinates(s):
     for row in range(TILE):
         for column in range(TILE):
             p = _pixel(column, row)
-            s[X + p], s[Y + p] = np.float32(column) + np.float32(0.5), np.float32(row) + np.float32(0.5)
+            s[X + p], s[Y + p] = (
+                np.float32(column) + np.float32(0.5),
+                np.float32(row) + np.float32(0.5),
+            )
 
 
 @inline_jit
 def _listed(listed, n):
-    """Of the n-th listed block: its splat, its first pixel in the tile, and where its own values begin. The bounds that
-    LLVM sees here tell it that these do not overlap the tile's."""
+    """Of the n-th listed block: its splat, its first pixel in the tile, and where its own values
+    begin. The bounds that LLVM sees here tell it that these do not overlap the tile's."""
     entry = np.uint64(listed[n])
     at = (n % np.uint64(LISTED)) * np.uint64(BLOCK_PIXELS)
     return entry // np.uint64(PIXELS), entry % np.uint64(PIXELS), at
@@ -165,8 +200,9 @@ def _listed(listed, n):
 
 @inline_jit
 def _falloff(count, listed, batch, keeps_offsets, s):
-    """Write opacity · exp(power) of the listed blocks to s[ALPHA], and if wished the offsets that the power is made of
-    to s[DX] and s[DY]. A loop of its own: together with blending, it needs more registers than AVX2 has."""
+    """Write opacity · exp(power) of the listed blocks to s[ALPHA], and if wished the offsets that
+    the power is made of to s[DX] and s[DY]. A loop of its own: together with blending, it needs
+    more registers than AVX2 has."""
     for n in range(np.uint64(count)):
         q, first, at = _listed(listed, n)
         mean_x, mean_y, shear = batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_SHEAR + q]
@@ -183,7 +219,8 @@ def _falloff(count, listed, batch, keeps_offsets, s):
 
 @inline_jit
 def _blend(count, listed, before, batch, s):
-    """Blend the listed blocks; before: how many splats of the tile's list precede the batch's first one."""
+    """Blend the listed blocks; before: how many splats of the tile's list precede the batch's first
+    one."""
     for n in range(np.uint64(count)):
         q, first, at = _listed(listed, n)
         red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
@@ -200,9 +237,12 @@ def _blend(count, listed, before, batch, s):
             s[SUM_RED + p] += weight * red
             s[SUM_GREEN + p] += weight * green
             s[SUM_BLUE + p] += weight * blue
-            # Positive floats order like their bits; of integers LLVM takes the maximum without a conditional store.
+            # Positive floats order like their bits; of integers LLVM takes the maximum without a
+            # conditional store.
             reached = order if weight > np.float32(0.0) else np.int32(0)
-            s[LAST + p] = np.int32(max(np.float32(s[LAST + p]).view(np.int32), reached)).view(np.float32)
+            s[LAST + p] = np.int32(max(np.float32(s[LAST + p]).view(np.int32), reached)).view(
+                np.float32
+            )
 
 
 @part_jit
@@ -259,10 +299,16 @@ def _store_tile(s, left, top, background, blended):
 def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background, blended):
     """Render the listed tiles to `blended`; the tuples are those of `layout.py`.
 
-    tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; tile_rows (tiles, 4): their rows that are needed, see
-    `find_needed_rows`; pixels of the others are undefined. background (3,): composited behind the splats.
+    tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; tile_rows (tiles, 4): their rows that
+    are needed, see `find_needed_rows`; pixels of the others are undefined. background (3,):
+    composited behind the splats.
     """
-    start, pair_splat, projected, extent_y = lists.start, lists.pair_splat, projection.columns, projection.extent_y
+    start, pair_splat, projected, extent_y = (
+        lists.start,
+        lists.pair_splat,
+        projection.columns,
+        projection.extent_y,
+    )
     pair_blocks = blended.pair_blocks
     s, batch = np.empty(FORWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
@@ -286,15 +332,27 @@ def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background
                 _prefetch_batch(pair_splat, batch_begin + count, next_end, projected)
                 for j in range(np.uint64(batch_begin + count), np.uint64(next_end)):
                     prefetch(extent_y, np.uint64(pair_splat[j]))
-                _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
+                _copy_batch(
+                    pair_splat,
+                    batch_begin,
+                    count,
+                    projected,
+                    np.float32(left),
+                    np.float32(top),
+                    batch,
+                )
                 for q in range(np.uint64(count)):
-                    batch[AT_EXTENT_Y + q] = extent_y[np.uint64(pair_splat[np.uint64(batch_begin) + q])]
+                    batch[AT_EXTENT_Y + q] = extent_y[
+                        np.uint64(pair_splat[np.uint64(batch_begin) + q])
+                    ]
                 _find_blocks(count, batch)
                 for group in range(0, count, PAIRS_PER_GROUP):
                     if group > 0:
                         alive = _blocks_alive(s)
                     blocks = np.uint64(0)
-                    for q in range(np.uint64(group), np.uint64(min(count, group + PAIRS_PER_GROUP))):
+                    for q in range(
+                        np.uint64(group), np.uint64(min(count, group + PAIRS_PER_GROUP))
+                    ):
                         reached = np.uint16(np.uint16(batch[AT_BLOCKS + q]) & alive)
                         pair_blocks[np.uint64(batch_begin) + q] = reached
                         blocks = _list_blocks(listed, blocks, q, reached)
@@ -315,8 +373,8 @@ def _blocks_of_wanted(first, past, pair_splat, pair_blocks, wanted):
 
 @inline_jit
 def _unblend(count, listed, before, batch, s):
-    """Take the listed blocks off again: the gradient of their power to s[V_POWER], those of the splat's color to
-    s[PART_RED], s[PART_GREEN] and s[PART_BLUE]."""
+    """Take the listed blocks off again: the gradient of their power to s[V_POWER], those of the
+    splat's color to s[PART_RED], s[PART_GREEN] and s[PART_BLUE]."""
     for n in range(np.uint64(count)):
         q, first, at = _listed(listed, n)
         red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
@@ -337,14 +395,15 @@ def _unblend(count, listed, before, batch, s):
             s[PART_RED + own] = weight * v_red
             s[PART_GREEN + own] = weight * v_green
             s[PART_BLUE + own] = weight * v_blue
-            # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does not reach.
+            # d alpha / d power through the clamp is zero; `a` zeroes pixels that this splat does
+            # not reach.
             s[V_POWER + own] = a * v_a if raw < MAX_ALPHA else np.float32(0.0)
 
 
 @inline_jit
 def _sum_gradient(first, past, s, sums):
-    """Write the sums of a splat's blocks, from value `first` to before `past`: of the power's gradient times 1, dx, dy,
-    dx², dx·dy and dy², and of the color's gradients."""
+    """Write the sums of a splat's blocks, from value `first` to before `past`: of the power's
+    gradient times 1, dx, dy, dx², dx·dy and dy², and of the color's gradients."""
     g0 = gx = gy = gxx = gxy = gyy = red = green = blue = np.float32(0.0)
     for p in range(first, past):
         dx, dy, g = s[DX + p], s[DY + p], s[V_POWER + p]
@@ -365,7 +424,11 @@ def _sum_gradient(first, past, s, sums):
 @part_jit
 def _store_pair(grads, j, q, batch, sums):
     """Write the gradient of pair j, splat q of a batch, from the sums of `_sum_gradient`."""
-    precision_x, precision_y, shear = batch[AT_PRECISION_X + q], batch[AT_PRECISION_Y + q], batch[AT_SHEAR + q]
+    precision_x, precision_y, shear = (
+        batch[AT_PRECISION_X + q],
+        batch[AT_PRECISION_Y + q],
+        batch[AT_SHEAR + q],
+    )
     grads[j, MEAN_X] = precision_x * sums[1]
     grads[j, MEAN_Y] = precision_y * sums[2] - shear * precision_x * sums[1]
     grads[j, PRECISION_X] = np.float32(-0.5) * sums[3]
@@ -377,13 +440,16 @@ def _store_pair(grads, j, q, batch, sums):
 
 @part_jit
 def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
-    """Copy what the backward pass needs of a tile's pixels. Returns the deepest of their last pairs, counted from 1."""
+    """Copy what the backward pass needs of a tile's pixels. Returns the deepest of their last
+    pairs, counted from 1."""
     transmittance, last = blended.transmittance, blended.last
     height, width = last.shape
     if left + TILE > width or top + TILE > height:  # pixels outside the image
         for p in range(np.uint64(PIXELS)):
             s[p] = np.float32(1.0)
-            s[BEHIND + p] = s[V_RED + p] = s[V_GREEN + p] = s[V_BLUE + p] = s[LAST + p] = np.float32(0.0)
+            s[BEHIND + p] = s[V_RED + p] = s[V_GREEN + p] = s[V_BLUE + p] = s[LAST + p] = (
+                np.float32(0.0)
+            )
     deepest = np.int32(0)
     for y in range(np.uint64(top), np.uint64(min(top + TILE, height))):
         for x0 in range(left, min(left + TILE, width), SIDE):
@@ -409,11 +475,13 @@ def blend_backward(
     work, tiles, tiles_x, lists, blended, wanted, projected, background, v_image, v_transmittance,
     pair_gradients,
 ):  # fmt: skip
-    """Write the gradient of every wanted (tile, splat) pair of the listed tiles to pair_gradients (P, PROJECTED).
+    """Write the gradient of every wanted (tile, splat) pair of the listed tiles to pair_gradients
+    (P, PROJECTED).
 
-    wanted (N,) bool: splats whose gradient is needed. projected (N, PROJECTED): the columns of the projection. v_image
-    (3, H, W), v_transmittance (H, W): gradients of the image over the background and of the transmittance. Each pair
-    has a row of its own, so that the sum over a splat's pairs has one order whatever the threads do.
+    wanted (N,) bool: splats whose gradient is needed. projected (N, PROJECTED): the columns of the
+    projection. v_image (3, H, W), v_transmittance (H, W): gradients of the image over the
+    background and of the transmittance. Each pair has a row of its own, so that the sum over a
+    splat's pairs has one order whatever the threads do.
     """
     start, pair_splat, pair_blocks = lists.start, lists.pair_splat, blended.pair_blocks
     s, batch = np.empty(BACKWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
@@ -428,7 +496,9 @@ def blend_backward(
             begin = start[tile]
             if begin == start[tile + 1]:
                 continue
-            deepest = begin + _load_tile(s, left, top, background, v_image, v_transmittance, blended)
+            deepest = begin + _load_tile(
+                s, left, top, background, v_image, v_transmittance, blended
+            )
             pair_gradients[deepest : start[tile + 1], :] = np.float32(0.0)
             nearest = begin  # nothing in front of the first wanted pair needs to be walked
             while nearest < deepest and not wanted[pair_splat[nearest]]:
@@ -437,8 +507,18 @@ def blend_backward(
             for batch_end in range(deepest, nearest, -BATCH_PAIRS):
                 batch_begin = max(nearest, batch_end - BATCH_PAIRS)
                 count = batch_end - batch_begin
-                _prefetch_batch(pair_splat, max(nearest, batch_begin - BATCH_PAIRS), batch_begin, projected)
-                _copy_batch(pair_splat, batch_begin, count, projected, np.float32(left), np.float32(top), batch)
+                _prefetch_batch(
+                    pair_splat, max(nearest, batch_begin - BATCH_PAIRS), batch_begin, projected
+                )
+                _copy_batch(
+                    pair_splat,
+                    batch_begin,
+                    count,
+                    projected,
+                    np.float32(left),
+                    np.float32(top),
+                    batch,
+                )
                 for group_end in range(count, 0, -PAIRS_PER_GROUP):
                     group = min(group_end, PAIRS_PER_GROUP)
                     blocks = np.uint64(0)

@@ -1,7 +1,8 @@
-"""Kernels that an edition of the extension brings compiled, so that the first training does not wait for a compiler.
+"""Kernels that an edition of the extension brings compiled, so that the first training does not
+wait for a compiler.
 
-They need x86-64-v3: AVX2, FMA and what else NEEDED_FEATURES lists. A processor with AVX-512 compiles its own in the
-background, which are faster, and uses these until then.
+They need x86-64-v3: AVX2, FMA and what else NEEDED_FEATURES lists. A processor with AVX-512
+compiles its own in the background, which are faster, and uses these until then.
 """
 
 import os
@@ -18,12 +19,13 @@ from numba.core.caching import UserProvidedCacheLocator
 from ..kernel_cache import OWN_KERNELS, has_kernels
 
 PACKAGE = "stga_addon"
-"""Under which workers import the package. A compiled kernel refers to its modules by name; inside of Blender they have
-other names, and other kernels."""
+"""Under which workers import the package. A compiled kernel refers to its modules by name; inside
+of Blender they have other names, and other kernels."""
 BUNDLE = Path(__file__).with_name("compiled")
 """Folder of Numba's cache files; only in an edition that brings them."""
 PROCESSOR, MACHINES = "x86-64-v3", ("x86_64", "AMD64")
-"""LLVM's name of the processor that they are compiled for, and what `platform.machine` calls its kind."""
+"""LLVM's name of the processor that they are compiled for, and what `platform.machine` calls its
+kind."""
 NEEDED_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
 FASTER_FEATURE = "avx512f"
 
@@ -31,8 +33,9 @@ FASTER_FEATURE = "avx512f"
 def kernel_folder(own: Path, beside: Path) -> tuple[Path, bool]:
     """The folder of compiled kernels, and whether they are the bundled ones.
 
-    own: that of this processor's kernels; beside: of bundled ones where the processor is faster with its own.
-    Has to be called before Numba compiles or loads anything: the name of the processor is a part of a kernel's key.
+    own: that of this processor's kernels; beside: of bundled ones where the processor is faster
+    with its own. Has to be called before Numba compiles or loads anything: the name of the
+    processor is a part of a kernel's key.
     """
     features = get_host_cpu_features()
     runs = platform.machine() in MACHINES and all(features.get(name) for name in NEEDED_FEATURES)
@@ -49,7 +52,8 @@ def kernel_folder(own: Path, beside: Path) -> tuple[Path, bool]:
 
 
 def _copy_bundle(folder: Path) -> None:
-    """Copy the bundle to where Numba looks for kernels of these files: it writes there, which an extension must not."""
+    """Copy the bundle to where Numba looks for kernels of these files: it writes there, which an
+    extension must not."""
     if has_kernels(folder):
         return
     path = folder / UserProvidedCacheLocator.get_suitable_cache_subpath(__file__)

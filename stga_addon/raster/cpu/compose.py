@@ -1,4 +1,5 @@
-"""Several sets of splats in one picture, sorted by depth together, with alpha and depth for compositing."""
+"""Several sets of splats in one picture, sorted by depth together, with alpha and depth for
+compositing."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +24,9 @@ from .rasterize import (
 from .tiles import sum_tiles, whole_tiles
 
 
-def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
+def compose(
+    layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
+) -> ComposedImage:
     """Render layers with a camera; one layer gives the pixels of `render`."""
     buffers, begin = BufferPool(), 0
     tiles_x, tiles_y = tile_grid(camera.width, camera.height)
@@ -31,7 +34,9 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
     everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
     for layer in layers:
         splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
-        parameters = Parameters(*(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields))
+        parameters = Parameters(
+            *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
+        )
         project_forward(
             np.arange(len(splats)), everywhere, with_strain_color(parameters), splats.face, layer_frames(layer,
             camera), splats.sh_degree, False, layer.antialiased, Projection(*(array[rows] for array in projection)),
@@ -48,12 +53,16 @@ def compose(layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = Fa
     projection.columns[:, GREEN] = projection.columns[:, BLUE] = 0
     blended = new_image(camera.width, camera.height, lists, BufferPool())
     blend_forward(tiles, tiles_x, whole, lists, projection, BLACK_BACKGROUND, blended)
-    return ComposedImage(rgb, alpha, blended.image[0] / np.maximum(alpha, np.finfo(np.float32).tiny))
+    return ComposedImage(
+        rgb, alpha, blended.image[0] / np.maximum(alpha, np.finfo(np.float32).tiny)
+    )
 
 
 def layer_frames(layer: PosedSplats, camera: Camera) -> CameraFrames:
-    """A layer's frames in camera space; its splats' directions stay those of the space they were trained in."""
+    """A layer's frames in camera space; its splats' directions stay those of the space they were
+    trained in."""
     to_camera = camera.world_to_camera @ layer.to_world
     frames = frames_in_camera(layer.frames, replace(camera, world_to_camera=to_camera))
-    u, _, v = np.linalg.svd(to_camera[:3, :3])  # the rotation in it; scale and reflection do not change a direction
+    # the rotation in it; scale and reflection do not change a direction
+    u, _, v = np.linalg.svd(to_camera[:3, :3])
     return frames._replace(to_world=np.ascontiguousarray((u @ v).T, np.float32))

@@ -1,5 +1,6 @@
-"""Exponential and logarithm for loops that LLVM vectorizes: the C library's are calls, one value at a time. And
-instructions that Python has no name for: prefetching, and what threads read and write at the same time."""
+"""Exponential and logarithm for loops that LLVM vectorizes: the C library's are calls, one value at
+a time. And instructions that Python has no name for: prefetching, and what threads read and write
+at the same time."""
 
 from typing import Any
 
@@ -15,7 +16,8 @@ LOG2E, LN2 = np.float32(1.4426950408889634), np.float32(0.6931471805599453)
 E2, E3, E4 = np.float32(4.999998791e-1), np.float32(1.666651248e-1), np.float32(4.166964626e-2)
 E5, E6 = np.float32(8.369628373e-3), np.float32(1.374882306e-3)
 SQRT_HALF_BITS = np.int32(0x3F3504F3)
-"""The bits of √½ in float32: subtracted from those of a number, they leave its exponent above those of its fraction."""
+"""The bits of √½ in float32: subtracted from those of a number, they leave its exponent above those
+of its fraction."""
 
 
 @inline_jit
@@ -36,7 +38,8 @@ def exponential(x):
 
 @inline_jit
 def logarithm(x):
-    """ln x to 2e-7, absolute or relative, of a positive normal number; some −87 for 0; undefined for others."""
+    """ln x to 2e-7, absolute or relative, of a positive normal number; some −87 for 0; undefined
+    for others."""
     bits = np.float32(x).view(np.int32)
     whole = np.int32(np.int32(bits - SQRT_HALF_BITS) >> np.int32(23))
     m = np.int32(bits - np.int32(whole << np.int32(23))).view(np.float32)  # √½ to √2
@@ -51,7 +54,8 @@ def logarithm(x):
 
 @intrinsic
 def prefetch(typing: Any, array: Any, index: Any) -> Any:
-    """Ask memory for the element of a contiguous array that has the given index in its flat form; does not wait."""
+    """Ask memory for the element of a contiguous array that has the given index in its flat form;
+    does not wait."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -66,7 +70,8 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
 
 
 def _atomic(generate_of: Any, *kinds: Any) -> Any:
-    """(signature, code) of an operation on an element of an int64 array; generate_of(builder, its pointer, *values)."""
+    """(signature, code) of an operation on an element of an int64 array; generate_of(builder, its
+    pointer, *values)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -77,9 +82,13 @@ def _atomic(generate_of: Any, *kinds: Any) -> Any:
 
 @intrinsic
 def fetch_add(typing: Any, array: Any, index: Any, step: Any) -> Any:
-    """Add `step` to an element of an int64 array, undivided by other threads; returns what it was before."""
+    """Add `step` to an element of an int64 array, undivided by other threads; returns what it was
+    before."""
     return _atomic(
-        lambda builder, at, by: builder.atomic_rmw("add", at, by, "seq_cst"), array, types.int64, types.int64
+        lambda builder, at, by: builder.atomic_rmw("add", at, by, "seq_cst"),
+        array,
+        types.int64,
+        types.int64,
     )
 
 
@@ -87,13 +96,17 @@ def fetch_add(typing: Any, array: Any, index: Any, step: Any) -> Any:
 def exchange(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write an element of an int64 array; returns what it was before."""
     return _atomic(
-        lambda builder, at, to: builder.atomic_rmw("xchg", at, to, "seq_cst"), array, types.int64, types.int64
+        lambda builder, at, to: builder.atomic_rmw("xchg", at, to, "seq_cst"),
+        array,
+        types.int64,
+        types.int64,
     )
 
 
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
-    """An element of an int64 array, as other threads left it; what they wrote before it is seen as well."""
+    """An element of an int64 array, as other threads left it; what they wrote before it is seen as
+    well."""
     return _atomic(lambda builder, at: builder.load_atomic(at, "seq_cst", 8), array, types.int64)
 
 
@@ -110,7 +123,8 @@ def compare_exchange(typing: Any, array: Any, index: Any, expected: Any, value: 
 
 @intrinsic
 def pause(typing: Any) -> Any:
-    """Tell the processor that this thread waits in a loop; nothing where LLVM has no name for that."""
+    """Tell the processor that this thread waits in a loop; nothing where LLVM has no name for
+    that."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         machine, kind = builder.module.triple.split("-")[0], ir.FunctionType(ir.VoidType(), [])

@@ -1,7 +1,8 @@
-"""Calling a compiled kernel with arguments that lie in memory, so that a thread needs no Python to call it.
+"""Calling a compiled kernel with arguments that lie in memory, so that a thread needs no Python to
+call it.
 
-`store_entry` writes them to a team's words, with the address of a function that knows their types, which `run_entry`
-calls.
+`store_entry` writes them to a team's words, with the address of a function that knows their types,
+which `run_entry` calls.
 """
 
 import hashlib
@@ -17,8 +18,8 @@ from numba.extending import intrinsic
 from . import jit
 
 ENTRY, KERNEL, FAILURE, EXCEPTION = 8, 9, 10, 11
-"""Words of a team, int64: addresses of the function that calls the kernel, and of the kernel; the code that the kernel
-returned if it failed, and the address of its exception."""
+"""Words of a team, int64: addresses of the function that calls the kernel, and of the kernel; the
+code that the kernel returned if it failed, and the address of its exception."""
 ARGUMENTS, ARGUMENTS_WORDS = 24, 2048
 """Where the arguments lie."""
 
@@ -48,13 +49,16 @@ def number_of_type(typing: Any, value: Any) -> Any:
 
 @intrinsic
 def store_entry(typing: Any, words: Any, arguments: Any) -> Any:
-    """Write a tuple of arguments to a team's words, with the function that calls a kernel with them."""
+    """Write a tuple of arguments to a team's words, with the function that calls a kernel with
+    them."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         data, value = _words(context, builder, signature, values), values[1]
         if context.get_abi_sizeof(value.type) > 8 * ARGUMENTS_WORDS:
             raise ValueError(f"{signature.args[1]} take more than {ARGUMENTS_WORDS} words")
-        builder.store(value, builder.bitcast(_at(builder, data, ARGUMENTS), value.type.as_pointer()))
+        builder.store(
+            value, builder.bitcast(_at(builder, data, ARGUMENTS), value.type.as_pointer())
+        )
         function = _make_entry(context, builder.module, tuple(signature.args[1]), value.type)
         builder.store(builder.ptrtoint(function, _word), _at(builder, data, ENTRY))
         return context.get_dummy_value()
@@ -73,10 +77,16 @@ def _make_entry(context: Any, module: Any, kinds: tuple[Any, ...], stored: Any) 
     result = cgutils.alloca_once(builder, kind.args[0].pointee)
     exception = cgutils.alloca_once(builder, excinfo_ptr_t, zfill=True)
     kernel = builder.inttoptr(builder.load(_at(builder, words, KERNEL)), kind.as_pointer())
-    code = builder.call(kernel, [result, exception, *context.get_arg_packer(kinds).as_arguments(builder, arguments)])
-    failed = builder.and_(builder.icmp_signed("!=", code, RETCODE_OK), builder.icmp_signed("!=", code, RETCODE_NONE))
+    code = builder.call(
+        kernel, [result, exception, *context.get_arg_packer(kinds).as_arguments(builder, arguments)]
+    )
+    failed = builder.and_(
+        builder.icmp_signed("!=", code, RETCODE_OK), builder.icmp_signed("!=", code, RETCODE_NONE)
+    )
     with builder.if_then(failed, likely=False):
-        builder.store(builder.ptrtoint(builder.load(exception), _word), _at(builder, words, EXCEPTION))
+        builder.store(
+            builder.ptrtoint(builder.load(exception), _word), _at(builder, words, EXCEPTION)
+        )
         builder.store(builder.sext(code, _word), _at(builder, words, FAILURE))
     builder.ret_void()
     return function
@@ -88,7 +98,9 @@ def run_entry(typing: Any, words: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         data = _words(context, builder, signature, values)
-        function = builder.inttoptr(builder.load(_at(builder, data, ENTRY)), _entry_kind.as_pointer())
+        function = builder.inttoptr(
+            builder.load(_at(builder, data, ENTRY)), _entry_kind.as_pointer()
+        )
         builder.call(function, [data])
         return context.get_dummy_value()
 
@@ -104,7 +116,9 @@ def _fail(typing: Any, words: Any) -> Any:
         code = builder.trunc(builder.load(_at(builder, data, FAILURE)), ir.IntType(32))
         exception = builder.inttoptr(builder.load(_at(builder, data, EXCEPTION)), excinfo_ptr_t)
         with builder.if_then(builder.icmp_signed("!=", code, code.type(0))):
-            convention.return_status_propagate(builder, convention._get_return_status(builder, code, exception))
+            convention.return_status_propagate(
+                builder, convention._get_return_status(builder, code, exception)
+            )
         return context.get_dummy_value()
 
     return types.void(words), generate

@@ -1,8 +1,9 @@
-"""(1 − w)·L1 + w·(1 − SSIM) and its gradient in one sweep over the rows of each rectangle of an image.
+"""(1 − w)·L1 + w·(1 − SSIM) and its gradient in one sweep over the rows of each rectangle of an
+image.
 
-SSIM: Gaussian window of 11 pixels, σ 1.5, zero padding, per channel, C1 = 0.01², C2 = 0.03² (Wang et al. 2004, as
-used by 3D Gaussian splatting). Rows of horizontally blurred values live in rings of eleven, so the intermediate
-maps never reach main memory.
+SSIM: Gaussian window of 11 pixels, σ 1.5, zero padding, per channel, C1 = 0.01², C2 = 0.03² (Wang
+et al. 2004, as used by 3D Gaussian splatting). Rows of horizontally blurred values live in rings of
+eleven, so the intermediate maps never reach main memory.
 """
 
 import numpy as np
@@ -16,7 +17,8 @@ LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
 ROW_UNIT_PX = 32
 """Rows of this length have no remainder for LLVM to compute pixel by pixel."""
 PADDING_PX = 8
-"""Zeros before and after each row: WINDOW_RADIUS_PX are needed, and with eight, rows begin where vectors do."""
+"""Zeros before and after each row: WINDOW_RADIUS_PX are needed, and with eight, rows begin where
+vectors do."""
 RING_ROWS = 2 * WINDOW_RADIUS_PX + 1
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 _window = np.exp(-0.5 * (np.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1) / 1.5) ** 2)
@@ -34,8 +36,8 @@ def _blur(a, i0, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10):
 
 @part_jit
 def _blur_row(source, offset, out, at, count):
-    """Horizontal blur of source[offset + PADDING_PX : …] to out[at : at + count]; the source row is padded by
-    PADDING_PX."""
+    """Horizontal blur of source[offset + PADDING_PX : …] to out[at : at + count]; the source row is
+    padded by PADDING_PX."""
     for x in range(np.uint64(count)):
         i = np.uint64(offset + PADDING_PX - WINDOW_RADIUS_PX) + x
         one = np.uint64(1)
@@ -69,20 +71,32 @@ def _blur_column(ring, plane, stride, row, out, at, count):
     r10 = np.uint64((base + (row + 5) % RING_ROWS) * stride)
     for x in range(np.uint64(count)):
         out[np.uint64(at) + x] = _blur(
-            ring, r0 + x, r1 + x, r2 + x, r3 + x, r4 + x, r5 + x, r6 + x, r7 + x, r8 + x, r9 + x, r10 + x
+            ring,
+            r0 + x,
+            r1 + x,
+            r2 + x,
+            r3 + x,
+            r4 + x,
+            r5 + x,
+            r6 + x,
+            r7 + x,
+            r8 + x,
+            r9 + x,
+            r10 + x,
         )
 
 
 @inline_jit
 def _similarity_row(moments, stride, padded, similarity, slopes):
-    """Write SSIM of a row of `padded` pixels to `similarity`, and its derivatives by three of the four blurred values
-    to `slopes`. Both others hold one value behind the other, `stride` apart; slopes from PADDING_PX on."""
+    """Write SSIM of a row of `padded` pixels to `similarity`, and its derivatives by three of the
+    four blurred values to `slopes`. Both others hold one value behind the other, `stride` apart;
+    slopes from PADDING_PX on."""
     for n in range(np.uint64(padded)):
         mx, my = moments[n], moments[np.uint64(stride) + n]
         squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
         mxy, mm = mx * my, mx * mx + my * my
-        # Differences of blurred squares: in bright, flat images rounding makes the variances negative and
-        # the covariance larger than their mean, which it can never be.
+        # Differences of blurred squares: in bright, flat images rounding makes the variances
+        # negative and the covariance larger than their mean, which it can never be.
         variance = max(ZERO, squares - mm)
         covariance = min(variance, max(-variance, TWO * (product - mxy)))
         over_d, over_e = ONE / (mm + C1), ONE / (variance + C2)
@@ -91,7 +105,9 @@ def _similarity_row(moments, stride, padded, similarity, slopes):
         # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
         by_product = TWO * luminance * over_e
         by_squares = -ssim * over_e
-        by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (over_d - over_e)
+        by_mean = TWO * my * (structure * over_d - luminance * over_e) - TWO * mx * ssim * (
+            over_d - over_e
+        )
         slopes[np.uint64(PADDING_PX) + n] = by_mean
         slopes[np.uint64(stride + PADDING_PX) + n] = by_squares
         slopes[np.uint64(2 * stride + PADDING_PX) + n] = by_product
@@ -100,10 +116,11 @@ def _similarity_row(moments, stride, padded, similarity, slopes):
 
 @part_jit
 def _sum_row(values, first, past):
-    """Σ values[first:past], which are overwritten: their second half is added to the first until one is left.
+    """Σ values[first:past], which are overwritten: their second half is added to the first until
+    one is left.
 
-    One total would be added up in an order that LLVM chooses, differently from one compilation to the next, or where
-    it is not sure that arrays do not overlap, from one address to the next.
+    One total would be added up in an order that LLVM chooses, differently from one compilation to
+    the next, or where it is not sure that arrays do not overlap, from one address to the next.
     """
     count = past - first
     while count > 1:
@@ -116,47 +133,68 @@ def _sum_row(values, first, past):
 
 @inline_jit
 def _gradient_row(
-    image, target_row, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient, differences
+    image,
+    target_row,
+    keep,
+    blurred,
+    stride,
+    left,
+    first,
+    past,
+    ssim_weight,
+    scale,
+    gradient,
+    differences,
 ):
-    """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`, and |image − target|.
+    """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`, and
+    |image − target|.
 
-    image, gradient (W,): the row; target_row: the target's, from `keep` on; blurred: the three blurred slopes, `stride`
-    apart; differences: from `first` to `past`.
+    image, gradient (W,): the row; target_row: the target's, from `keep` on; blurred: the three
+    blurred slopes, `stride` apart; differences: from `first` to `past`.
     """
     for n in range(np.uint64(first), np.uint64(past)):
         x, y = image[np.uint64(left) + n], target_row[np.uint64(keep) + n]
         sign = ONE if x > y else (-ONE if x < y else ZERO)
         differences[n] = abs(x - y)
-        slope = blurred[n] + TWO * x * blurred[np.uint64(stride) + n] + y * blurred[np.uint64(2 * stride) + n]
+        slope = (
+            blurred[n]
+            + TWO * x * blurred[np.uint64(stride) + n]
+            + y * blurred[np.uint64(2 * stride) + n]
+        )
         gradient[np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
 
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
 @kernel_jit
 def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, sums):
-    """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of pixels.
+    """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of
+    pixels.
 
-    image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so `scale` is
-    1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes gradient (3, H, W) and, for the
-    rows of all rectangles one after the other, sums (2, 3, rows): Σ |difference| and Σ SSIM over a row's pixels, by
-    channel. By row, the sums do not depend on how an image is cut into bands.
+    image (3, H, W) float32; target (H, W, 3) uint8; the loss is the mean over all 3·H·W values, so
+    `scale` is 1 / (3·H·W). Reads the image up to LOSS_REACH_PX pixels around a rectangle. Writes
+    gradient (3, H, W) and, for the rows of all rectangles one after the other, sums (2, 3, rows): Σ
+    |difference| and Σ SSIM over a row's pixels, by channel. By row, the sums do not depend on how
+    an image is cut into bands.
     """
     height, width = image.shape[1], image.shape[2]
     first_job, past_job = next_piece(work)
     while first_job < past_job:
-        for job in range(first_job, past_job):  # one channel of one rectangle: row by row, the gradient ten rows behind
+        # one channel of one rectangle: row by row, the gradient ten rows behind
+        for job in range(first_job, past_job):
             r, c = job // 3, job % 3
             x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
             first_sum = -y0  # where the sums of the rectangle's rows begin, less its first row
             for before in range(r):
                 first_sum += rectangles[before, 3] - rectangles[before, 1]
-            # Columns [left, right) hold everything that matters; each row buffer is padded by PADDING_PX zeros.
+            # Columns [left, right) hold everything that matters; each row buffer is padded by
+            # PADDING_PX zeros.
             left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
             span = right - left
             # Blurs go beyond the span, where nothing reads.
             padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX
             stride = padded + 2 * PADDING_PX
-            target_row = np.zeros(RING_ROWS * stride, np.float32)  # the target's last rows, as floats
+            # the target's last rows, as floats
+            target_row = np.zeros(RING_ROWS * stride, np.float32)
             source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
             first = np.zeros(4 * RING_ROWS * stride, np.float32)
             moments = np.zeros(4 * stride, np.float32)
@@ -197,7 +235,9 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                         beyond = plane * stride + PADDING_PX
                         slopes[beyond + span : beyond + padded] = ZERO
                     if y0 <= middle < y1:
-                        sums[1, c, first_sum + middle] = _sum_row(similarities, x0 - left, x1 - left)
+                        sums[1, c, first_sum + middle] = _sum_row(
+                            similarities, x0 - left, x1 - left
+                        )
                 for plane in range(3):
                     into = (plane * RING_ROWS + middle % RING_ROWS) * stride
                     if inside:
@@ -221,8 +261,8 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
 
 @jit
 def add_up(sums):
-    """Of sums (2, 3, rows) float64 the two over all rows and channels. Not by numpy, whose code memory has to bring
-    anew after each kernel: six times as long."""
+    """Of sums (2, 3, rows) float64 the two over all rows and channels. Not by numpy, whose code
+    memory has to bring anew after each kernel: six times as long."""
     return _total(sums[0]), _total(sums[1])
 
 
@@ -241,7 +281,8 @@ def change_background(work, image, mask, before, after, out):
     """Write image (H, W, 3) uint8, composited over the color `before`, as it looks over `after`.
 
     mask (H, W) uint8: the foreground's coverage; before, after (3,) float32 in 0…255; out as image.
-    image = coverage · foreground + (1 − coverage) · before, so only the second term has to be exchanged.
+    image = coverage · foreground + (1 − coverage) · before, so only the second term has to be
+    exchanged.
     """
     first_row, past_row = next_piece(work)
     while first_row < past_row:
@@ -250,5 +291,7 @@ def change_background(work, image, mask, before, after, out):
                 clear = np.float32(255 - mask[y, x]) * np.float32(1 / 255)
                 for c in range(3):
                     value = np.float32(image[y, x, c]) + clear * (after[c] - before[c])
-                    out[y, x, c] = np.uint8(min(np.float32(255.0), max(ZERO, value)) + np.float32(0.5))
+                    out[y, x, c] = np.uint8(
+                        min(np.float32(255.0), max(ZERO, value)) + np.float32(0.5)
+                    )
         first_row, past_row = next_piece(work)

@@ -1,11 +1,12 @@
-"""Array contract of the rasterizer: the arrays that its stages hand on, with shapes, types and units.
+"""Array contract of the rasterizer: the arrays that its stages hand on, with shapes, types and
+units.
 
-Stages: `project` (splats to the screen), `tiles` (which splats reach which tile), `blend` (tiles to pixels), and
-`image_loss`; each forward and, but for `tiles`, backward. The kernels take one tuple of arrays per concern, float32
-unless said; `gpu/layout.py` says what of it the GPU's tables hold.
+Stages: `project` (splats to the screen), `tiles` (which splats reach which tile), `blend` (tiles to
+pixels), and `image_loss`; each forward and, but for `tiles`, backward. The kernels take one tuple
+of arrays per concern, float32 unless said; `gpu/layout.py` says what of it the GPU's tables hold.
 
-N splats, F triangles, K = (degree + 1)² SH coefficients, S components of strain, P (tile, splat) pairs, image H × W.
-Gradients of a scalar have the name of the quantity after `v_`.
+N splats, F triangles, K = (degree + 1)² SH coefficients, S components of strain, P (tile, splat)
+pairs, image H × W. Gradients of a scalar have the name of the quantity after `v_`.
 """
 
 from typing import Any, NamedTuple
@@ -16,9 +17,10 @@ TILE = 16
 """Side of a tile, pixels. Tiles are numbered row by row."""
 PIXELS = TILE * TILE
 
-# Columns of a projected splat, and of the gradient of one (tile, splat) pair. Alpha at the offset (dx, dy) from MEAN is
-# OPACITY · exp(−½ · (PRECISION_X·(dx − SHEAR·dy)² + PRECISION_Y·dy²)). The usual three entries of the inverse
-# covariance lose the small one of a long needle, and with it the sign of the exponent; squares cannot.
+# Columns of a projected splat, and of the gradient of one (tile, splat) pair. Alpha at the offset
+# (dx, dy) from MEAN is OPACITY · exp(−½ · (PRECISION_X·(dx − SHEAR·dy)² + PRECISION_Y·dy²)). The
+# usual three entries of the inverse covariance lose the small one of a long needle, and with it the
+# sign of the exponent; squares cannot.
 MEAN_X, MEAN_Y, PRECISION_X, SHEAR, PRECISION_Y, OPACITY, RED, GREEN, BLUE = range(9)
 PROJECTED = 9
 
@@ -26,9 +28,9 @@ PROJECTED = 9
 class Parameters(NamedTuple):
     """What is trained of N splats, raw as in `Splats`: numpy arrays, in `autograd` torch tensors.
 
-    xyz (N, 3), rotation (N, 4) wxyz, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3); strain_color (N, S, 3), or
-    None where colors do not follow strain. The triangles (N,) int32 that the splats are bound to are passed beside
-    them.
+    xyz (N, 3), rotation (N, 4) wxyz, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3);
+    strain_color (N, S, 3), or None where colors do not follow strain. The triangles (N,) int32 that
+    the splats are bound to are passed beside them.
     """
 
     xyz: Any
@@ -40,10 +42,12 @@ class Parameters(NamedTuple):
 
 
 class CameraFrames(NamedTuple):
-    """Frames of the triangles in camera space, and the camera: camera point = matrix @ local point + origin.
+    """Frames of the triangles in camera space, and the camera: camera point = matrix @ local point
+    + origin.
 
-    origin (F, 3) meters, matrix (F, 3, 3) with the triangle's scale in it, strain (F, S); to_world (3, 3) rotation
-    from camera to world; intrinsics (4,) fl_x, fl_y, cx, cy in pixels; size (2,) int64 width, height.
+    origin (F, 3) meters, matrix (F, 3, 3) with the triangle's scale in it, strain (F, S); to_world
+    (3, 3) rotation from camera to world; intrinsics (4,) fl_x, fl_y, cx, cy in pixels; size (2,)
+    int64 width, height.
     """
 
     origin: np.ndarray
@@ -57,10 +61,10 @@ class CameraFrames(NamedTuple):
 class Projection(NamedTuple):
     """N splats on the screen.
 
-    columns (N, PROJECTED); depth (N,) meters along the view axis; extent_y (N,) half height in pixels up to
-    alpha = 1/255; rect (N, 4) int32 bounds x0, y0, x1, y1 in tiles: all 0 for a splat that is not visible, all −1 for
-    one that is not finite or would be wider than float32 can square (some 1e9 pixels). The other three are undefined
-    for a splat that is not visible.
+    columns (N, PROJECTED); depth (N,) meters along the view axis; extent_y (N,) half height in
+    pixels up to alpha = 1/255; rect (N, 4) int32 bounds x0, y0, x1, y1 in tiles: all 0 for a splat
+    that is not visible, all −1 for one that is not finite or would be wider than float32 can square
+    (some 1e9 pixels). The other three are undefined for a splat that is not visible.
     """
 
     columns: np.ndarray
@@ -72,7 +76,8 @@ class Projection(NamedTuple):
 class TileLists(NamedTuple):
     """The (tile, splat) pairs, by tile and by splat.
 
-    visible (M,) int32: the splats with a pair. start (tiles + 1,) int64: where each tile's pairs begin; pair_splat (P,)
+    visible (M,) int32: the splats with a pair. start (tiles + 1,) int64: where each tile's pairs
+    begin; pair_splat (P,)
     int32: the splat of each pair, front to back within a tile. Splat i's pairs are
     splat_pairs[first_pair[i] : first_pair[i] + pairs[i]], all int32.
     """
@@ -88,10 +93,12 @@ class TileLists(NamedTuple):
 class Blended(NamedTuple):
     """The image, and what the backward pass of blending needs.
 
-    image (3, H, W) over the background; transmittance (H, W) = 1 − alpha, whose small values alpha would round away;
-    last (H, W) int32: one past the pixel's last contributing pair, counted from its tile's first. pair_blocks (P,)
-    uint16: the blocks of the tile that the splat may reach, a bit each; undefined for pairs behind all of a tile's
-    pixels.
+    image (3, H, W) over the background; transmittance (H, W) = 1 − alpha, whose small values alpha
+    would round away;
+    last (H, W) int32: one past the pixel's last contributing pair, counted from its tile's first.
+    pair_blocks (P,)
+    uint16: the blocks of the tile that the splat may reach, a bit each; undefined for pairs behind
+    all of a tile's pixels.
     """
 
     image: np.ndarray

@@ -13,15 +13,19 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 ROWS_PER_BLOCK = 256
 """Rows that a thread steps at a time."""
 ROWS_PER_SUM = 1024
-"""Rows that are summed by one thread, so that a sum does not depend on how many threads there are."""
+"""Rows that are summed by one thread, so that a sum does not depend on how many threads there
+are."""
 MAX_GRADIENT = np.float32(1e18)
-"""A row with a larger gradient is skipped: its square would make the second moment infinite, and the row NaN."""
+"""A row with a larger gradient is skipped: its square would make the second moment infinite, and
+the row NaN."""
 
 
 class AdamTables(NamedTuple):
-    """A parameter in training: its values (N, D) float32 and, of the same shape, what Adam keeps for them.
+    """A parameter in training: its values (N, D) float32 and, of the same shape, what Adam keeps
+    for them.
 
-    gradient, first, second, average  first and second moment, and the exponential moving average of the values
+    gradient, first, second, average  first and second moment, and the exponential moving average of
+                                      the values
     rates  (D,) float32 learning rate of each column
     """
 
@@ -34,7 +38,8 @@ class AdamTables(NamedTuple):
 
 
 class AdamOptions(NamedTuple):
-    """Adam's constants, and the least share of a step in the exponential moving average; all float32."""
+    """Adam's constants, and the least share of a step in the exponential moving average; all
+    float32."""
 
     beta1: np.float32
     beta2: np.float32
@@ -47,11 +52,11 @@ class AdamOptions(NamedTuple):
 def adam_rows(work, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
-    parameters: tuple of AdamTables; steps (N,) int32; options: AdamOptions. The stepped value enters its exponential
-    moving average with the share `ema_share`, or 4 / (steps + 3) where that is more, because the first steps are long.
-    Rows that are not listed are not touched at all. A row whose gradient is not finite, or beyond MAX_GRADIENT, keeps
-    that parameter, its moments and its average.
-    All parameters at once: every further parallel loop waits for its slowest thread.
+    parameters: tuple of AdamTables; steps (N,) int32; options: AdamOptions. The stepped value
+    enters its exponential moving average with the share `ema_share`, or 4 / (steps + 3) where that
+    is more, because the first steps are long. Rows that are not listed are not touched at all. A
+    row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter, its moments and
+    its average. All parameters at once: every further parallel loop waits for its slowest thread.
     """
     log1, log2 = math.log(options.beta1), math.log(options.beta2)
     correct1, correct2 = np.empty(ROWS_PER_BLOCK, np.float32), np.empty(ROWS_PER_BLOCK, np.float32)
@@ -75,7 +80,8 @@ def adam_rows(work, rows, steps, parameters, options):
 
 @part_jit
 def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
-    """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and vectorizes."""
+    """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and
+    vectorizes."""
     values, gradient, first, second, average, rates = parameter
     beta1, beta2, epsilon, _ = options
     width = values.shape[1]
@@ -113,7 +119,8 @@ def add_screen_gradients(work, rows, screen_gradient, total, count):
 
 @jit
 def sum_by_triangle(rows, face, gradient, total, trained):
-    """Add gradient (N, 3) of the listed rows (M,) to the total (F, 3) of their triangles, marked in trained (F,)."""
+    """Add gradient (N, 3) of the listed rows (M,) to the total (F, 3) of their triangles, marked in
+    trained (F,)."""
     for n in range(len(rows)):
         i = rows[n]
         f = face[i]
@@ -131,23 +138,27 @@ def scale_limit(
     weight: float,
     gradient: np.ndarray,
 ) -> float:
-    """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
+    """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N,
+    3).
 
-    limits (2, F) per triangle, of bound and of unbound splats, in the unit of the splats' local scale. Returns the
-    norm.
+    limits (2, F) per triangle, of bound and of unbound splats, in the unit of the splats' local
+    scale. Returns the norm.
     """
     sums = np.empty(-(-len(rows) // ROWS_PER_SUM))
     sum_excess_scale(sums, rows, log_scale, face, unbound, limits)
     norm = math.sqrt(math.fsum(sums.tolist()))
     if norm > 0.0:
-        add_excess_scale(rows, log_scale, face, unbound, limits, np.float32(weight / norm), gradient)
+        add_excess_scale(
+            rows, log_scale, face, unbound, limits, np.float32(weight / norm), gradient
+        )
     return norm
 
 
 @parallel(lambda sums, *_: len(sums), piece=4)
 @kernel_jit
 def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
-    """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see `scale_limit`."""
+    """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see
+    `scale_limit`."""
     scales = np.empty(3 * ROWS_PER_SUM, np.float32)
     first_sum, past_sum = next_piece(work)
     while first_sum < past_sum:
@@ -188,7 +199,8 @@ def add_excess_scale(work, rows, log_scale, face, unbound, limits, factor, gradi
 @parallel(lambda rows, *_: len(rows), piece=16_384)
 @kernel_jit
 def opacity_weight(work, rows, opacity, share, weight, gradient):
-    """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient (N,).
+    """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient
+    (N,).
 
     share (N,) float32.
     """
@@ -204,7 +216,8 @@ def opacity_weight(work, rows, opacity, share, weight, gradient):
 
 @jit
 def distance_limit(rows, xyz, face, unbound, limit, weight, gradient):
-    """weight · ‖ReLU(|xyz| − limit)‖₂ over the listed rows; its gradient is added to gradient (N, 3).
+    """weight · ‖ReLU(|xyz| − limit)‖₂ over the listed rows; its gradient is added to gradient (N,
+    3).
 
     limit (F,) per triangle in local units. Unbound splats have no limit. Returns the norm.
     """

@@ -1,4 +1,5 @@
-"""Which rows of pixels a splat's outline, the ellipse on which α = 1/255, reaches between two columns."""
+"""Which rows of pixels a splat's outline, the ellipse on which α = 1/255, reaches between two
+columns."""
 
 import math
 
@@ -11,7 +12,8 @@ ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 @part_jit
 def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
-    """Coefficients of a projected splat's outline for `rows_within`; the arguments are its columns (see `layout.py`).
+    """Coefficients of a projected splat's outline for `rows_within`; the arguments are its columns
+    (see `layout.py`).
 
     On its outline the squares that make the exponent add up to precision_y·extent_y².
     """
@@ -20,16 +22,26 @@ def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
     # Slack, so that rounding (of differences of squares above all) does not lose a pixel.
     slack = np.float32(0.01) + np.float32(1e-3) * math.sqrt(chord) + np.float32(1e-6) * extent_y
     lean, rate = shear * extent_y, precision_x * shear * shrink
-    return mean_x - HALF, mean_y - HALF, extent_y, lean, rate, chord, precision_x * precision_y * shrink * shrink, slack
+    return (
+        mean_x - HALF,
+        mean_y - HALF,
+        extent_y,
+        lean,
+        rate,
+        chord,
+        precision_x * precision_y * shrink * shrink,
+        slack,
+    )
 
 
 @part_jit
 def rows_within(outline, left, width, rows):
-    """First and past-the-last of rows 0 to `rows` in which a pixel of the `width` columns from `left` on has its center
-    in an outline; the first is not before the other where there are none. All float32.
+    """First and past-the-last of rows 0 to `rows` in which a pixel of the `width` columns from
+    `left` on has its center in an outline; the first is not before the other where there are none.
+    All float32.
 
-    Between the outermost centers the ellipse is highest where it is highest altogether, or else at the nearer edge, and
-    likewise lowest.
+    Between the outermost centers the ellipse is highest where it is highest altogether, or else at
+    the nearer edge, and likewise lowest.
     """
     mean_x, mean_y, extent_y, lean, rate, chord, cut, slack = outline
     low = left - mean_x

@@ -1,6 +1,8 @@
-"""Compilation of the rasterizer's kernels in two processes: rendering in a second one, gradients in the first.
+"""Compilation of the rasterizer's kernels in two processes: rendering in a second one, gradients in
+the first.
 
-Numba compiles one function at a time per process. The second process needs no torch, so it starts at once.
+Numba compiles one function at a time per process. The second process needs no torch, so it starts
+at once.
 """
 
 import os
@@ -46,14 +48,22 @@ def begin_compiling() -> None:
 
 @cache
 def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
-    """The process that runs `compile_rendering`, started by the first call; None if the kernels are cached already or
-    a second process would not help.
+    """The process that runs `compile_rendering`, started by the first call; None if the kernels are
+    cached already or a second process would not help.
     """
-    if has_kernels(KERNEL_CACHE_FOLDER) or (os.cpu_count() or 1) < 2 or not __name__.startswith(f"{PACKAGE}."):
+    if (
+        has_kernels(KERNEL_CACHE_FOLDER)
+        or (os.cpu_count() or 1) < 2
+        or not __name__.startswith(f"{PACKAGE}.")
+    ):
         return None
     try:
         return subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import compile_rendering; compile_rendering()"],
+            [
+                sys.executable,
+                "-c",
+                f"from {__name__} import compile_rendering; compile_rendering()",
+            ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -67,29 +77,39 @@ def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
 def compile_rendering() -> None:
     """Compile `render_forward` with the types of real training."""
     buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
-    tiles, everywhere = np.arange(tiles_x * tiles_y, dtype=np.int32), sum_tiles(np.ones((tiles_y, tiles_x), bool))
+    tiles, everywhere = (
+        np.arange(tiles_x * tiles_y, dtype=np.int32),
+        sum_tiles(np.ones((tiles_y, tiles_x), bool)),
+    )
     splats, face, frames = _two_splats()
     projection = new_projection(2, buffers)
     project_forward(np.arange(2), everywhere, splats, face, frames, 3, False, False, projection)
     projection.rect[:] = 0
     split_splats(np.ones(2, bool))
     find_needed_rows(projection, np.arange(2), np.float32(0), tiles_x, tiles_y)
-    projection.rect[:, 2:], projection.depth[:] = 1, (1, 2)  # in one tile, behind each other: sorted
+    # in one tile, behind each other: sorted
+    projection.rect[:, 2:], projection.depth[:] = 1, (1, 2)
     sort_by_depth(projection, buffers)
     projection.rect[:] = 0
     lists, _ = sort_into_tiles(projection, tiles_x, whole_tiles(len(tiles)), buffers)
     blended = new_image(SIZE, SIZE, lists, buffers)
-    blend_forward(tiles, tiles_x, whole_tiles(len(tiles)), lists, projection, BLACK_BACKGROUND, blended)
+    blend_forward(
+        tiles, tiles_x, whole_tiles(len(tiles)), lists, projection, BLACK_BACKGROUND, blended
+    )
 
 
 def compile_gradients() -> None:
-    """Compile `render_backward` with the types of real training; nothing has to be rendered before."""
+    """Compile `render_backward` with the types of real training; nothing has to be rendered
+    before."""
     buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
     splats, face, frames = _two_splats()
     tiles, projection = np.arange(tiles_x * tiles_y, dtype=np.int32), new_projection(2, buffers)
     none, by_splat = np.zeros(0, np.int32), np.zeros(2, np.int32)
     lists = TileLists(none, by_splat, by_splat, none, np.zeros(len(tiles) + 1, np.int64), none)
-    v_image, v_transmittance = np.zeros((3, SIZE, SIZE), np.float32), np.zeros((SIZE, SIZE), np.float32)
+    v_image, v_transmittance = (
+        np.zeros((3, SIZE, SIZE), np.float32),
+        np.zeros((SIZE, SIZE), np.float32),
+    )
     pair_gradients = buffers.get("pair_gradients", (0, PROJECTED))
     blend_backward(
         tiles, tiles_x, lists, new_image(SIZE, SIZE, lists, buffers), np.ones(2, bool), projection.columns,
@@ -104,7 +124,8 @@ def compile_gradients() -> None:
 
 
 def _two_splats() -> tuple[Parameters, np.ndarray, CameraFrames]:
-    # That no tile contains; two, because a column of a one-row array is contiguous, which is another type to Numba.
+    # That no tile contains; two, because a column of a one-row array is contiguous, which is
+    # another type to Numba.
     splats = with_strain_color(Parameters(*(np.zeros((2, *shape), np.float32) for shape in SHAPES)))
     frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
     return splats, np.zeros(2, np.int32), frames

@@ -1,8 +1,9 @@
 """Embedding, projection and color of every splat in one pass, forward and backward.
 
-The face frames arrive already in camera space (composed in float64 by the caller), so a head far from the
-world's origin loses nothing to float32, and embedded and world-space splats take the same path. The arithmetic is in
-`splat_block`; here, what is scattered in memory is copied there and back.
+The face frames arrive already in camera space (composed in float64 by the caller), so a head far
+from the world's origin loses nothing to float32, and embedded and world-space splats take the same
+path. The arithmetic is in `splat_block`; here, what is scattered in memory is copied there and
+back.
 """
 
 import numpy as np
@@ -21,18 +22,21 @@ SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
 @parallel(lambda origin, *_: len(origin), piece=4096)
 @kernel_jit
 def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
-    """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin = turn @ origin +
-    shift.
+    """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin =
+    turn @ origin + shift.
 
-    origin (F, 3), rotation (F, 3, 3), scale (F,), turn (3, 3) and shift (3,) float64, so that distance from the origin
-    costs no precision. Writes camera_origin (F, 3) and camera_matrix (F, 3, 3) float32.
+    origin (F, 3), rotation (F, 3, 3), scale (F,), turn (3, 3) and shift (3,) float64, so that
+    distance from the origin costs no precision. Writes camera_origin (F, 3) and camera_matrix (F,
+    3, 3) float32.
     """
     begin, end = next_piece(work)
     while begin < end:
         for f in range(begin, end):
             for r in range(3):
                 t0, t1, t2 = turn[r, 0], turn[r, 1], turn[r, 2]
-                camera_origin[f, r] = t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
+                camera_origin[f, r] = (
+                    t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
+                )
                 for c in range(3):
                     along = t0 * rotation[f, 0, c] + t1 * rotation[f, 1, c] + t2 * rotation[f, 2, c]
                     camera_matrix[f, r, c] = scale[f] * along
@@ -42,17 +46,38 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
 @part_jit
 def _load(rows, splats, face, frames, b):
     """Copy the listed splats (at most BLOCK_SPLATS) and their frames to the block `b`."""
-    xyz, rotation, log_scale, opacity = splats.xyz, splats.rotation, splats.log_scale, splats.opacity
+    xyz, rotation, log_scale, opacity = (
+        splats.xyz,
+        splats.rotation,
+        splats.log_scale,
+        splats.opacity,
+    )
     origin, matrix = frames.origin, frames.matrix
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         f = np.uint64(face[i])
-        b[block.M00 + q], b[block.M01 + q], b[block.M02 + q] = matrix[f, 0, 0], matrix[f, 0, 1], matrix[f, 0, 2]
-        b[block.M10 + q], b[block.M11 + q], b[block.M12 + q] = matrix[f, 1, 0], matrix[f, 1, 1], matrix[f, 1, 2]
-        b[block.M20 + q], b[block.M21 + q], b[block.M22 + q] = matrix[f, 2, 0], matrix[f, 2, 1], matrix[f, 2, 2]
+        b[block.M00 + q], b[block.M01 + q], b[block.M02 + q] = (
+            matrix[f, 0, 0],
+            matrix[f, 0, 1],
+            matrix[f, 0, 2],
+        )
+        b[block.M10 + q], b[block.M11 + q], b[block.M12 + q] = (
+            matrix[f, 1, 0],
+            matrix[f, 1, 1],
+            matrix[f, 1, 2],
+        )
+        b[block.M20 + q], b[block.M21 + q], b[block.M22 + q] = (
+            matrix[f, 2, 0],
+            matrix[f, 2, 1],
+            matrix[f, 2, 2],
+        )
         b[block.ORIGIN_X + q], b[block.ORIGIN_Y + q] = origin[f, 0], origin[f, 1]
         b[block.ORIGIN_Z + q] = origin[f, 2]
-        b[block.LOCAL_X + q], b[block.LOCAL_Y + q], b[block.LOCAL_Z + q] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        b[block.LOCAL_X + q], b[block.LOCAL_Y + q], b[block.LOCAL_Z + q] = (
+            xyz[i, 0],
+            xyz[i, 1],
+            xyz[i, 2],
+        )
         b[block.RAW_0 + q], b[block.RAW_1 + q] = rotation[i, 0], rotation[i, 1]
         b[block.RAW_2 + q], b[block.RAW_3 + q] = rotation[i, 2], rotation[i, 3]
         b[block.LOG_0 + q], b[block.LOG_1 + q] = log_scale[i, 0], log_scale[i, 1]
@@ -61,7 +86,8 @@ def _load(rows, splats, face, frames, b):
 
 @part_jit
 def _color(b, q, i, coefficients, sh):
-    """Red, green and blue of splat i, which stands at q in the block; negative, infinite and NaN as they come."""
+    """Red, green and blue of splat i, which stands at q in the block; negative, infinite and NaN as
+    they come."""
     red = green = blue = HALF
     for k in range(coefficients):
         harmonic = b[block.B0 + k * COLUMN + q]
@@ -93,7 +119,8 @@ def _shrink_bounds(covered, x0, y0, x1, y1):
 
 @part_jit
 def _tan_limits(intrinsics, size):
-    """Bounds of x/z and y/z in the projection's Jacobian: the image plus 0.3 of its half field of view."""
+    """Bounds of x/z and y/z in the projection's Jacobian: the image plus 0.3 of its half field of
+    view."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     width, height, margin = np.float32(size[0]), np.float32(size[1]), np.float32(0.3)
     half_x, half_y = HALF * width / fx, HALF * height / fy
@@ -105,14 +132,15 @@ def _tan_limits(intrinsics, size):
 
 @part_jit
 def _bound(b, column, q):
-    """One of the block's bounds in tiles; 0 of a splat that is not visible, whose bounds may be no number."""
+    """One of the block's bounds in tiles; 0 of a splat that is not visible, whose bounds may be no
+    number."""
     return np.int64(b[column + q] if b[block.SEEN + q] > ZERO else ZERO)
 
 
 @part_jit
 def _list_seen(rows, covered, rect, b, seen):
-    """List the places of the block's visible splats in `seen`, their bounds shrunk to the rendered tiles, and write
-    `rect` of all as of splats that are not. Returns how many are visible.
+    """List the places of the block's visible splats in `seen`, their bounds shrunk to the rendered
+    tiles, and write `rect` of all as of splats that are not. Returns how many are visible.
 
     Without a branch that depends on which tiles are rendered, but at these tiles' border.
     """
@@ -138,18 +166,28 @@ def project_forward(
 ):  # fmt: skip
     """Write the listed rows of `projection`; the tuples are those of `layout.py`.
 
-    rows (M,): the splats to project. covered (tiles_y + 1, tiles_x + 1) int32: how many tiles above and to the left are
-    rendered; a splat's bounds end at these, and one that reaches none of them counts as not visible. face (N,) int32.
-    degree: of the spherical harmonics used, at most the stored one. Colors follow as many components of strain as both
-    the frames and the splats have.
-    depth_as_color: blend (depth, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to a splat's area is
-    taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased" mode).
+    rows (M,): the splats to project. covered (tiles_y + 1, tiles_x + 1) int32: how many tiles above
+    and to the left are rendered; a splat's bounds end at these, and one that reaches none of them
+    counts as not visible. face (N,) int32.
+    degree: of the spherical harmonics used, at most the stored one. Colors follow as many
+    components of strain as both the frames and the splats have.
+    depth_as_color: blend (depth, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to
+    a splat's area is taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased"
+    mode).
     """
     sh, strain_color, strain = splats.sh, splats.strain_color, frames.strain
-    projected, depth, extent_y, rect = projection.columns, projection.depth, projection.extent_y, projection.rect
+    projected, depth, extent_y, rect = (
+        projection.columns,
+        projection.depth,
+        projection.extent_y,
+        projection.rect,
+    )
     strains = np.uint64(min(strain.shape[1], strain_color.shape[1]))
     tiles_x, tiles_y = (frames.size[0] + TILE - 1) // TILE, (frames.size[1] + TILE - 1) // TILE
-    limits, coefficients = _tan_limits(frames.intrinsics, frames.size), np.uint64((degree + 1) * (degree + 1))
+    limits, coefficients = (
+        _tan_limits(frames.intrinsics, frames.size),
+        np.uint64((degree + 1) * (degree + 1)),
+    )
     b, seen = np.zeros(block.FORWARD_SIZE, np.float32), np.empty(BLOCK_SPLATS, np.uint64)
     begin, end = next_piece(work)
     while begin < end:
@@ -184,18 +222,32 @@ def project_forward(
                 rect[i, 0], rect[i, 1] = np.int32(b[block.X0 + q]), np.int32(b[block.Y0 + q])
                 rect[i, 2], rect[i, 3] = np.int32(b[block.X1 + q]), np.int32(b[block.Y1 + q])
                 depth[i], extent_y[i] = z, b[block.EXTENT_Y + q]
-                projected[i, MEAN_X], projected[i, MEAN_Y] = b[block.MEAN_X + q], b[block.MEAN_Y + q]
-                projected[i, PRECISION_X], projected[i, SHEAR] = b[block.PRECISION_X + q], b[block.SHEAR + q]
-                projected[i, PRECISION_Y], projected[i, OPACITY] = b[block.PRECISION_Y + q], b[block.OPACITY + q]
+                projected[i, MEAN_X], projected[i, MEAN_Y] = (
+                    b[block.MEAN_X + q],
+                    b[block.MEAN_Y + q],
+                )
+                projected[i, PRECISION_X], projected[i, SHEAR] = (
+                    b[block.PRECISION_X + q],
+                    b[block.SHEAR + q],
+                )
+                projected[i, PRECISION_Y], projected[i, OPACITY] = (
+                    b[block.PRECISION_Y + q],
+                    b[block.OPACITY + q],
+                )
                 projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
         begin, end = next_piece(work)
 
 
 @part_jit
 def _sum_pairs(rows, lists, pair_gradients, b):
-    """Sum the gradients of each listed splat's pairs to the block: a short loop asks memory for many of them at
-    once."""
-    first_pair, pairs, splat_pairs, grads = lists.first_pair, lists.pairs, lists.splat_pairs, pair_gradients
+    """Sum the gradients of each listed splat's pairs to the block: a short loop asks memory for
+    many of them at once."""
+    first_pair, pairs, splat_pairs, grads = (
+        lists.first_pair,
+        lists.pairs,
+        lists.splat_pairs,
+        pair_gradients,
+    )
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = ZERO
@@ -211,11 +263,18 @@ def _sum_pairs(rows, lists, pair_gradients, b):
 
 @part_jit
 def _load_projected(rows, projected, b):
-    """Copy the listed splats' columns to the block, and clear the gradient of colors that were cut at zero."""
+    """Copy the listed splats' columns to the block, and clear the gradient of colors that were cut
+    at zero."""
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
-        b[block.PRECISION_X + q], b[block.SHEAR + q] = projected[i, PRECISION_X], projected[i, SHEAR]
-        b[block.PRECISION_Y + q], b[block.OPACITY + q] = projected[i, PRECISION_Y], projected[i, OPACITY]
+        b[block.PRECISION_X + q], b[block.SHEAR + q] = (
+            projected[i, PRECISION_X],
+            projected[i, SHEAR],
+        )
+        b[block.PRECISION_Y + q], b[block.OPACITY + q] = (
+            projected[i, PRECISION_Y],
+            projected[i, OPACITY],
+        )
         b[block.G_RED + q] = b[block.G_RED + q] if projected[i, RED] > ZERO else ZERO
         b[block.G_GREEN + q] = b[block.G_GREEN + q] if projected[i, GREEN] > ZERO else ZERO
         b[block.G_BLUE + q] = b[block.G_BLUE + q] if projected[i, BLUE] > ZERO else ZERO
@@ -223,11 +282,16 @@ def _load_projected(rows, projected, b):
 
 @part_jit
 def _color_gradient(b, q, i, coefficients, sh, v_sh):
-    """Write the gradient of splat i's coefficients, and the weights of the harmonics to the block at q."""
+    """Write the gradient of splat i's coefficients, and the weights of the harmonics to the block
+    at q."""
     red, green, blue = b[block.G_RED + q], b[block.G_GREEN + q], b[block.G_BLUE + q]
     for k in range(coefficients):
         harmonic = b[block.B0 + k * COLUMN + q]
-        v_sh[i, k, 0], v_sh[i, k, 1], v_sh[i, k, 2] = harmonic * red, harmonic * green, harmonic * blue
+        v_sh[i, k, 0], v_sh[i, k, 1], v_sh[i, k, 2] = (
+            harmonic * red,
+            harmonic * green,
+            harmonic * blue,
+        )
         b[block.W0 + k * COLUMN + q] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
     for k in range(coefficients, np.uint64(v_sh.shape[1])):
         v_sh[i, k, 0] = v_sh[i, k, 1] = v_sh[i, k, 2] = ZERO
@@ -238,7 +302,12 @@ def _color_gradient(b, q, i, coefficients, sh, v_sh):
 @part_jit
 def _store_gradient(rows, b, gradients, screen_gradient):
     """Copy the gradients of the listed splats' geometry from the block."""
-    xyz, rotation, log_scale, opacity = gradients.xyz, gradients.rotation, gradients.log_scale, gradients.opacity
+    xyz, rotation, log_scale, opacity = (
+        gradients.xyz,
+        gradients.rotation,
+        gradients.log_scale,
+        gradients.opacity,
+    )
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         xyz[i, 0], xyz[i, 1] = b[block.V_LOCAL_X + q], b[block.V_LOCAL_Y + q]
@@ -255,16 +324,26 @@ def project_backward(
     work, visible, splats, face, frames, degree, depth_as_color, antialiased,
     projected, lists, pair_gradients, gradients, screen_gradient,
 ):  # fmt: skip
-    """Write the gradient of each listed splat to its row of `gradients`; the counterpart of `project_forward`.
+    """Write the gradient of each listed splat to its row of `gradients`; the counterpart of
+    `project_forward`.
 
-    visible (M,) int32: the splats to differentiate. projected (N, PROJECTED): the columns of the projection.
-    pair_gradients (P, PROJECTED). Writes screen_gradient (N,) too: the length of the gradient with respect to the
-    projected center in units of half the image, for density control.
+    visible (M,) int32: the splats to differentiate. projected (N, PROJECTED): the columns of the
+    projection.
+    pair_gradients (P, PROJECTED). Writes screen_gradient (N,) too: the length of the gradient with
+    respect to the projected center in units of half the image, for density control.
     """
-    sh, strain, v_sh, v_strain_color = splats.sh, frames.strain, gradients.sh, gradients.strain_color
+    sh, strain, v_sh, v_strain_color = (
+        splats.sh,
+        frames.strain,
+        gradients.sh,
+        gradients.strain_color,
+    )
     strains = np.uint64(min(strain.shape[1], splats.strain_color.shape[1]))
     half_size = HALF * np.float32(frames.size[0]), HALF * np.float32(frames.size[1])
-    limits, coefficients = _tan_limits(frames.intrinsics, frames.size), np.uint64((degree + 1) * (degree + 1))
+    limits, coefficients = (
+        _tan_limits(frames.intrinsics, frames.size),
+        np.uint64((degree + 1) * (degree + 1)),
+    )
     compensated = ONE if antialiased else ZERO
     b = np.zeros(block.BACKWARD_SIZE, np.float32)
     begin, end = next_piece(work)

@@ -1,4 +1,5 @@
-"""Rendering on the CPU: splats and a camera to an image, and the image's gradient back to the splats."""
+"""Rendering on the CPU: splats and a camera to an image, and the image's gradient back to the
+splats."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -43,9 +44,9 @@ BLACK_BACKGROUND = np.zeros(3, np.float32)
 class RenderOutput:
     """An image and what its backward pass needs; the tuples are those of `layout.py`.
 
-    tiles (T,) int32: the rendered tiles, tile_rows (tiles, 4) uint8: their rows that are, see `find_needed_rows`; all
-    other pixels are undefined. focus (N,) bool: the splats that need a gradient, or None for all; touched (tiles_y,
-    tiles_x) bool: the tiles that they reach.
+    tiles (T,) int32: the rendered tiles, tile_rows (tiles, 4) uint8: their rows that are, see
+    `find_needed_rows`; all other pixels are undefined. focus (N,) bool: the splats that need a
+    gradient, or None for all; touched (tiles_y, tiles_x) bool: the tiles that they reach.
     """
 
     blended: Blended
@@ -72,7 +73,8 @@ class RenderOutput:
 
 
 class BufferPool:
-    """Buffers that are reused between iterations: fresh large arrays cost more page faults than the work in them."""
+    """Buffers that are reused between iterations: fresh large arrays cost more page faults than the
+    work in them."""
 
     def __init__(self) -> None:
         self._buffers: dict[str, np.ndarray] = {}
@@ -84,7 +86,8 @@ class BufferPool:
         buffer = self._buffers.get(name)
         if buffer is None or len(buffer) < size:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
-            # Zeros, not what memory held: where a local iteration does not render, nothing may be infinite or NaN.
+            # Zeros, not what memory held: where a local iteration does not render, nothing may be
+            # infinite or NaN.
             buffer = self._buffers[name] = np.zeros(size + size // 8, dtype)
         return buffer[:size].reshape(shape)
 
@@ -96,8 +99,12 @@ class BufferPool:
 
 
 def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
-    """Compose face frames with a camera in float64, so that distance from the origin costs no precision."""
-    rotation, translation = np.float64(camera.world_to_camera[:3, :3]), np.float64(camera.world_to_camera[:3, 3])
+    """Compose face frames with a camera in float64, so that distance from the origin costs no
+    precision."""
+    rotation, translation = (
+        np.float64(camera.world_to_camera[:3, :3]),
+        np.float64(camera.world_to_camera[:3, 3]),
+    )
     parts = (frames.origin, frames.rotation, frames.scale, rotation, translation)
     origin = np.empty((len(frames.origin), 3), np.float32)
     matrix = np.empty((len(frames.origin), 3, 3), np.float32)
@@ -127,10 +134,12 @@ def render_forward(
     """Render N embedded splats over a background color (3,).
 
     splats: numpy arrays; face (N,) int32; degree: of the spherical harmonics used.
-    focus (N,) bool: render only the tiles that these splats touch and what is at most `reach` pixels away from the
-    splats, which is all that can influence their gradient; None renders everything.
+    focus (N,) bool: render only the tiles that these splats touch and what is at most `reach`
+    pixels away from the splats, which is all that can influence their gradient; None renders
+    everything.
     depth_as_color: the first channel blends camera depth, the others are zero.
-    antialiased: splats narrower than a pixel, which are rendered a pixel wide, lose the opacity that this adds.
+    antialiased: splats narrower than a pixel, which are rendered a pixel wide, lose the opacity
+    that this adds.
     buffers: memory to reuse; the output is then valid until the next one with the same buffers.
     """
     splats, buffers = with_strain_color(splats), buffers or BufferPool()
@@ -139,24 +148,40 @@ def render_forward(
     projection = new_projection(len(splats.xyz), buffers)
 
     def project(rows: np.ndarray, covered: np.ndarray) -> None:
-        project_forward(rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection)
+        project_forward(
+            rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
+        )
 
     touched = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
-    everywhere = buffers.kept("everywhere", (tiles_y, tiles_x), lambda *shape: sum_tiles(np.ones(shape, bool)))
+    everywhere = buffers.kept(
+        "everywhere", (tiles_y, tiles_x), lambda *shape: sum_tiles(np.ones(shape, bool))
+    )
     if focus is None:
         project(buffers.kept("everything", (len(splats.xyz),), np.arange), everywhere)
         tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), whole_tiles)
     else:
         focused, others = split_splats(focus)
         project(focused, everywhere)
-        touched, covered, tile_rows = find_needed_rows(projection, focused, np.float32(reach), tiles_x, tiles_y)
+        touched, covered, tile_rows = find_needed_rows(
+            projection, focused, np.float32(reach), tiles_x, tiles_y
+        )
         project(others, covered)
     lists, tiles = sort_into_tiles(projection, tiles_x, tile_rows, buffers)
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, tile_rows, lists, projection, background, blended)
     return RenderOutput(
-        blended, projection, lists, tiles, tile_rows, focus, touched, background, degree, depth_as_color, antialiased
+        blended,
+        projection,
+        lists,
+        tiles,
+        tile_rows,
+        focus,
+        touched,
+        background,
+        degree,
+        depth_as_color,
+        antialiased,
     )
 
 
@@ -172,14 +197,19 @@ def render_backward(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
-    v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients` that belong to a
-    visible splat, one in focus if the output has a focus, and leaves all others unchanged.
-    Returns the rows written (M,) int32, and screen_gradient (N,): for those rows, the length of the gradient with
-    respect to the projected center in units of half the image.
+    v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients`
+    that belong to a visible splat, one in focus if the output has a focus, and leaves all others
+    unchanged. Returns the rows written (M,) int32, and screen_gradient (N,): for those rows, the
+    length of the gradient with respect to the projected center in units of half the image.
     """
     n, buffers = len(splats.xyz), buffers or BufferPool()
     tiles_x, _ = tile_grid(*frames.size)
-    lists, columns, tiles, rows = output.lists, output.projection.columns, output.tiles, output.lists.visible
+    lists, columns, tiles, rows = (
+        output.lists,
+        output.projection.columns,
+        output.tiles,
+        output.lists.visible,
+    )
     wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
     if output.focus is not None:
         wanted = output.focus
@@ -188,7 +218,9 @@ def render_backward(
     screen_gradient = buffers.get("screen_gradient", (n,))
     if v_transmittance is None:
         shape = output.transmittance.shape
-        v_transmittance = buffers.kept("v_transmittance", shape, lambda *shape: np.zeros(shape, np.float32))
+        v_transmittance = buffers.kept(
+            "v_transmittance", shape, lambda *shape: np.zeros(shape, np.float32)
+        )
     blend_backward(
         tiles, tiles_x, lists, output.blended, wanted, columns, output.background, v_image,
         np.ascontiguousarray(v_transmittance), pair_gradients,
@@ -223,15 +255,18 @@ def new_image(width: int, height: int, lists: TileLists, buffers: BufferPool) ->
 def sort_into_tiles(
     projection: Projection, tiles_x: int, tile_rows: np.ndarray, buffers: BufferPool
 ) -> tuple[TileLists, np.ndarray]:
-    """Which projected splats reach which tile, front to back; rows of several projections may follow each other.
+    """Which projected splats reach which tile, front to back; rows of several projections may
+    follow each other.
 
-    tile_rows (tiles, 4): see `find_needed_rows`. Returns the lists, and the tiles (T,) int32 with a needed row in the
-    order in which they are rendered.
+    tile_rows (tiles, 4): see `find_needed_rows`. Returns the lists, and the tiles (T,) int32 with a
+    needed row in the order in which they are rendered.
     """
     rect = projection.rect
     visible, order, first_pair, pairs, total = sort_by_depth(projection, buffers)
     counts = buffers.get("counts", (SORT_PARTS, len(tile_rows)), np.int32)
-    splat_pairs, pair_splat = (buffers.get(name, (total,), np.int32) for name in ("splat_pairs", "pair_splat"))
+    splat_pairs, pair_splat = (
+        buffers.get(name, (total,), np.int32) for name in ("splat_pairs", "pair_splat")
+    )
     count_pairs(rect, order, tiles_x, counts)
     start, tiles = arrange_tiles(counts, tile_rows)
     fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
@@ -241,25 +276,42 @@ def sort_into_tiles(
 def sort_by_depth(
     projection: Projection, buffers: BufferPool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-    """The visible splats (M,) int32, the same near to far, where the pairs of each splat begin and how many they are
-    (N,), and how many there are in all; see `TileLists`. Equal depths keep their order.
+    """The visible splats (M,) int32, the same near to far, where the pairs of each splat begin and
+    how many they are (N,), and how many there are in all; see `TileLists`. Equal depths keep their
+    order.
 
-    Least-significant-digit radix sort on the bits of the float: positive floats order like their bits. Counted from the
-    least, the depths of a head have 22 bits, and take two of the three passes.
+    Least-significant-digit radix sort on the bits of the float: positive floats order like their
+    bits. Counted from the least, the depths of a head have 22 bits, and take two of the three
+    passes.
     """
     (n,) = projection.depth.shape
     found, visible, order, moved, first_pair, pairs = (
-        buffers.get(name, (n,), np.int32) for name in ("found", "visible", "order", "moved", "first_pair", "pairs")
+        buffers.get(name, (n,), np.int32)
+        for name in ("found", "visible", "order", "moved", "first_pair", "pairs")
     )
     keys, moved_keys = (buffers.get(name, (n,), np.uint32) for name in ("keys", "moved_keys"))
     parts = buffers.get("parts", (parts_of(n) + 1, 4), np.int64)
     counts = buffers.get("digits", (parts_of(n), DIGITS), np.int32)
-    list_visible(projection.rect, projection.depth.view(np.uint32), found, keys, pairs, first_pair, parts, counts)
+    list_visible(
+        projection.rect,
+        projection.depth.view(np.uint32),
+        found,
+        keys,
+        pairs,
+        first_pair,
+        parts,
+        counts,
+    )
     least, greatest = sum_parts(parts, counts)
     splats, total = int(parts[-1, SPLATS]), int(parts[-1, PAIRS])
     visible = visible[:splats]
     move_visible(parts, found, keys, counts, first_pair, visible, moved_keys, order)
-    keys, moved_keys, order, moved = moved_keys[:splats], keys[:splats], order[:splats], moved[:splats]
+    keys, moved_keys, order, moved = (
+        moved_keys[:splats],
+        keys[:splats],
+        order[:splats],
+        moved[:splats],
+    )
     counts = counts[: parts_of(splats)]
     for shift in range(RADIX_BITS, greatest.bit_length(), RADIX_BITS):
         digit = np.uint32(least), np.uint32(shift)

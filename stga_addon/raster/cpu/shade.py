@@ -7,23 +7,28 @@ import numpy as np
 from . import kernel_jit, part_jit
 from .threads import next_piece, parallel
 
-ZERO, EIGHTH, HALF, ONE, TWO, PI = (np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi))
+ZERO, EIGHTH, HALF, ONE, TWO, PI = (
+    np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi)
+)
 SUN, POINT, SPOT, AREA = 0, 1, 2, 3
 KIND, POSITION, DIRECTION, COLOR, CONE, FADE = 0, 1, 4, 7, 10, 11
 MAP, DIFFUSE, SPECULAR, WIDTH, COLUMNS = 12, 13, 14, 15, 16
-"""Columns of a table of lights (L, COLUMNS) float32: kind; position (3); direction in which it shines (3); color (3),
-irradiance of a sun, else intensity in W/sr towards what faces it; cosine of half a spot's cone, and how far above the
-cosine has risen where the spot no longer fades; row of the shares that are lit, -1: all; factors of diffuse and
-specular light; tangent of half the angle that a sun takes, else half the width in meters."""
+"""Columns of a table of lights (L, COLUMNS) float32: kind; position (3); direction in which it
+shines (3); color (3), irradiance of a sun, else intensity in W/sr towards what faces it; cosine of
+half a spot's cone, and how far above the cosine has risen where the spot no longer fades; row of
+the shares that are lit, -1: all; factors of diffuse and specular light; tangent of half the angle
+that a sun takes, else half the width in meters."""
 MIN_FACING = np.float32(0.05)
 """Cosine that a highlight's normal is taken to have at least towards the eye."""
 
 
 @part_jit
 def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
-    """Reflected share per steradian and cosine of a GGX lobe with Smith's shadowing and Schlick's Fresnel term.
+    """Reflected share per steradian and cosine of a GGX lobe with Smith's shadowing and Schlick's
+    Fresnel term.
 
-    facing, toward_eye, half: cosines of the normal to light, eye and the direction half between them. square: α².
+    facing, toward_eye, half: cosines of the normal to light, eye and the direction half between
+    them. square: α².
     """
     spread = half * half * (square - ONE) + ONE
     distribution = square / (PI * spread * spread)
@@ -36,10 +41,14 @@ def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
 
 @parallel(lambda points, *_: len(points), piece=256)
 @kernel_jit
-def add_lights(work, points, normals, eye, roughness, reflectance, lights, lit, irradiance, highlight):
-    """Add what lights (L, COLUMNS) give to irradiance and highlight (N, 3) float32 of points with normals (N, 3).
+def add_lights(
+    work, points, normals, eye, roughness, reflectance, lights, lit, irradiance, highlight
+):
+    """Add what lights (L, COLUMNS) give to irradiance and highlight (N, 3) float32 of points with
+    normals (N, 3).
 
-    eye (3,). roughness, reflectance (N,): of the highlight; a roughness of 0 has none. lit (maps, N): see MAP.
+    eye (3,). roughness, reflectance (N,): of the highlight; a roughness of 0 has none. lit (maps,
+    N): see MAP.
     """
     begin, end = next_piece(work)
     while begin < end:
@@ -59,7 +68,13 @@ def add_lights(work, points, normals, eye, roughness, reflectance, lights, lit, 
                     dx, dy, dz = light[1] - px, light[2] - py, light[3] - pz
                     square = max(dx * dx + dy * dy + dz * dz, np.float32(1e-8))
                     away = ONE / math.sqrt(square)
-                    dx, dy, dz, strength, width = dx * away, dy * away, dz * away, ONE / square, width * away
+                    dx, dy, dz, strength, width = (
+                        dx * away,
+                        dy * away,
+                        dz * away,
+                        ONE / square,
+                        width * away,
+                    )
                     along = -(dx * light[4] + dy * light[5] + dz * light[6])
                     if kind == AREA:
                         strength *= max(along, ZERO)

@@ -12,10 +12,11 @@ ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 @jit
 def add_depths(points, faces, depth):
-    """Draw triangles into a depth map (S, S) float32, which keeps the least depth at each texel's center.
+    """Draw triangles into a depth map (S, S) float32, which keeps the least depth at each texel's
+    center.
 
-    points (V, 3) float32: x and y in texels, depth, or what grows with it and is linear in texels; triangles with a
-    point that is not finite are left out.
+    points (V, 3) float32: x and y in texels, depth, or what grows with it and is linear in texels;
+    triangles with a point that is not finite are left out.
     """
     size = len(depth)
     centers = np.arange(size).astype(np.float32) + HALF
@@ -47,10 +48,12 @@ def add_depths(points, faces, depth):
 @parallel(lambda depth, points, *_: len(points), piece=256)
 @kernel_jit
 def lit_shares(work, depth, points, bias, step, lit):
-    """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not block it.
+    """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not
+    block it.
 
-    points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block. step: texels between
-    the 3 × 3 places that are looked up bilinearly around a point; 0: one place.
+    points (N, 3) as in `add_depths`. bias (N,): depth by which a texel must be nearer to block.
+    step: texels between the 3 × 3 places that are looked up bilinearly around a point; 0: one
+    place.
     """
     size, reach = len(depth), 1 if step > 0 else 0
     begin, end = next_piece(work)

@@ -1,8 +1,9 @@
 """Projection of a block of splats, forward and backward, in loops that LLVM vectorizes.
 
-The values of a block lie in one flat float32 array `b`: column C of splat q at b[C + q]. Every loop computes all
-BLOCK_SPLATS, whatever an earlier block has left behind the last splat, so that a splat's bits do not depend on its
-place. `project` copies to the array, and from it, what is scattered in memory.
+The values of a block lie in one flat float32 array `b`: column C of splat q at b[C + q]. Every loop
+computes all BLOCK_SPLATS, whatever an earlier block has left behind the last splat, so that a
+splat's bits do not depend on its place. `project` copies to the array, and from it, what is
+scattered in memory.
 """
 
 import math
@@ -25,11 +26,13 @@ BASIS_SIZE = 16
 # The splat's frame in camera space and its parameters.
 (M00, M01, M02, M10, M11, M12, M20, M21, M22, ORIGIN_X, ORIGIN_Y, ORIGIN_Z, LOCAL_X, LOCAL_Y, LOCAL_Z,
  RAW_0, RAW_1, RAW_2, RAW_3, LOG_0, LOG_1, LOG_2, LOGIT) = (np.uint64(n * BLOCK_SPLATS) for n in range(23))  # fmt: skip
-# On the screen: the geometry of `layout.Projection`; the covariance, its determinant, and that of the splat without
-# LOW_PASS_PX2; bounds in tiles; SEEN: 1 where the splat may be visible, −1 where it is not finite, else 0.
+# On the screen: the geometry of `layout.Projection`; the covariance, its determinant, and that of
+# the splat without LOW_PASS_PX2; bounds in tiles; SEEN: 1 where the splat may be visible, −1 where
+# it is not finite, else 0.
 (MEAN_X, MEAN_Y, PRECISION_X, SHEAR, PRECISION_Y, OPACITY, EXTENT_Y, XX, XY, YY, DETERMINANT, SHARP,
  X0, Y0, X1, Y1, SEEN) = (np.uint64(n * BLOCK_SPLATS) for n in range(23, 40))  # fmt: skip
-# In camera space; the unit vector from the camera in world space, 1 / distance; and the harmonics of the vector.
+# In camera space; the unit vector from the camera in world space, 1 / distance; and the harmonics
+# of the vector.
 (CAMERA_X, CAMERA_Y, CAMERA_Z, TOWARD_X, TOWARD_Y, TOWARD_Z, PER_DISTANCE) = (
     np.uint64(n * BLOCK_SPLATS) for n in range(40, 47)
 )
@@ -37,8 +40,9 @@ BASIS_SIZE = 16
     np.uint64(n * BLOCK_SPLATS) for n in range(47, 63)
 )
 FORWARD_SIZE = 63 * BLOCK_SPLATS
-# Gradients: of the columns of `layout.Projection`, and of the red, green and blue of harmonic k together; of the
-# splat's parameters and its place in camera space; the length of the center's, in units of half the image.
+# Gradients: of the columns of `layout.Projection`, and of the red, green and blue of harmonic k
+# together; of the splat's parameters and its place in camera space; the length of the center's, in
+# units of half the image.
 G_MEAN_X, G_MEAN_Y, G_PRECISION_X, G_SHEAR, G_PRECISION_Y, G_OPACITY, G_RED, G_GREEN, G_BLUE = (
     np.uint64(n * BLOCK_SPLATS) for n in range(63, 72)
 )
@@ -62,10 +66,12 @@ def _rotation(q0, q1, q2, q3):
 
 @inline_jit
 def _unit(b, q):
-    """Unit quaternion and 1 / norm of a quaternion of any length; zero counts as the identity, with 1 / norm = 0.
+    """Unit quaternion and 1 / norm of a quaternion of any length; zero counts as the identity, with
+    1 / norm = 0.
 
-    The squares of 1e-20 and 1e20 leave float32's range, so quaternions far from length one are first scaled by a
-    power of two. 1 / norm only serves the gradient, whose square must stay in range too: it ends at 1e12.
+    The squares of 1e-20 and 1e20 leave float32's range, so quaternions far from length one are
+    first scaled by a power of two. 1 / norm only serves the gradient, whose square must stay in
+    range too: it ends at 1e12.
     """
     q0, q1, q2, q3 = b[RAW_0 + q], b[RAW_1 + q], b[RAW_2 + q], b[RAW_3 + q]
     size = abs(q0) + abs(q1) + abs(q2) + abs(q3)
@@ -91,8 +97,8 @@ def _camera_point(b, q):
 
 @inline_jit
 def _pixels_per_local(b, q, jx, jy, tx, ty):
-    """The affine map U from the triangle's local frame to pixels, row by row: the projection's Jacobian times its
-    matrix.
+    """The affine map U from the triangle's local frame to pixels, row by row: the projection's
+    Jacobian times its matrix.
 
     jx, jy: focal lengths over depth; tx, ty: x and y over depth.
     """
@@ -105,14 +111,19 @@ def _pixels_per_local(b, q, jx, jy, tx, ty):
 
 @inline_jit
 def _row_times_matrix(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22):
-    return a0 * r00 + a1 * r10 + a2 * r20, a0 * r01 + a1 * r11 + a2 * r21, a0 * r02 + a1 * r12 + a2 * r22
+    return (
+        a0 * r00 + a1 * r10 + a2 * r20,
+        a0 * r01 + a1 * r11 + a2 * r21,
+        a0 * r02 + a1 * r12 + a2 * r22,
+    )
 
 
 @inline_jit
 def project_geometry(b, intrinsics, limits):
     """Write MEAN_X and MEAN_Y, XX to SHARP, OPACITY and CAMERA_X to CAMERA_Z.
 
-    intrinsics (4,): fl_x, fl_y, cx, cy. limits (4,): lowest and highest x / z and y / z in the projection's Jacobian.
+    intrinsics (4,): fl_x, fl_y, cx, cy. limits (4,): lowest and highest x / z and y / z in the
+    projection's Jacobian.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     low_x, high_x, low_y, high_y = limits[0], limits[1], limits[2], limits[3]
@@ -124,12 +135,17 @@ def project_geometry(b, intrinsics, limits):
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
         u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, fx * rz, fy * rz, tx, ty)
         s0, s1, s2 = exponential(b[LOG_0 + q]), exponential(b[LOG_1 + q]), exponential(b[LOG_2 + q])
-        w00, w01, w02 = _row_times_matrix(u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-        w10, w11, w12 = _row_times_matrix(u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+        w00, w01, w02 = _row_times_matrix(
+            u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22
+        )
+        w10, w11, w12 = _row_times_matrix(
+            u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22
+        )
         a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
         xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS_PX2
         yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS_PX2
-        # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or below.
+        # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or
+        # below.
         m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
         sharp = m01 * m01 + m02 * m02 + m12 * m12
         b[CAMERA_X + q], b[CAMERA_Y + q], b[CAMERA_Z + q] = x, y, z
@@ -149,10 +165,16 @@ def compensate_low_pass(b):
 
 @inline_jit
 def project_bounds(b, tiles_x, tiles_y):
-    """Write PRECISION_X, SHEAR, PRECISION_Y, EXTENT_Y, X0 to Y1 and SEEN; tiles_x, tiles_y float32."""
+    """Write PRECISION_X, SHEAR, PRECISION_Y, EXTENT_Y, X0 to Y1 and SEEN; tiles_x, tiles_y
+    float32."""
     size = np.float32(TILE)
     for q in range(np.uint64(BLOCK_SPLATS)):
-        mean_x, mean_y, det, opacity = b[MEAN_X + q], b[MEAN_Y + q], b[DETERMINANT + q], b[OPACITY + q]
+        mean_x, mean_y, det, opacity = (
+            b[MEAN_X + q],
+            b[MEAN_Y + q],
+            b[DETERMINANT + q],
+            b[OPACITY + q],
+        )
         reach = TWO * logarithm(np.float32(255.0) * opacity)
         yy, infinite = b[YY + q], np.float32(np.inf)
         ex, ey = math.sqrt(reach * b[XX + q]), math.sqrt(reach * yy)
@@ -162,14 +184,20 @@ def project_bounds(b, tiles_x, tiles_y):
         b[X1 + q] = min(tiles_x, max(ZERO, np.ceil((mean_x + ex) / size)))
         b[Y0 + q] = min(tiles_y, max(ZERO, np.floor((mean_y - ey) / size)))
         b[Y1 + q] = min(tiles_y, max(ZERO, np.ceil((mean_y + ey) / size)))
-        finite = (opacity >= ZERO) & (det < infinite) & (abs(mean_x) < infinite) & (abs(mean_y) < infinite)
+        finite = (
+            (opacity >= ZERO)
+            & (det < infinite)
+            & (abs(mean_x) < infinite)
+            & (abs(mean_y) < infinite)
+        )
         seen = (ONE if reach > ZERO else ZERO) if finite else -ONE
         b[SEEN + q] = ZERO if b[CAMERA_Z + q] < NEAR_M else seen
 
 
 @inline_jit
 def compute_harmonics(b, to_world):
-    """Write TOWARD_X to PER_DISTANCE and B0 to B15; to_world (3, 3): rotation from camera to world space."""
+    """Write TOWARD_X to PER_DISTANCE and B0 to B15; to_world (3, 3): rotation from camera to world
+    space."""
     t00, t01, t02 = to_world[0, 0], to_world[0, 1], to_world[0, 2]
     t10, t11, t12 = to_world[1, 0], to_world[1, 1], to_world[1, 2]
     t20, t21, t22 = to_world[2, 0], to_world[2, 1], to_world[2, 2]
@@ -187,12 +215,14 @@ def compute_harmonics(b, to_world):
 
 @inline_jit
 def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
-    """Gradient with respect to A's two rows of v·ln sqrt(sharp / det), as in `compensate_low_pass`."""
+    """Gradient with respect to A's two rows of v·ln sqrt(sharp / det), as in
+    `compensate_low_pass`."""
     low = LOW_PASS_PX2
     sharp = m01 * m01 + m02 * m02 + m12 * m12
     xx, yy = a00 * a00 + a01 * a01 + a02 * a02, a10 * a10 + a11 * a11 + a12 * a12
     det = sharp + low * (xx + yy + low)
-    # v holds sqrt(sharp) as a factor, so the quotient stays finite where a splat has no area and v = 0.
+    # v holds sqrt(sharp) as a factor, so the quotient stays finite where a splat has no area and v
+    # = 0.
     w = v * low * (xx + yy + low) / (det * max(sharp, np.float32(1e-30)))
     u = -v * low / det
     return (
@@ -204,11 +234,11 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
 
 @inline_jit
 def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
-    """Write V_RAW_0 to V_LOGIT, V_SCREEN, V_CAMERA_X to V_CAMERA_Z without the harmonics' part, and CAMERA_X to
-    CAMERA_Z, from G_MEAN_X to G_OPACITY and PRECISION_X to OPACITY.
+    """Write V_RAW_0 to V_LOGIT, V_SCREEN, V_CAMERA_X to V_CAMERA_Z without the harmonics' part, and
+    CAMERA_X to CAMERA_Z, from G_MEAN_X to G_OPACITY and PRECISION_X to OPACITY.
 
-    intrinsics, limits: as in `project_geometry`; half_size (2,): of the image, pixels; compensated: 1 after
-    `compensate_low_pass`, else 0; all float32.
+    intrinsics, limits: as in `project_geometry`; half_size (2,): of the image, pixels; compensated:
+    1 after `compensate_low_pass`, else 0; all float32.
     """
     fx, fy, half_width, half_height = intrinsics[0], intrinsics[1], half_size[0], half_size[1]
     low_x, high_x, low_y, high_y = limits[0], limits[1], limits[2], limits[3]
@@ -225,14 +255,19 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
         jx, jy = fx * rz, fy * rz
         u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, jx, jy, tx, ty)
         s0, s1, s2 = exponential(b[LOG_0 + q]), exponential(b[LOG_1 + q]), exponential(b[LOG_2 + q])
-        w00, w01, w02 = _row_times_matrix(u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-        w10, w11, w12 = _row_times_matrix(u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22)
+        w00, w01, w02 = _row_times_matrix(
+            u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22
+        )
+        w10, w11, w12 = _row_times_matrix(
+            u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22
+        )
         a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
 
-        # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0 − shear·a1,
-        # ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy: the gradient with respect to
-        # a0 is v0, that with respect to a1 is −shear·v0 + v1. The residual, and every product of −shear·v0 with
-        # something of row 1, is taken together with row 0, because the two cancel for long splats.
+        # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0
+        # − shear·a1, ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy:
+        # the gradient with respect to a0 is v0, that with respect to a1 is −shear·v0 + v1. The
+        # residual, and every product of −shear·v0 with something of row 1, is taken together with
+        # row 0, because the two cancel for long splats.
         precision_x, shear, inverse_yy = b[PRECISION_X + q], b[SHEAR + q], b[PRECISION_Y + q]
         m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
         e0 = inverse_yy * (LOW_PASS_PX2 * a00 + a11 * m01 + a12 * m02)
@@ -257,9 +292,15 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
         h10, h11, h12 = p1 * v00 + u11 * v10, p1 * v01 + u11 * v11, p1 * v02 + u11 * v12
         h20, h21, h22 = p2 * v00 + u12 * v10, p2 * v01 + u12 * v11, p2 * v02 + u12 * v12
         vq0 = TWO * (q3 * (h10 - h01) + q2 * (h02 - h20) + q1 * (h21 - h12))
-        vq1 = TWO * (q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22))
-        vq2 = TWO * (q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22))
-        vq3 = TWO * (q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11))
+        vq1 = TWO * (
+            q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22)
+        )
+        vq2 = TWO * (
+            q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22)
+        )
+        vq3 = TWO * (
+            q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11)
+        )
         radial = vq0 * q0 + vq1 * q1 + vq2 * q2 + vq3 * q3
         b[V_RAW_0 + q], b[V_RAW_1 + q] = (vq0 - radial * q0) * rn, (vq1 - radial * q1) * rn
         b[V_RAW_2 + q], b[V_RAW_3 + q] = (vq2 - radial * q2) * rn, (vq3 - radial * q3) * rn
@@ -285,7 +326,8 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
 
 @inline_jit
 def differentiate_position(b, to_world):
-    """Write V_LOCAL_X to V_LOCAL_Z from V_CAMERA_X to V_CAMERA_Z and the weights W1 to W15 of the harmonics."""
+    """Write V_LOCAL_X to V_LOCAL_Z from V_CAMERA_X to V_CAMERA_Z and the weights W1 to W15 of the
+    harmonics."""
     t00, t01, t02 = to_world[0, 0], to_world[0, 1], to_world[0, 2]
     t10, t11, t12 = to_world[1, 0], to_world[1, 1], to_world[1, 2]
     t20, t21, t22 = to_world[2, 0], to_world[2, 1], to_world[2, 2]

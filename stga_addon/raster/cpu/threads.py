@@ -1,12 +1,12 @@
 """Running kernels on several threads, which works because kernels release the GIL.
 
-Numba's parallel loops would compile every kernel four times over (7 s instead of 2 for the image loss), hold the lock
-while they run, so that Blender's window waits for a picture rendered in its background, and crash where two threads
-call them at once.
+Numba's parallel loops would compile every kernel four times over (7 s instead of 2 for the image
+loss), hold the lock while they run, so that Blender's window waits for a picture rendered in its
+background, and crash where two threads call them at once.
 
-The helping threads stay in compiled code, without Python's lock: the calling thread writes a kernel's address and
-arguments where they look for it. They look for SPIN_S, and then sleep until they are woken. Who comes late finds no
-work, and nobody waits for him.
+The helping threads stay in compiled code, without Python's lock: the calling thread writes a
+kernel's address and arguments where they look for it. They look for SPIN_S, and then sleep until
+they are woken. Who comes late finds no work, and nobody waits for him.
 """
 
 import atexit
@@ -37,13 +37,15 @@ from .entry import (
 )
 
 UNITS, PIECE = 1, 2
-"""Where a kernel's `work` (3,) int64 holds the number of units and those of a piece; first is the next unit."""
+"""Where a kernel's `work` (3,) int64 holds the number of units and those of a piece; first is the
+next unit."""
 SPIN_S = 2e-4
-"""For how long a thread looks for work or waits for others before it sleeps: longer than most of the time between two
-kernels of an iteration, and little of what a busy machine's other programs would get."""
+"""For how long a thread looks for work or waits for others before it sleeps: longer than most of
+the time between two kernels of an iteration, and little of what a busy machine's other programs
+would get."""
 
-# Words of a team, int64. STATE: threads that may still join the kernel, times SEAT; threads in it, times 1; and SLEEPS
-# if its caller waits asleep for these.
+# Words of a team, int64. STATE: threads that may still join the kernel, times SEAT; threads in it,
+# times 1; and SLEEPS if its caller waits asleep for these.
 STATE, SEAT, SLEEPS = 0, 1 << 32, 1 << 31
 HELPERS, SPINS, CALLER_LOCK, STOPPED = 16, 17, 18, 19
 FIRST_HELPER, HELPER_WORDS, ASLEEP = ARGUMENTS + ARGUMENTS_WORDS, 8, 1
@@ -68,17 +70,20 @@ def set_threads(count: int) -> None:
 
 
 def start_threads() -> None:
-    """Start the threads that kernels run on, one at least, so that no kernel waits until what they run is compiled."""
+    """Start the threads that kernels run on, one at least, so that no kernel waits until what they
+    run is compiled."""
     _team.start(max(1, _threads - 1))
 
 
 def parallel(units: Callable[..., int], piece: int = 1) -> Callable[[Any], Callable[..., None]]:
-    """Make the compiled kernel(work, *arguments) a function of the arguments alone that runs on all threads.
+    """Make the compiled kernel(work, *arguments) a function of the arguments alone that runs on all
+    threads.
 
-    units: how many units of work the arguments hold. Each thread calls the kernel once, and in there takes one piece
-    after the other, by `next_piece`. A kernel must do a unit whatever the others do, and write what no other unit
-    writes, so that results do not depend on the threads. piece: units that are taken at a time; there are at most as
-    many threads as pieces, so one should take longer than to wake a thread.
+    units: how many units of work the arguments hold. Each thread calls the kernel once, and in
+    there takes one piece after the other, by `next_piece`. A kernel must do a unit whatever the
+    others do, and write what no other unit writes, so that results do not depend on the threads.
+    piece: units that are taken at a time; there are at most as many threads as pieces, so one
+    should take longer than to wake a thread.
     """
 
     def decorate(kernel: Any) -> Callable[..., None]:
@@ -95,17 +100,20 @@ def parallel(units: Callable[..., int], piece: int = 1) -> Callable[[Any], Calla
 
 @part_jit
 def next_piece(work):
-    """First and past-the-last unit of a piece that no thread has taken before; the same number if none is left."""
+    """First and past-the-last unit of a piece that no thread has taken before; the same number if
+    none is left."""
     begin = fetch_add(work, 0, work[PIECE])
     return min(begin, work[UNITS]), min(begin + work[PIECE], work[UNITS])
 
 
 class TeamKernel:
-    """A kernel as compiled for several types of arguments, and the function that calls it on a team."""
+    """A kernel as compiled for several types of arguments, and the function that calls it on a
+    team."""
 
     def __init__(self, kernel: Any) -> None:
         self.kernel = kernel
-        # A function of its own for each kernel, because two processes that compile must not write to the same cache.
+        # A function of its own for each kernel, because two processes that compile must not write
+        # to the same cache.
         own = FunctionType(_lead.__code__, globals(), f"lead_{kernel.__name__}")
         own.__qualname__ = own.__name__
         self.lead = jit(own)
@@ -124,7 +132,9 @@ class TeamKernel:
         self.kernel.compile(tuple(kind))
         compiled = self.kernel.overloads[tuple(kind)]
         address = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
-        self.addresses = np.concatenate([self.addresses, np.array([[number_of(kind), address]], np.int64)])
+        self.addresses = np.concatenate(
+            [self.addresses, np.array([[number_of(kind), address]], np.int64)]
+        )
 
 
 def _run(kernel: TeamKernel, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
@@ -135,7 +145,9 @@ def _run(kernel: TeamKernel, units: int, piece: int, arguments: tuple[Any, ...])
     team = _team
     if team.is_led.acquire(blocking=False):
         try:
-            kernel.call(team.words, team.start(min(_threads, -(-units // piece)) - 1), (work, *arguments))
+            kernel.call(
+                team.words, team.start(min(_threads, -(-units // piece)) - 1), (work, *arguments)
+            )
         finally:
             team.is_led.release()
     else:  # another thread leads them
@@ -162,17 +174,22 @@ class Team:
                 self.words[SPINS] = spins_of(SPIN_S)
             place = FIRST_HELPER + HELPER_WORDS * len(self._helpers)
             self.words[place] = _new_lock()
-            helper = Thread(target=_help, args=(self.words, place), name="stga kernels", daemon=True)
+            helper = Thread(
+                target=_help, args=(self.words, place), name="stga kernels", daemon=True
+            )
             self._helpers.append(helper)
             helper.start()
         return count
 
     def stop(self) -> None:
-        """End the threads, which must not run on where Python takes down the code that they are in."""
+        """End the threads, which must not run on where Python takes down the code that they are
+        in."""
         with self.is_led:
             self.words[STOPPED] = 1
             for n, helper in enumerate(self._helpers):
-                pythonapi.PyThread_release_lock(c_void_p(int(self.words[FIRST_HELPER + HELPER_WORDS * n])))
+                pythonapi.PyThread_release_lock(
+                    c_void_p(int(self.words[FIRST_HELPER + HELPER_WORDS * n]))
+                )
                 helper.join()
             self._helpers.clear()
             self.words[:] = 0
@@ -195,7 +212,8 @@ def _spin(count):
 
 
 def _new_lock() -> int:
-    """Address of one of Python's locks that is taken: whoever releases it wakes the thread that waits for it."""
+    """Address of one of Python's locks that is taken: whoever releases it wakes the thread that
+    waits for it."""
     pythonapi.PyThread_allocate_lock.restype = c_void_p
     lock = pythonapi.PyThread_allocate_lock()
     pythonapi.PyThread_acquire_lock(c_void_p(lock), 1)
@@ -203,7 +221,8 @@ def _new_lock() -> int:
 
 
 def _lead(words, addresses, helpers, arguments):
-    """Call a kernel with the arguments on this thread and so many helpers; false if it is not among the addresses."""
+    """Call a kernel with the arguments on this thread and so many helpers; false if it is not among
+    the addresses."""
     number, kernel = number_of_type(arguments), 0
     for n in range(len(addresses)):
         if addresses[n, 0] == number:
@@ -239,7 +258,8 @@ def _wait_for_helpers(words):
 
 @part_jit
 def _wake_two(words):
-    """Wake two helpers, if so many sleep: these wake two each, so that nobody has to wake them all."""
+    """Wake two helpers, if so many sleep: these wake two each, so that nobody has to wake them
+    all."""
     woken = 0
     for n in range(words[HELPERS]):
         place = FIRST_HELPER + HELPER_WORDS * n
@@ -252,7 +272,8 @@ def _wake_two(words):
 
 @part_jit
 def _join(words):
-    """Whether there is a kernel to help with; this thread is then among those that its caller waits for."""
+    """Whether there is a kernel to help with; this thread is then among those that its caller waits
+    for."""
     state = load(words, STATE)
     while state >= SEAT:
         if compare_exchange(words, STATE, state, state - SEAT + 1):
@@ -278,8 +299,11 @@ def _help(words, place):
             spins += 1
         else:
             exchange(words, place + ASLEEP, 1)
-            # After this, who has work or stops the team sees that this thread sleeps; what came before, it sees here.
-            if (load(words, STATE) < SEAT and load(words, STOPPED) == 0) or exchange(words, place + ASLEEP, 0) == 0:
+            # After this, who has work or stops the team sees that this thread sleeps; what came
+            # before, it sees here.
+            if (load(words, STATE) < SEAT and load(words, STOPPED) == 0) or exchange(
+                words, place + ASLEEP, 0
+            ) == 0:
                 _acquire(words[place], 1)
             spins = 0
 

@@ -17,7 +17,8 @@ SPLATS_PER_SORT = 4_096
 SORT_PARTS = 16
 """Parallel parts: the splats, sorted near to far, are cut into as many of equal length."""
 SPLATS, PAIRS, LEAST, GREATEST = range(4)
-"""Columns of what `list_visible` finds in a part: splats with a tile, their pairs, and the bounds of their keys."""
+"""Columns of what `list_visible` finds in a part: splats with a tile, their pairs, and the bounds
+of their keys."""
 RUN_BUCKETS = 512
 """Kinds of runs of tiles, by how many pairs they have."""
 
@@ -32,9 +33,11 @@ def _digit(key, least, shift):
 def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, counts):
     """List the splats with tiles in their bounds, rect (N, 4), by parts of SPLATS_PER_SORT splats.
 
-    Writes from each part's first place on its visible splats to found (N,) int32, and their keys, the bits of their
-    depths (N,), to keys (N,) uint32. pairs, first_pair (N,) int32: how many pairs each splat has, and how many in its
-    part come before. parts (parts + 1, 4) int64: see SPLATS. counts (parts, DIGITS) int32: of the keys' lowest digits.
+    Writes from each part's first place on its visible splats to found (N,) int32, and their keys,
+    the bits of their
+    depths (N,), to keys (N,) uint32. pairs, first_pair (N,) int32: how many pairs each splat has,
+    and how many in its part come before. parts (parts + 1, 4) int64: see SPLATS. counts (parts,
+    DIGITS) int32: of the keys' lowest digits.
     """
     part, past_part = next_piece(work)
     while part < past_part:
@@ -51,8 +54,16 @@ def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, 
                 pairs[i], first_pair[i] = width * (rect[i, 3] - rect[i, 1]), before
                 count, before = count + np.uint64(seen), np.int32(before + pairs[i])
                 row[_digit(key, np.uint32(0), np.uint32(0))] += seen
-                least, greatest = min(least, key if seen else least), max(greatest, key if seen else greatest)
-            parts[k, SPLATS], parts[k, PAIRS], parts[k, LEAST], parts[k, GREATEST] = count, before, least, greatest
+                least, greatest = (
+                    min(least, key if seen else least),
+                    max(greatest, key if seen else greatest),
+                )
+            parts[k, SPLATS], parts[k, PAIRS], parts[k, LEAST], parts[k, GREATEST] = (
+                count,
+                before,
+                least,
+                greatest,
+            )
         part, past_part = next_piece(work)
 
 
@@ -63,11 +74,11 @@ def parts_of(splats: int) -> int:
 
 @jit
 def sum_parts(parts, counts):
-    """Turn the splats and pairs of `list_visible`'s parts into those of the parts before, with a last row of all, and
-    its counts of digits into places.
+    """Turn the splats and pairs of `list_visible`'s parts into those of the parts before, with a
+    last row of all, and its counts of digits into places.
 
-    Returns what all keys are counted from, of lowest digit 0, so that a key's lowest digit is its own, and the greatest
-    of the keys counted from there.
+    Returns what all keys are counted from, of lowest digit 0, so that a key's lowest digit is its
+    own, and the greatest of the keys counted from there.
     """
     splats, pairs, least, greatest = 0, 0, 0xFFFFFFFF, 0
     last = len(parts) - 1
@@ -84,9 +95,11 @@ def sum_parts(parts, counts):
 
 @part_jit
 def _sum_counts(counts):
-    """Turn counts (parts, columns) int32 into places: column by column, in each one part after the other.
+    """Turn counts (parts, columns) int32 into places: column by column, in each one part after the
+    other.
 
-    Returns where each column begins, and the sum (columns + 1,) int64. Row by row, in loops that vectorize.
+    Returns where each column begins, and the sum (columns + 1,) int64. Row by row, in loops that
+    vectorize.
     """
     start = np.zeros(counts.shape[1] + 1, np.int64)
     for k in range(counts.shape[0]):
@@ -112,16 +125,21 @@ def sum_digits(counts):
 @parallel(lambda parts, *_: len(parts) - 1)
 @kernel_jit
 def move_visible(work, parts, found, keys, place, first_pair, visible, moved_keys, moved):
-    """Write the splats of `list_visible`, M in all, to visible (M,), and with their keys sorted by the lowest digit to
+    """Write the splats of `list_visible`, M in all, to visible (M,), and with their keys sorted by
+    the lowest digit to
     moved (M,) and moved_keys (M,).
 
-    parts and `place`, the places of digits, as of `sum_parts`; `place` is advanced. first_pair (N,): from now on counts
-    the pairs of the parts before as well.
+    parts and `place`, the places of digits, as of `sum_parts`; `place` is advanced. first_pair
+    (N,): from now on counts the pairs of the parts before as well.
     """
     part, past_part = next_piece(work)
     while part < past_part:
         for k in range(part, past_part):
-            row, begin, first = place[k], np.uint64(k * SPLATS_PER_SORT), np.uint64(parts[k, SPLATS])
+            row, begin, first = (
+                place[k],
+                np.uint64(k * SPLATS_PER_SORT),
+                np.uint64(parts[k, SPLATS]),
+            )
             before = np.int32(parts[k, PAIRS])
             for n in range(np.uint64(parts[k + 1, SPLATS] - parts[k, SPLATS])):
                 i, key = found[begin + n], keys[begin + n]
@@ -137,16 +155,20 @@ def move_visible(work, parts, found, keys, place, first_pair, visible, moved_key
 @parallel(lambda counts, *_: len(counts))
 @kernel_jit
 def count_digits(work, counts, keys, least, shift):
-    """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit occurs.
+    """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit
+    occurs.
 
-    The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts, DIGITS) int32.
+    The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts,
+    DIGITS) int32.
     """
     part, past_part = next_piece(work)
     while part < past_part:
         for k in range(part, past_part):
             row = counts[k]
             row[:] = 0
-            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
+            for n in range(
+                np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))
+            ):
                 row[_digit(keys[n], least, shift)] += 1
         part, past_part = next_piece(work)
 
@@ -154,12 +176,15 @@ def count_digits(work, counts, keys, least, shift):
 @parallel(lambda counts, *_: len(counts))
 @kernel_jit
 def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
-    """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_digits` and is advanced."""
+    """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_digits` and is
+    advanced."""
     part, past_part = next_piece(work)
     while part < past_part:
         for k in range(part, past_part):
             row = place[k]
-            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))):
+            for n in range(
+                np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))
+            ):
                 digit = _digit(keys[n], least, shift)
                 at = np.uint64(row[digit])
                 moved_keys[at], moved[at] = keys[n], values[n]
@@ -173,8 +198,11 @@ SPLATS_AHEAD = 16
 
 @part_jit
 def _prefetch_rect(rect, order, n, past):
-    """Ask memory for the bounds of the splat SPLATS_AHEAD after the n-th in order: they lie anywhere."""
-    prefetch(rect, np.uint64(order[min(n + np.uint64(SPLATS_AHEAD), past - np.uint64(1))]) * np.uint64(4))
+    """Ask memory for the bounds of the splat SPLATS_AHEAD after the n-th in order: they lie
+    anywhere."""
+    prefetch(
+        rect, np.uint64(order[min(n + np.uint64(SPLATS_AHEAD), past - np.uint64(1))]) * np.uint64(4)
+    )
 
 
 @inline_jit
@@ -186,8 +214,9 @@ def _tiles_of(rect, i, tiles_x):
 
 @inline_jit
 def _next_tile(tile, column, width, tiles_x):
-    """The splat's tile after `tile`, its column-th in the row, and its column. One loop over all of them, without a
-    branch at the end of a row, is a fourth faster than two: the processor cannot foresee where short loops end."""
+    """The splat's tile after `tile`, its column-th in the row, and its column. One loop over all of
+    them, without a branch at the end of a row, is a fourth faster than two: the processor cannot
+    foresee where short loops end."""
     is_last, one = column == width, np.uint64(1)
     step = np.uint64(tiles_x) - width + one if is_last else one
     return tile + step, one if is_last else column + one
@@ -221,21 +250,24 @@ def count_pairs(work, rect, order, tiles_x, counts):
 def arrange_tiles(counts, tile_rows):
     """Turn the counts of `count_pairs` into the offset of each part's pairs in each tile's list.
 
-    tile_rows (tiles, 4) as of `find_needed_rows`. Returns start (tiles + 1,) int64: where each tile's list begins, and
+    tile_rows (tiles, 4) as of `find_needed_rows`. Returns start (tiles + 1,) int64: where each
+    tile's list begins, and
     tiles (T,) int32: those with a needed row, in the order in which they are rendered.
     """
     start = _sum_counts(counts)
     tiles, count = np.empty(len(tile_rows), np.int32), 0
     for tile in range(len(tile_rows)):
         tiles[count] = tile
-        count += (tile_rows[tile, 0] < tile_rows[tile, 1]) | (tile_rows[tile, 2] < tile_rows[tile, 3])
+        count += (tile_rows[tile, 0] < tile_rows[tile, 1]) | (
+            tile_rows[tile, 2] < tile_rows[tile, 3]
+        )
     return start, heaviest_first(tiles[:count], start)
 
 
 @part_jit
 def heaviest_first(tiles, start):
-    """Reorder tiles (T,) int32 in runs of neighbors, those of the most pairs first, RUN_BUCKETS kinds of them: what is
-    left at the end is short."""
+    """Reorder tiles (T,) int32 in runs of neighbors, those of the most pairs first, RUN_BUCKETS
+    kinds of them: what is left at the end is short."""
     runs = len(tiles) // RUN_TILES
     pairs, places = np.zeros(runs, np.int64), np.zeros(RUN_BUCKETS + 1, np.int64)
     most = 1
@@ -259,10 +291,11 @@ def heaviest_first(tiles, start):
 @parallel(lambda *_: SORT_PARTS)
 @kernel_jit
 def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
-    """Write every tile's pairs front to back; `place` holds the offsets of `arrange_tiles` and is advanced.
+    """Write every tile's pairs front to back; `place` holds the offsets of `arrange_tiles` and is
+    advanced.
 
-    pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat stand, its first at
-    first_pair[i].
+    pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat
+    stand, its first at first_pair[i].
     """
     part, past_part = next_piece(work)
     while part < past_part:
@@ -296,7 +329,8 @@ def _cell(pixel, size, cells):
 
 @part_jit
 def _add_box(count, x0, y0, x1, y1):
-    """Count one more from (x0, y0) to before (x1, y1), as differences between neighbors: four whatever the size."""
+    """Count one more from (x0, y0) to before (x1, y1), as differences between neighbors: four
+    whatever the size."""
     count[y0, x0] += 1
     count[y0, x1] -= 1
     count[y1, x0] -= 1
@@ -335,7 +369,8 @@ def listed_rows(rows, wanted):
 
 
 def sum_tiles(tiles: np.ndarray) -> np.ndarray:
-    """How many of the marked tiles (tiles_y, tiles_x) bool are above and to the left (tiles_y + 1, tiles_x + 1)."""
+    """How many of the marked tiles (tiles_y, tiles_x) bool are above and to the left (tiles_y + 1,
+    tiles_x + 1)."""
     covered = np.zeros((tiles.shape[0] + 1, tiles.shape[1] + 1), np.int32)
     tiles.cumsum(0, np.int32).cumsum(1, out=covered[1:, 1:])
     return covered
@@ -343,32 +378,47 @@ def sum_tiles(tiles: np.ndarray) -> np.ndarray:
 
 @jit
 def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
-    """The tiles that the listed splats (M,) reach, and the rows of tiles in which a pixel may be at most `reach`
-    pixels, float32, away from one that they reach.
+    """The tiles that the listed splats (M,) reach, and the rows of tiles in which a pixel may be at
+    most `reach` pixels, float32, away from one that they reach.
 
-    Returns touched (tiles_y, tiles_x) bool, the tiles that they reach, which are needed whole; `sum_tiles` of those
-    with a needed row; and tile_rows (tiles, 4) uint8: first and past-the-last row in the left and in the right half of
-    each tile, both even; the first is not before the other where there are none.
+    Returns touched (tiles_y, tiles_x) bool, the tiles that they reach, which are needed whole;
+    `sum_tiles` of those with a needed row; and tile_rows (tiles, 4) uint8: first and past-the-last
+    row in the left and in the right half of each tile, both even; the first is not before the other
+    where there are none.
     """
     projected, extent_y, rect = projection.columns, projection.extent_y, projection.rect
     two, half, slack = np.float32(2.0), np.float32(TILE // 2), np.float32(1e-4)
     strips, pairs = 2 * tiles_x, TILE // 2 * tiles_y  # cells: two rows of half a tile
-    near, reached = np.zeros((pairs + 1, strips + 1), np.int32), np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
+    near, reached = (
+        np.zeros((pairs + 1, strips + 1), np.int32),
+        np.zeros((tiles_y + 1, tiles_x + 1), np.int32),
+    )
     for n in range(len(splats)):
         i = np.uint64(splats[n])
         if rect[i, 2] <= rect[i, 0]:
             continue
         _add_box(reached, rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3])
-        x, y, ey, shear = projected[i, MEAN_X], projected[i, MEAN_Y], extent_y[i], projected[i, SHEAR]
+        x, y, ey, shear = (
+            projected[i, MEAN_X],
+            projected[i, MEAN_Y],
+            extent_y[i],
+            projected[i, SHEAR],
+        )
         ex = ey * math.sqrt(projected[i, PRECISION_Y] / projected[i, PRECISION_X] + shear * shear)
-        ex, ey = ex + slack * ex + reach + np.float32(0.5), ey + slack * ey + reach + np.float32(0.5)
+        ex, ey = (
+            ex + slack * ex + reach + np.float32(0.5),
+            ey + slack * ey + reach + np.float32(0.5),
+        )
         _add_box(
             near, _cell(x - ex, half, strips), _cell(y - ey, two, pairs), _cell(x + ex + half, half, strips),
             _cell(y + ey + two, two, pairs),
         )  # fmt: skip
     _sum_boxes(reached)
     _sum_boxes(near)
-    touched, tile_rows = np.empty((tiles_y, tiles_x), np.bool_), np.empty((tiles_y * tiles_x, 4), np.uint8)
+    touched, tile_rows = (
+        np.empty((tiles_y, tiles_x), np.bool_),
+        np.empty((tiles_y * tiles_x, 4), np.uint8),
+    )
     covered = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
     for tile in range(tiles_y * tiles_x):
         ty, tx = tile // tiles_x, tile % tiles_x
@@ -385,8 +435,8 @@ def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
 
 @part_jit
 def _number_group(tiles, numbers, tile, number):
-    """Give all marked tiles that are connected to `tile`, by sides or corners, a number; returns their first row and
-    past-the-last."""
+    """Give all marked tiles that are connected to `tile`, by sides or corners, a number; returns
+    their first row and past-the-last."""
     rows, columns = tiles.shape
     waiting, count = np.empty(tiles.size, np.int64), 1
     waiting[0], numbers[tile // columns, tile % columns] = tile, number
@@ -406,18 +456,25 @@ def _number_group(tiles, numbers, tile, number):
 
 @jit
 def box_groups(tiles, most_rows):
-    """Boxes (B, 4) int64 x0, y0, x1, y1 around each connected group of marked tiles (rows, columns) bool, the largest
-    first; a group of more than `most_rows` rows is cut into bands of about as many rows each."""
+    """Boxes (B, 4) int64 x0, y0, x1, y1 around each connected group of marked tiles (rows, columns)
+    bool, the largest first; a group of more than `most_rows` rows is cut into bands of about as
+    many rows each."""
     columns, numbers = tiles.shape[1], np.zeros(tiles.shape, np.int64)
     boxes, count, number = np.empty((tiles.size, 4), np.int64), 0, 0
     for tile in range(tiles.size):
-        if not tiles[tile // columns, tile % columns] or numbers[tile // columns, tile % columns] > 0:
+        if (
+            not tiles[tile // columns, tile % columns]
+            or numbers[tile // columns, tile % columns] > 0
+        ):
             continue
         number += 1
         first, past = _number_group(tiles, numbers, tile, number)
         bands = (past - first + most_rows - 1) // most_rows
         for band in range(bands):
-            y0, y1 = first + (past - first) * band // bands, first + (past - first) * (band + 1) // bands
+            y0, y1 = (
+                first + (past - first) * band // bands,
+                first + (past - first) * (band + 1) // bands,
+            )
             x0, x1 = columns, 0
             for y in range(y0, y1):
                 for x in range(columns):

@@ -8,7 +8,10 @@ from typing import Any
 import wgpu
 from wgpu.backends.wgpu_native.extras import set_instance_extras
 
-NEEDED_LIMITS = {"max-storage-buffers-per-shader-stage": 10, "max-compute-workgroup-storage-size": 24 << 10}
+NEEDED_LIMITS = {
+    "max-storage-buffers-per-shader-stage": 10,
+    "max-compute-workgroup-storage-size": 24 << 10,
+}
 """What the kernels need of an adapter; WebGPU promises 8 and 16 KiB, desktop adapters have more."""
 BACKENDS = ("Vulkan", "Metal", "DX12")
 """Without OpenGL, which lacks what the kernels need and complains where there is no display."""
@@ -16,11 +19,14 @@ BACKENDS = ("Vulkan", "Metal", "DX12")
 
 @cache
 def adapters() -> dict[str, Any]:
-    """The adapters that can run the kernels, by a name that tells equal ones apart: cards first, software last.
+    """The adapters that can run the kernels, by a name that tells equal ones apart: cards first,
+    software last.
 
-    A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the slowest.
+    A GPU that has Vulkan or Metal is named by that before Direct3D 12, whose compiler is the
+    slowest.
     """
-    os.environ.setdefault("NODEVICE_SELECT", "1")  # Mesa's layer for windows complains where there is no display
+    # Mesa's layer for windows complains where there is no display
+    os.environ.setdefault("NODEVICE_SELECT", "1")
     with suppress(RuntimeError):  # where this process has an instance already, it stays as it is
         set_instance_extras(backends=BACKENDS)
     found: dict[str, Any] = {}

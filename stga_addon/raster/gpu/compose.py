@@ -23,7 +23,9 @@ from .rasterize import (
 )
 
 
-def compose(adapter: str, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False) -> ComposedImage:
+def compose(
+    adapter: str, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
+) -> ComposedImage:
     """Render layers with a camera on the adapter of that name; see `cpu.compose.compose`.
 
     Raises DeviceError where the adapter fails.
@@ -40,14 +42,21 @@ def _rasterizer(adapter: str) -> Rasterizer:
     return Rasterizer(Device(adapter))
 
 
-def _compose(rasterizer: Rasterizer, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool) -> ComposedImage:
-    """Each layer has its own view of the same camera, and all share the tables of projected splats."""
+def _compose(
+    rasterizer: Rasterizer, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool
+) -> ComposedImage:
+    """Each layer has its own view of the same camera, and all share the tables of projected
+    splats."""
     device, given = rasterizer.device, list[tuple[PosedSplats, SplatTable, CameraFrames, Tables]]()
     for n, layer in enumerate(layers):
         frames = layer_frames(layer, camera)
         parameters = Parameters(*(getattr(layer.splats, name) for name in Parameters._fields))
         table = upload_splats(device, parameters, layer.splats.face, f" {n}")
-        tables = {"splats": table.rows, "face": table.face, "frames": upload_frames(device, frames, f" {n}")}
+        tables = {
+            "splats": table.rows,
+            "face": table.face,
+            "frames": upload_frames(device, frames, f" {n}"),
+        }
         given.append((layer, table, frames, tables))
     count = sum(table.count for _, table, _, _ in given)
 

@@ -1,7 +1,7 @@
 """WebGPU device: buffers that grow, kernels from WGSL files, recorded work, late readback.
 
-Work is recorded into one command encoder and submitted at once; nothing waits for the device except `read` and
-`Readback.result`. A failure of driver or memory becomes a DeviceError.
+Work is recorded into one command encoder and submitted at once; nothing waits for the device except
+`read` and `Readback.result`. A failure of driver or memory becomes a DeviceError.
 """
 
 import logging
@@ -27,11 +27,16 @@ POLL_INTERVAL_S = 2e-4
 LOST_CHECK_S = 0.5
 
 _BINDING = re.compile(
-    r"^@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)(.*)$", re.M
+    r"^@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)(.*)$",
+    re.M,
 )
 _FUNCTION = re.compile(r"(?:^@compute[^\n]*\n)?^fn (\w+)(.*?)^\}", re.M | re.S)
 _WRITTEN = re.compile(r"^\s*(\w+)\[[^=;\n]*\][.\w]* [-+*|]?=\s|&(\w+)", re.M)
-_LAYOUT_TYPE = {"uniform": "uniform", "storage, read": "read-only-storage", "storage, read_write": "storage"}
+_LAYOUT_TYPE = {
+    "uniform": "uniform",
+    "storage, read": "read-only-storage",
+    "storage, read_write": "storage",
+}
 
 Groups = tuple[int, int, int] | tuple[Any, int]
 """Workgroups of a dispatch; or the buffer that holds them as three u32, and the offset in bytes."""
@@ -39,7 +44,8 @@ Groups = tuple[int, int, int] | tuple[Any, int]
 
 @dataclass(frozen=True)
 class Kernel:
-    """An entry point of a WGSL file, ready to be dispatched; bindings: index of each table that it uses by name."""
+    """An entry point of a WGSL file, ready to be dispatched; bindings: index of each table that it
+    uses by name."""
 
     name: str
     pipeline: Any
@@ -48,10 +54,12 @@ class Kernel:
 
 
 class Device:
-    """Buffers by name on one adapter; devices of the same adapter share its connection and compiled kernels.
+    """Buffers by name on one adapter; devices of the same adapter share its connection and compiled
+    kernels.
 
     dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
-    kernel_times                times the kernels while it is set (`KernelTimes` of benchmarks/gpu_kernels.py)
+    kernel_times                times the kernels while it is set (`KernelTimes` of
+                                benchmarks/gpu_kernels.py)
     failures                    what the driver raised while results were awaited
     """
 
@@ -59,14 +67,20 @@ class Device:
         """Open the adapter called `name` in `adapters()`, the first one by default."""
         known = adapters()
         if not known:
-            raise StgaError("--device gpu: no graphics driver with Vulkan, Metal or Direct3D 12 was found")
+            raise StgaError(
+                "--device gpu: no graphics driver with Vulkan, Metal or Direct3D 12 was found"
+            )
         self.name = name or next(iter(known))
         if self.name not in known:
-            raise StgaError(f"--device gpu:{self.name}: no such adapter; there are: {', '.join(known)}")
+            raise StgaError(
+                f"--device gpu:{self.name}: no such adapter; there are: {', '.join(known)}"
+            )
         self.is_software = is_software(known[self.name])
         with self.errors():
             self.gpu, self._kernels, self.failures = _open(self.name)
-        self.max_bytes = min(self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"])
+        self.max_bytes = min(
+            self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"]
+        )
         self.dispatches = self.submits = self.waits = 0
         self.kernel_times: Any = None
         self._buffers: dict[str, Any] = {}
@@ -78,15 +92,21 @@ class Device:
         return sum(buffer.size for buffer in self._buffers.values())
 
     def buffer(self, name: str, words: int, usage: str = "storage") -> Any:
-        """A buffer of at least so many 32-bit words; the same memory until more is asked for, then fresh zeros.
+        """A buffer of at least so many 32-bit words; the same memory until more is asked for, then
+        fresh zeros.
 
-        usage: "storage", "uniform", or "indirect" (storage that also holds the workgroups of a dispatch).
+        usage: "storage", "uniform", or "indirect" (storage that also holds the workgroups of a
+        dispatch).
         """
         buffer = self._buffers.get(name)
         needed = 4 * max(words, 4)
         if buffer is None or buffer.size < needed:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
-            size = needed if buffer is None else min(needed + needed // 32 * 4, max(needed, self.max_bytes // 4 * 4))
+            size = (
+                needed
+                if buffer is None
+                else min(needed + needed // 32 * 4, max(needed, self.max_bytes // 4 * 4))
+            )
             self._groups.clear()  # which would keep the old buffer's memory
             buffer = self._buffers[name] = self.new_buffer(name, size, _USAGE[usage])
         return buffer
@@ -103,9 +123,11 @@ class Device:
             return self.gpu.create_buffer(label=name, size=size, usage=usage)
 
     def upload(self, name: str, values: np.ndarray, usage: str = "storage") -> Any:
-        """Copy an array, which may be changed as soon as this returns, to a buffer before the next submit.
+        """Copy an array, which may be changed as soon as this returns, to a buffer before the next
+        submit.
 
-        The driver keeps the copy until earlier work is done. Bytes are padded with zeros to whole words.
+        The driver keeps the copy until earlier work is done. Bytes are padded with zeros to whole
+        words.
         """
         data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
         buffer = self.buffer(name, -(-data.size // 4), usage)
@@ -114,7 +136,9 @@ class Device:
             if whole:
                 self.gpu.queue.write_buffer(buffer, 0, data, 0, whole)
             if whole < data.size:
-                self.gpu.queue.write_buffer(buffer, whole, np.pad(data[whole:], (0, 4 - data.size % 4)))
+                self.gpu.queue.write_buffer(
+                    buffer, whole, np.pad(data[whole:], (0, 4 - data.size % 4))
+                )
         return buffer
 
     def read(self, buffer: Any, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
@@ -131,7 +155,8 @@ class Device:
         return np.array(readback.result().view(dtype)[:count].reshape(shape))
 
     def kernel(self, name: str, **constants: float) -> Kernel:
-        """The entry point "file.function", compiled once; constants: values of the file's `override` declarations."""
+        """The entry point "file.function", compiled once; constants: values of the file's
+        `override` declarations."""
         key = name, *sorted(constants.items())
         if key not in self._kernels:
             self._kernels[key] = self._compile(name, constants)
@@ -143,7 +168,11 @@ class Device:
         with self.errors():
             layout = self.gpu.create_bind_group_layout(
                 entries=[
-                    {"binding": index, "visibility": wgpu.ShaderStage.COMPUTE, "buffer": {"type": kind}}
+                    {
+                        "binding": index,
+                        "visibility": wgpu.ShaderStage.COMPUTE,
+                        "buffer": {"type": kind},
+                    }
                     for index, kind in tables.values()
                 ]
             )
@@ -156,10 +185,13 @@ class Device:
                     "constants": constants,
                 },
             )
-        return Kernel(name, pipeline, layout, {table: index for table, (index, _) in tables.items()})
+        return Kernel(
+            name, pipeline, layout, {table: index for table, (index, _) in tables.items()}
+        )
 
     def bind(self, kernel: Kernel, tables: Mapping[str, Any]) -> Any:
-        """The bind group of a kernel with those of the tables that it uses; made once for the same buffers."""
+        """The bind group of a kernel with those of the tables that it uses; made once for the same
+        buffers."""
         buffers = [tables[name] for name in kernel.bindings]
         key = id(kernel), *map(id, buffers)
         found = self._groups.get(key)
@@ -185,7 +217,8 @@ class Device:
 
     @contextmanager
     def errors(self) -> Iterator[None]:
-        """Turn what driver and library raise into a DeviceError; mistakes in kernels and calls pass as they are."""
+        """Turn what driver and library raise into a DeviceError; mistakes in kernels and calls pass
+        as they are."""
         try:
             yield
         except wgpu.GPUOutOfMemoryError as error:
@@ -204,18 +237,23 @@ class Device:
 
 
 class Recording:
-    """Work for the device in the order in which it is recorded; each dispatch sees what those before it wrote."""
+    """Work for the device in the order in which it is recorded; each dispatch sees what those
+    before it wrote."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self._encoder = device.gpu.create_command_encoder()
         self._pass: Any = None
 
-    def dispatch(self, name: str, threads: int | Groups, tables: Mapping[str, Any], **constants: float) -> None:
-        """Run `Device.kernel` with those of the tables that it uses, by at least so many threads or workgroups."""
+    def dispatch(
+        self, name: str, threads: int | Groups, tables: Mapping[str, Any], **constants: float
+    ) -> None:
+        """Run `Device.kernel` with those of the tables that it uses, by at least so many threads or
+        workgroups."""
         kernel, groups = self.device.kernel(name, **constants), threads
         if isinstance(groups, int):
-            groups = self.device.groups_of(-(-groups // WORKGROUP))  # `thread_number` in WGSL numbers the threads
+            # `thread_number` in WGSL numbers the threads
+            groups = self.device.groups_of(-(-groups // WORKGROUP))
         indirect = not isinstance(groups[0], int)
         if not indirect and 0 in groups:
             return
@@ -251,7 +289,10 @@ class Recording:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if error is None:
             self.submit()
@@ -260,7 +301,9 @@ class Recording:
         times = self.device.kernel_times
         if times is not None:
             self._end_pass()
-            self._pass = self._encoder.begin_compute_pass(timestamp_writes=times.writes(kernel.name))
+            self._pass = self._encoder.begin_compute_pass(
+                timestamp_writes=times.writes(kernel.name)
+            )
         elif self._pass is None:
             self._pass = self._encoder.begin_compute_pass()
         return self._pass
@@ -290,7 +333,8 @@ class Readback:
     def start(self) -> None:
         """Ask for the words as soon as the submitted work is done."""
         with self._device.errors():
-            # Without the empty submit that wgpu makes for READ; its own `read_buffer` does the same.
+            # Without the empty submit that wgpu makes for READ; its own `read_buffer` does the
+            # same.
             self._promise = self._buffer.map_async("READ_NOSYNC")
 
     def result(self) -> np.ndarray:
@@ -317,12 +361,14 @@ _USAGE = {
     "indirect": _STORAGE | wgpu.BufferUsage.INDIRECT,
     "uniform": wgpu.BufferUsage.UNIFORM | wgpu.BufferUsage.COPY_DST | wgpu.BufferUsage.COPY_SRC,
 }
-logging.getLogger("wgpu").setLevel(logging.CRITICAL)  # what it logs it also raises, and that is reported
+# what it logs it also raises, and that is reported
+logging.getLogger("wgpu").setLevel(logging.CRITICAL)
 
 
 @cache
 def _open(name: str) -> tuple[Any, dict[tuple, Kernel], list[Exception]]:
-    """An adapter's device, with its limits raised, and room for compiled kernels and for failures."""
+    """An adapter's device, with its limits raised, and room for compiled kernels and for
+    failures."""
     adapter = adapters()[name]
     device = adapter.request_device_sync(
         required_features=sorted({"timestamp-query"} & adapter.features),
@@ -334,9 +380,11 @@ def _open(name: str) -> tuple[Any, dict[tuple, Kernel], list[Exception]]:
 
 
 def _poll_without_blocking(device: Any, failures: list[Exception]) -> None:
-    """Let wgpu's thread, which runs while a result is awaited, look now and then whether it is there.
+    """Let wgpu's thread, which runs while a result is awaited, look now and then whether it is
+    there.
 
-    By itself it waits inside the driver for all submitted work, and holds a lock that the next submit waits for.
+    By itself it waits inside the driver for all submitted work, and holds a lock that the next
+    submit waits for.
     """
     reference = weakref.ref(device)
 
@@ -350,7 +398,8 @@ def _poll_without_blocking(device: Any, failures: list[Exception]) -> None:
             sleep(LOST_CHECK_S)
         sleep(POLL_INTERVAL_S)
 
-    if hasattr(getattr(device, "_poller", None), "_poll_func"):  # private: a version without it is slower, not wrong
+    # private: a version without it is slower, not wrong
+    if hasattr(getattr(device, "_poller", None), "_poll_func"):
         device._poller._poll_func = poll
 
 
@@ -360,11 +409,15 @@ def _source(name: str) -> str:
 
 @cache
 def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
-    """The text of an entry point with the functions that it calls, and index and kind of each table that they use.
+    """The text of an entry point with the functions that it calls, and index and kind of each table
+    that they use.
 
-    A table is bound for reading where none of them assigns to it: what only reads needs no barrier between dispatches.
+    A table is bound for reading where none of them assigns to it: what only reads needs no barrier
+    between dispatches.
     """
-    text = "\n".join([constants_wgsl(), struct_wgsl("View", VIEW), _source("common"), _source(file)])
+    text = "\n".join(
+        [constants_wgsl(), struct_wgsl("View", VIEW), _source("common"), _source(file)]
+    )
     code = re.sub("//.*", "", text)
     bodies, reached, left = dict(_FUNCTION.findall(code)), set[str](), {entry}
     while left:
@@ -372,7 +425,10 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
         called = {name for each in left for name in re.findall(r"\w+(?=\()", bodies[each])}
         left = called & bodies.keys() - reached
     body = "".join(bodies[name] for name in sorted(reached))
-    used, assigned = set(re.findall(r"(?<![.\w])\w+", body)), {name for pair in _WRITTEN.findall(body) for name in pair}
+    used, assigned = (
+        set(re.findall(r"(?<![.\w])\w+", body)),
+        {name for pair in _WRITTEN.findall(body) for name in pair},
+    )
     tables: dict[str, tuple[int, str]] = {}
 
     def declare(found: re.Match[str]) -> str:

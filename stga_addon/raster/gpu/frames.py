@@ -1,4 +1,5 @@
-"""Camera-space frames and strain of a posed mesh's triangles, computed on the device, moved by driven offsets."""
+"""Camera-space frames and strain of a posed mesh's triangles, computed on the device, moved by
+driven offsets."""
 
 from collections.abc import Collection, Mapping
 from typing import Any, ClassVar, Protocol
@@ -13,7 +14,8 @@ from .device import Device, Recording
 from .layout import FRAME_STRAIN, list_words
 
 POSE = np.dtype(
-    [("rows", np.float32, (3, 4))] + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "padding")]
+    [("rows", np.float32, (3, 4))]
+    + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "padding")]
 )
 """The uniform of frames.wgsl."""
 
@@ -26,7 +28,8 @@ class Signal(Protocol):
     def __init__(self, device: Device, basis: StrainBasis) -> None: ...
 
     def record(self, work: Recording, pose: Any, strain_from_rest: Any) -> Any:
-        """Record the signal of the pose whose strain (F, 3), less that at rest, is given; returns its table (F, S)."""
+        """Record the signal of the pose whose strain (F, 3), less that at rest, is given; returns
+        its table (F, S)."""
 
 
 class SmoothedStrain:
@@ -37,14 +40,21 @@ class SmoothedStrain:
     def __init__(self, device: Device, basis: StrainBasis) -> None:
         self._count = len(basis.faces)
         self._neighbors = device.upload("neighbors", list_words(basis.neighbors))
-        self._rounds = [device.buffer(f"smoothed strain {n}", self._count * STRAIN_COMPONENTS) for n in range(2)]
+        self._rounds = [
+            device.buffer(f"smoothed strain {n}", self._count * STRAIN_COMPONENTS) for n in range(2)
+        ]
 
     def record(self, work: Recording, pose: Any, strain_from_rest: Any) -> Any:
         """As of `Signal`; S is 3."""
         averaged = strain_from_rest
         for n in range(AVERAGING_ROUNDS):
             smoothed, averaged = averaged, self._rounds[n % 2]
-            tables = {"pose": pose, "neighbors": self._neighbors, "smoothed": smoothed, "averaged": averaged}
+            tables = {
+                "pose": pose,
+                "neighbors": self._neighbors,
+                "smoothed": smoothed,
+                "averaged": averaged,
+            }
             work.dispatch(self.kernels[0], self._count, tables)
         return averaged
 
@@ -57,25 +67,31 @@ class Embedding:
     """A mesh's topology and neutral form on the device, uploaded once.
 
     strains  columns of strain in its frames
-    signals  name of a driven offset -> its signal (F, S) of the mesh whose frames were composed last
+    signals  name of a driven offset -> its signal (F, S) of the mesh whose frames were composed
+             last
     """
 
     def __init__(
         self, device: Device, neutral: np.ndarray, faces: np.ndarray, convention: str,
         basis: StrainBasis | None = None, offsets: Collection[str] = (),
     ) -> None:  # fmt: skip
-        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where splats follow strain; offsets: the
-        driven offsets that they follow, which need the basis."""
+        """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where splats follow
+        strain; offsets: the driven offsets that they follow, which need the basis."""
         if convention not in embedding.CONVENTIONS:
-            raise ValueError(f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}")
+            raise ValueError(
+                f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}"
+            )
         self.strains = 0 if basis is None else STRAIN_COMPONENTS
         self._device, self._count, self._area_scales = device, len(faces), convention == "stga"
         area = embedding.face_areas(neutral, faces)
-        area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)  # zero only where the float64 is
+        # zero only where the float64 is
+        area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)
         rows, touching = np.zeros(0, np.float32), np.zeros(0, np.uint32)
         if basis is not None:
             parts = basis.gram, basis.to_tensor, basis.to_plane, basis.range
-            rows = np.concatenate([part.reshape(len(faces), -1) for part in parts], axis=1, dtype=np.float32)
+            rows = np.concatenate(
+                [part.reshape(len(faces), -1) for part in parts], axis=1, dtype=np.float32
+            )
             touching = list_words(basis.vertex_faces)
         self._tables = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
@@ -86,13 +102,16 @@ class Embedding:
             "strain_from_rest": device.buffer("strain from rest", len(faces) * self.strains),
         }
         assert basis is not None or not offsets
-        self._signals = {name: SIGNALS[name](device, basis) for name in offsets if basis is not None}
+        self._signals = {
+            name: SIGNALS[name](device, basis) for name in offsets if basis is not None
+        }
         self.signals: dict[str, Any] = {}
 
     def upload(self, vertices: np.ndarray, camera: Camera) -> None:
         """Send a posed mesh (V, 3), world meters, and its camera before the recording is submitted.
 
-        Shaders have no float64: a position becomes the float32 of its distance to the first vertex and the rest.
+        Shaders have no float64: a position becomes the float32 of its distance to the first vertex
+        and the rest.
         """
         center = vertices[0] if len(vertices) else np.zeros(3)
         local = vertices - center
@@ -103,13 +122,18 @@ class Embedding:
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         pose = np.zeros(1, POSE)
         pose["rows"] = np.c_[turn, turn @ center + shift]
-        pose["triangles"], pose["strains"], pose["area_scales"] = self._count, self.strains, self._area_scales
+        pose["triangles"], pose["strains"], pose["area_scales"] = (
+            self._count,
+            self.strains,
+            self._area_scales,
+        )
         self._device.upload("pose", pose, "uniform")
 
     def compose(self, work: Recording, coefficients: Mapping[str, Any]) -> Any:
         """Record the frames of the mesh that was uploaded last; returns their table.
 
-        coefficients: driven offset -> table (F, S, 3): the frames are moved by them as in `Avatar.frames`.
+        coefficients: driven offset -> table (F, S, 3): the frames are moved by them as in
+        `Avatar.frames`.
         """
         buffer, tables = self._device.buffer, self._tables
         pose = tables["pose"] = buffer("pose", POSE.itemsize // 4, "uniform")
@@ -119,7 +143,9 @@ class Embedding:
         if self.strains:
             work.dispatch("frames.average_strain", self._count, tables)
         strain = tables["strain_from_rest"]
-        self.signals = {name: signal.record(work, pose, strain) for name, signal in self._signals.items()}
+        self.signals = {
+            name: signal.record(work, pose, strain) for name, signal in self._signals.items()
+        }
         for name, table in coefficients.items():
             moving = {**tables, "coefficients": table, "driving": self.signals[name]}
             work.dispatch("frames.shift", self._count, moving, SIGNALS=OFFSETS[name].signals)

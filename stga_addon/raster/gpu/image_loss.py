@@ -8,17 +8,23 @@ from ..cpu.rasterize import tile_grid
 from .device import Device, Recording
 
 LOSS = np.dtype(
-    [("ssim_weight", np.float32), ("masked", np.uint32)] + [(f"change_{channel}", np.float32) for channel in "rgb"]
+    [("ssim_weight", np.float32), ("masked", np.uint32)]
+    + [(f"change_{channel}", np.float32) for channel in "rgb"]
 )
 """The uniform `loss` of image_loss.wgsl."""
 
 
 def upload_target(
-    device: Device, target: np.ndarray, ssim_weight: float, mask: np.ndarray | None = None, change: Any = (0, 0, 0)
+    device: Device,
+    target: np.ndarray,
+    ssim_weight: float,
+    mask: np.ndarray | None = None,
+    change: Any = (0, 0, 0),
 ) -> None:
     """Send the target (H, W, 3) uint8 of the next image, and how it is compared.
 
-    mask (H, W) uint8: the foreground's coverage; where it leaves the background free, the target's color is changed by
+    mask (H, W) uint8: the foreground's coverage; where it leaves the background free, the target's
+    color is changed by
     `change` (3,) in 0…255.
     """
     loss = np.zeros(1, LOSS)
@@ -35,9 +41,9 @@ def image_loss(
 ) -> tuple[Any, Any]:
     """Record the gradient of the loss of an image (3, H, W) against the uploaded target.
 
-    touched (tiles,): in which tiles the gradient is wanted; the image must be rendered LOSS_REACH_PX around them.
-    Returns the gradient (3, H, W), undefined in other tiles, and the loss (1,), which is computed if `whole`: every
-    tile is touched.
+    touched (tiles,): in which tiles the gradient is wanted; the image must be rendered
+    LOSS_REACH_PX around them. Returns the gradient (3, H, W), undefined in other tiles, and the
+    loss (1,), which is computed if `whole`: every tile is touched.
     """
     buffer, (columns, rows) = work.device.buffer, tile_grid(width, height)
     tables = {

@@ -1,24 +1,41 @@
-"""Memory layout of the GPU's arrays, in Python and as the WGSL prelude that every kernel begins with.
+"""Memory layout of the GPU's arrays, in Python and as the WGSL prelude that every kernel begins
+with.
 
-A table is a flat array of 32-bit words, row by row, without padding: word c of row i is table[i * stride + c].
-N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs, image H × W.
+A table is a flat array of 32-bit words, row by row, without padding: word c of row i is table[i *
+stride + c]. N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs, image
+H × W.
 
-| table          | words per row    | content                                                                          |
+| table          | words per row    | content
+                 |
 |----------------|------------------|----------------------------------------------------------------------------------|
-| splats         | 11 + 3K + 3S f32 | the fields of `cpu.layout.Parameters` in that order; also gradients and moments  |
-| frames         | 12 + columns f32 | a triangle's origin (3), matrix (3, 3) by rows, strain, in camera space          |
-| projected      | PROJECTED f32    | a splat on the screen: the columns of `cpu.layout`                               |
-| rect           | 4 i32            | tile bounds x0, y0, x1, y1 of a splat, as in `cpu.layout.Projection`             |
-| depth_key      | 1 u32            | bits of a splat's depth; HIDDEN where it is not visible                          |
-| slots          | 2 u32            | a splat's first slot, and how many it has: one for each of its pairs             |
-| slot_splat     | 1 u32            | the splat of a slot, with WANTED                                                 |
-| pair_gradients | PROJECTED f32    | by slot: gradient of the pair with respect to the splat's projected columns      |
-| wanted         | 1 u32            | 1 for splats that are visible and in focus: only their gradients are written     |
-| touched        | 1 u32            | 1 for the tiles that a splat in focus reaches                                    |
-| rendered       | 1 u32            | 1 for those and the tiles around them, as far as their gradient depends on       |
-| tile_range     | 2 u32            | a tile's first pair and one past its last                                        |
-| pair_slot      | 1 u32            | a pair's slot; by tile, near to far                                              |
-| pixels         | 2 words          | transmittance f32, and one past the last contributing pair of the tile           |
+| splats         | 11 + 3K + 3S f32 | the fields of `cpu.layout.Parameters` in that order; also
+                 gradients and moments  |
+| frames         | 12 + columns f32 | a triangle's origin (3), matrix (3, 3) by rows, strain, in
+                 camera space          |
+| projected      | PROJECTED f32    | a splat on the screen: the columns of `cpu.layout`
+                 |
+| rect           | 4 i32            | tile bounds x0, y0, x1, y1 of a splat, as in
+                 `cpu.layout.Projection`             |
+| depth_key      | 1 u32            | bits of a splat's depth; HIDDEN where it is not visible
+                 |
+| slots          | 2 u32            | a splat's first slot, and how many it has: one for each of its
+                 pairs             |
+| slot_splat     | 1 u32            | the splat of a slot, with WANTED
+                 |
+| pair_gradients | PROJECTED f32    | by slot: gradient of the pair with respect to the splat's
+                                    projected columns      |
+| wanted         | 1 u32            | 1 for splats that are visible and in focus: only their
+                 gradients are written     |
+| touched        | 1 u32            | 1 for the tiles that a splat in focus reaches
+                 |
+| rendered       | 1 u32            | 1 for those and the tiles around them, as far as their
+                 gradient depends on       |
+| tile_range     | 2 u32            | a tile's first pair and one past its last
+                 |
+| pair_slot      | 1 u32            | a pair's slot; by tile, near to far
+                 |
+| pixels         | 2 words          | transmittance f32, and one past the last contributing pair of
+                 the tile           |
 """
 
 import math
@@ -40,8 +57,8 @@ DIGIT_BITS = 11
 SORT_BLOCK = 2048
 """Keys that a workgroup sorts."""
 SORT_GROUPS, PAIR_GROUPS, PAIRS, NEEDED, OVERFLOWED, COUNTS = 0, 3, 6, 7, 8, 9
-"""Words of `counts`: workgroups to sort the pairs and to visit each; pairs in the lists, found, and 1 if they did not
-fit since the host last cleared it."""
+"""Words of `counts`: workgroups to sort the pairs and to visit each; pairs in the lists, found, and
+1 if they did not fit since the host last cleared it."""
 XYZ, ROTATION, LOG_SCALE, OPACITY_LOGIT, SH = 0, 3, 7, 10, 11
 """Columns of a splat; its strain colors begin after the SH coefficients."""
 FRAME_ORIGIN, FRAME_MATRIX, FRAME_STRAIN = 0, 3, 12
@@ -97,7 +114,9 @@ CONSTANTS: dict[str, int | float] = {
 def splat_rows(splats: Parameters) -> np.ndarray:
     """Numpy arrays of splats as one table (N, stride) float32."""
     parts = [part for part in splats if part is not None]
-    flat = [np.asarray(part, np.float32).reshape(len(part), math.prod(part.shape[1:])) for part in parts]
+    flat = [
+        np.asarray(part, np.float32).reshape(len(part), math.prod(part.shape[1:])) for part in parts
+    ]
     return np.concatenate(flat, axis=1)
 
 

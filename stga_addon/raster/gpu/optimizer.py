@@ -1,4 +1,5 @@
-"""Adam on the device: on wanted rows only, with the limits of size and distance, and on driven offsets."""
+"""Adam on the device: on wanted rows only, with the limits of size and distance, and on driven
+offsets."""
 
 import math
 from collections.abc import Mapping
@@ -16,17 +17,28 @@ from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 KERNELS = {
     "frames": ("compose", "average_strain"),
     "project": ("mark_focus", "forward", "backward"),
-    "tiles": ("mark_touched", "choose_rendered", "count_pairs", "add_pairs", "fill_pairs", "find_ranges"),
+    "tiles": (
+        "mark_touched",
+        "choose_rendered",
+        "count_pairs",
+        "add_pairs",
+        "fill_pairs",
+        "find_ranges",
+    ),
     "blend": ("forward", "backward"),
     "image_loss": ("gradient", "total"),
     "optimizer": ("measure_excess", "join_excess", "prepare", "adam"),
 }
 """What any iteration may dispatch, by file, beside sorting and driven offsets."""
 RATES = (*Parameters._fields, "sh_rest")
-"""Learning rates in the order of the kernels; the last is that of the harmonics above the constant one."""
+"""Learning rates in the order of the kernels; the last is that of the harmonics above the constant
+one."""
 STEP = np.dtype(
     [("rates", np.float32, 8)]
-    + [(name, np.float32) for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon", "ema_share")]
+    + [
+        (name, np.float32)
+        for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon", "ema_share")
+    ]
     + [(name, np.float32) for name in ("scale_weight", "distance_weight", "opacity_weight")]
     + [(name, np.uint32) for name in ("statistics", "triangles", "padding")]
 )
@@ -38,7 +50,8 @@ class OptimizerTables(NamedTuple):
 
     first, second, average  shaped as the table of splats
     history  (N, 3) steps uint32, sum of the screen gradients and number of summands float32
-    traits   (N, 2) float32: 1 for unbound splats, else 0; share of the cameras that did not see them
+    traits   (N, 2) float32: 1 for unbound splats, else 0; share of the cameras that did not see
+             them
     limits   (F, 3) float32: largest scale of bound and of unbound splats, largest distance
     """
 
@@ -62,9 +75,9 @@ def upload_step(
 ) -> None:
     """Send the numbers of the next step.
 
-    rates by name; ema_share: least share of a step in the exponential moving average; weights: of the limits of scale,
-    distance and, divided by the number of splats, opacity; statistics: collect the screen gradients; triangles:
-    whose splats driven offsets move.
+    rates by name; ema_share: least share of a step in the exponential moving average; weights: of
+    the limits of scale, distance and, divided by the number of splats, opacity; statistics: collect
+    the screen gradients; triangles: whose splats driven offsets move.
     """
     step = np.zeros(1, STEP)
     step["rates"][0, : len(RATES)] = [rates[name] for name in RATES]
@@ -76,11 +89,14 @@ def upload_step(
     device.upload("step", step, "uniform")
 
 
-def optimize(work: Recording, count: int, stride: int, limited: bool, tables: OptimizerTables, **given: Any) -> None:
-    """Record a step of the wanted rows of `count` splats of `stride` words, with the numbers uploaded last.
+def optimize(
+    work: Recording, count: int, stride: int, limited: bool, tables: OptimizerTables, **given: Any
+) -> None:
+    """Record a step of the wanted rows of `count` splats of `stride` words, with the numbers
+    uploaded last.
 
-    limited: whether a limit of scale or distance has a weight. given: view, splats, face, wanted, gradients, which are
-    changed by those of the limits, and screen, of `Rasterizer.backward`.
+    limited: whether a limit of scale or distance has a weight. given: view, splats, face, wanted,
+    gradients, which are changed by those of the limits, and screen, of `Rasterizer.backward`.
     """
     buffer = work.device.buffer
     all_tables = {
@@ -101,7 +117,8 @@ def optimize(work: Recording, count: int, stride: int, limited: bool, tables: Op
 class OffsetTables(NamedTuple):
     """Tables of a driven offset of F triangles in training, on the device.
 
-    coefficients, first, second, average  (F, S, 3) float32, with Adam's moments and the exponential moving average
+    coefficients, first, second, average  (F, S, 3) float32, with Adam's moments and the exponential
+                                          moving average
     steps      (F,) uint32
     splats_of  of `splats_by_triangle`
     """
@@ -115,7 +132,8 @@ class OffsetTables(NamedTuple):
 
 
 def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
-    """(triangles + 1 + N,) the splats on each triangle, in order, behind where each one's begin in this same array.
+    """(triangles + 1 + N,) the splats on each triangle, in order, behind where each one's begin in
+    this same array.
 
     face (N,): the triangle of each splat.
     """
@@ -125,11 +143,16 @@ def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
 
 
 def step_offsets(
-    work: Recording, triangles: int, offsets: Mapping[str, OffsetTables], signals: Mapping[str, Any], **given: Any
+    work: Recording,
+    triangles: int,
+    offsets: Mapping[str, OffsetTables],
+    signals: Mapping[str, Any],
+    **given: Any,
 ) -> None:
     """Record a step of the triangles that have a wanted splat, with the numbers of `upload_step`.
 
-    signals: of `Embedding`. given: view, wanted, and the splats' gradients, without those of the limits.
+    signals: of `Embedding`. given: view, wanted, and the splats' gradients, without those of the
+    limits.
     """
     uniform = work.device.buffer("step", STEP.itemsize // 4, "uniform")
     for name, tables in offsets.items():
@@ -143,7 +166,8 @@ def offset_constants(name: str) -> dict[str, float]:
 
 
 def compile_kernels(device: Device) -> None:
-    """Compile what an iteration of up to 2²² tiles dispatches, before the time that is given to training."""
+    """Compile what an iteration of up to 2²² tiles dispatches, before the time that is given to
+    training."""
     for file, entries in KERNELS.items():
         for entry in entries:
             device.kernel(f"{file}.{entry}")

@@ -1,7 +1,9 @@
-"""Rendering on a WebGPU device: splats and a camera to an image, and its gradient back to the splats.
+"""Rendering on a WebGPU device: splats and a camera to an image, and its gradient back to the
+splats.
 
-Three stages, a WGSL file each: `project` places and colors splats, `tiles` lists those of a tile, `blend` draws them.
-They share tables, by the names of `layout.py`; a function that records a stage adds its own to those given.
+Three stages, a WGSL file each: `project` places and colors splats, `tiles` lists those of a tile,
+`blend` draws them. They share tables, by the names of `layout.py`; a function that records a stage
+adds its own to those given.
 """
 
 from collections.abc import Sequence
@@ -74,7 +76,8 @@ class ViewOptions:
 class Rasterizer:
     """Renders on one device, forward and backward, with room for `capacity` pairs.
 
-    Where the pairs do not fit, nothing is rendered and no splat is wanted, now and later, until `make_room`.
+    Where the pairs do not fit, nothing is rendered and no splat is wanted, now and later, until
+    `make_room`.
     """
 
     def __init__(self, device: Device) -> None:
@@ -82,19 +85,28 @@ class Rasterizer:
         self.capacity = INITIAL_PAIR_CAPACITY
 
     def forward(
-        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, view: Any, focus: Any = None
+        self,
+        work: Recording,
+        splats: SplatTable,
+        frames: Any,
+        options: ViewOptions,
+        view: Any,
+        focus: Any = None,
     ) -> Tables:
-        """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if `options.focused`.
+        """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if
+        `options.focused`.
 
-        Returns its tables, valid until the device's next rendering: the image (3, H, W) over the background and those
-        of `layout.py`.
+        Returns its tables, valid until the device's next rendering: the image (3, H, W) over the
+        background and those of `layout.py`.
         """
         tables = projected_tables(self.device, splats.count)
         tables |= {"view": view, "splats": splats.rows, "face": splats.face, "frames": frames}
         work.dispatch("project.forward", splats.count, tables)
         return self.draw(work, tables, splats.count, options.camera, focus)
 
-    def draw(self, work: Recording, tables: Tables, count: int, camera: Camera, focus: Any = None) -> Tables:
+    def draw(
+        self, work: Recording, tables: Tables, count: int, camera: Camera, focus: Any = None
+    ) -> Tables:
         """Record the rendering of `count` projected splats, with the view in `tables`."""
         columns, rows = tile_grid(camera.width, camera.height)
         tables["focus"] = tables["rect"] if focus is None else focus
@@ -107,11 +119,13 @@ class Rasterizer:
         self, work: Recording, rendering: Tables, splats: SplatTable, camera: Camera, v_image: Any, gradients: Any,
         v_transmittance: Any = None,
     ) -> Any:  # fmt: skip
-        """Record the gradient of a scalar with respect to the splats, from that with respect to the image.
+        """Record the gradient of a scalar with respect to the splats, from that with respect to the
+        image.
 
-        v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the wanted rows of `gradients`. Returns
-        `screen` (N,): for these rows, the length of the gradient with respect to the projected center in units of half
-        the image.
+        v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the wanted rows of
+        `gradients`. Returns
+        `screen` (N,): for these rows, the length of the gradient with respect to the projected
+        center in units of half the image.
         """
         columns, rows = tile_grid(camera.width, camera.height)
         tables = {
@@ -135,7 +149,8 @@ class Rasterizer:
         return not counts[OVERFLOWED]
 
     def make_room(self, needed: int) -> None:
-        """Hold at least so many pairs from now on, and an eighth to spare, and let renderings begin again."""
+        """Hold at least so many pairs from now on, and an eighth to spare, and let renderings begin
+        again."""
         self.capacity = max(self.capacity, needed + needed // 8)
         self.device.upload("counts", np.zeros(COUNTS, np.uint32), "indirect")
 
@@ -145,34 +160,56 @@ class Rasterizer:
     ) -> Any:  # fmt: skip
         """Send the uniform of that name for the next rendering.
 
-        to_world (3, 3): from the camera to the space of the harmonics' directions, where that is not the world; first:
-        row of the splats in the tables of projected ones.
+        to_world (3, 3): from the camera to the space of the harmonics' directions, where that is
+        not the world; first: row of the splats in the tables of projected ones.
         """
         camera, view = options.camera, np.zeros((), VIEW)
         to_world = camera.world_to_camera[:3, :3].T if to_world is None else to_world
         columns, rows = tile_grid(camera.width, camera.height)
         values = (
-            *(camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height, columns, rows),
+            *(
+                camera.fl_x,
+                camera.fl_y,
+                camera.cx,
+                camera.cy,
+                camera.width,
+                camera.height,
+                columns,
+                rows,
+            ),
             *to_world.ravel(),
             *options.background,
             *(splats.count, splats.coefficients, splats.strain_colors, options.degree),
             *(min(options.strains, splats.strain_colors), options.strains, options.depth_as_color),
-            *(options.antialiased, options.focused, -(-options.reach // TILE), self.capacity, first),
+            *(
+                options.antialiased,
+                options.focused,
+                -(-options.reach // TILE),
+                self.capacity,
+                first,
+            ),
         )
         view[...] = values
         return self.device.upload(name, view, "uniform")
 
 
-def upload_splats(device: Device, splats: Parameters, face: np.ndarray, layer: str = "") -> SplatTable:
-    """Numpy arrays of splats as a table on the device; layer: part of its name where there are several."""
+def upload_splats(
+    device: Device, splats: Parameters, face: np.ndarray, layer: str = ""
+) -> SplatTable:
+    """Numpy arrays of splats as a table on the device; layer: part of its name where there are
+    several."""
     rows = splat_rows(splats)
     strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
-    on_device = device.upload(f"splats{layer}", rows), device.upload(f"face{layer}", face.astype(np.uint32))
+    on_device = (
+        device.upload(f"splats{layer}", rows),
+        device.upload(f"face{layer}", face.astype(np.uint32)),
+    )
     return SplatTable(*on_device, len(rows), splats.sh.shape[1], strain_colors)
 
 
 def upload_frames(device: Device, frames: CameraFrames, layer: str = "") -> Any:
-    """Frames in camera space, computed on the CPU, as a table on the device; layer: as in `upload_splats`."""
+    """Frames in camera space, computed on the CPU, as a table on the device; layer: as in
+    `upload_splats`."""
     count = len(frames.origin)
     parts = (frames.origin, frames.matrix.reshape(count, 9), frames.strain)
     return device.upload(f"frames{layer}", np.concatenate(parts, axis=1, dtype=np.float32))
@@ -184,7 +221,8 @@ def counts_buffer(device: Device) -> Any:
 
 
 def mark_focus(work: Recording, splats: SplatTable, view: Any, selected: Any) -> Any:
-    """Record which splats ride on a selected triangle: (N,) 0 or 1; selected (F,): uploaded as bytes."""
+    """Record which splats ride on a selected triangle: (N,) 0 or 1; selected (F,): uploaded as
+    bytes."""
     focus = work.device.buffer("focus", splats.count)
     tables = {"view": view, "face": splats.face, "selected": selected, "focus": focus}
     work.dispatch("project.mark_focus", splats.count, tables)
@@ -198,7 +236,8 @@ def projected_tables(device: Device, count: int) -> Tables:
 
 
 def choose_tiles(work: Recording, count: int, tiles: int, tables: Tables, focused: bool) -> None:
-    """Record which of `tiles` tiles are rendered of `count` splats, by view, rect and, if there is one, the focus."""
+    """Record which of `tiles` tiles are rendered of `count` splats, by view, rect and, if there is
+    one, the focus."""
     buffer = work.device.buffer
     tables |= {"touched": buffer("touched", tiles), "rendered": buffer("rendered", tiles)}
     tables["tile_range"] = buffer("ranges", 2 * tiles)
@@ -211,9 +250,10 @@ def choose_tiles(work: Recording, count: int, tiles: int, tables: Tables, focuse
 def list_pairs(work: Recording, count: int, tiles: int, capacity: int, tables: Tables) -> None:
     """Record every rendered tile's list of pairs, near to far, with room for `capacity` pairs.
 
-    Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable sort by tile keeps. A
-    splat has a pair with each tile that its outline reaches; its bounding box would count more. How many pairs there
-    are is known on the device only, so everything that follows is dispatched indirectly.
+    Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable
+    sort by tile keeps. A splat has a pair with each tile that its outline reaches; its bounding box
+    would count more. How many pairs there are is known on the device only, so everything that
+    follows is dispatched indirectly.
     """
     buffer, counts = work.device.buffer, counts_buffer(work.device)
     _, tables["order"] = sort_keys(work, tables["depth_key"], count, DEPTH_BITS, tables["view"])
@@ -224,7 +264,9 @@ def list_pairs(work: Recording, count: int, tiles: int, capacity: int, tables: T
     work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
     work.dispatch("tiles.fill_pairs", count, tables)
     keys, bits = tables["slot_tile"], tiles.bit_length()
-    tables["pair_tile"], tables["pair_slot"] = sort_keys(work, keys, capacity, bits, tables["view"], of_pairs=True)
+    tables["pair_tile"], tables["pair_slot"] = sort_keys(
+        work, keys, capacity, bits, tables["view"], of_pairs=True
+    )
     work.dispatch("tiles.find_ranges", (counts, 4 * PAIR_GROUPS), tables)
 
 
@@ -233,8 +275,8 @@ def sort_keys(
 ) -> tuple[Any, Any]:
     """Record sorting of the keys, of which the lowest `bits` count; equal keys keep their order.
 
-    There are as many keys as splats, or as pairs, and room for so many. Returns buffers of the sorted keys and of
-    their numbers before; `keys` may be overwritten.
+    There are as many keys as splats, or as pairs, and room for so many. Returns buffers of the
+    sorted keys and of their numbers before; `keys` may be overwritten.
     """
     counts, buffer, blocks = counts_buffer(work.device), work.device.buffer, -(-room // SORT_BLOCK)
     groups: Groups = (counts, 4 * SORT_GROUPS) if of_pairs else (blocks, 1, 1)
@@ -259,7 +301,10 @@ def sort_keys(
 
 def sort_passes(bits: int, of_pairs: bool) -> list[dict[str, Any]]:
     """The constants of sort.wgsl in each pass."""
-    return [{"SHIFT": shift, "FIRST": shift == 0, "OF_PAIRS": of_pairs} for shift in range(0, bits, DIGIT_BITS)]
+    return [
+        {"SHIFT": shift, "FIRST": shift == 0, "OF_PAIRS": of_pairs}
+        for shift in range(0, bits, DIGIT_BITS)
+    ]
 
 
 def blend(work: Recording, camera: Camera, tables: Tables) -> None:

@@ -1,4 +1,5 @@
-"""Trial: whether a device's gradients are the CPU's, and which of the two is faster, before training on it."""
+"""Trial: whether a device's gradients are the CPU's, and which of the two is faster, before
+training on it."""
 
 from dataclasses import dataclass
 from time import perf_counter
@@ -19,14 +20,16 @@ SOFTWARE_SIZE = 1_000, 80
 """For adapters that compute on the CPU, whose speed is no question."""
 DEGREE = 1
 MAX_ERROR = 1e-3
-"""Of a wrong device's gradient, as a share of the gradient's length; rounding makes 1e-5 of it, a lost pair 1e-2."""
+"""Of a wrong device's gradient, as a share of the gradient's length; rounding makes 1e-5 of it, a
+lost pair 1e-2."""
 SECONDS = 0.3
 """For each of the two, after the first image, which is not timed."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """error: largest difference of a parameter's gradient from the CPU's, as a share of its length; times in s."""
+    """error: largest difference of a parameter's gradient from the CPU's, as a share of its length;
+    times in s."""
 
     error: float
     device_s: float
@@ -38,9 +41,13 @@ class Trial:
 
 
 def try_device(device: Device) -> Trial:
-    """Render a cloud of splats and differentiate a random sum of its colors, on the device and on the CPU."""
+    """Render a cloud of splats and differentiate a random sum of its colors, on the device and on
+    the CPU."""
     count, size = SOFTWARE_SIZE if device.is_software else SIZE
-    splats, camera = _cloud(count), Camera(size, size, 1.25 * size, 1.25 * size, size / 2, size / 2, np.eye(4))
+    splats, camera = (
+        _cloud(count),
+        Camera(size, size, 1.25 * size, 1.25 * size, size / 2, size / 2, np.eye(4)),
+    )
     face, frames = np.zeros(count, np.int32), frames_in_camera(WORLD, camera)
     v_image = np.random.default_rng(1).normal(size=(3, size, size)).astype(np.float32)
     expected, cpu_s = _on_cpu(splats, face, frames, v_image)
@@ -82,12 +89,20 @@ def _on_cpu(
 
 
 def _on_device(
-    device: Device, splats: Parameters, face: np.ndarray, frames: CameraFrames, camera: Camera, v_image: np.ndarray
+    device: Device,
+    splats: Parameters,
+    face: np.ndarray,
+    frames: CameraFrames,
+    camera: Camera,
+    v_image: np.ndarray,
 ) -> tuple[np.ndarray, float]:
     """Gradients (N, stride) and the time of one image."""
     rasterizer, table = Rasterizer(device), upload_splats(device, splats, face)
     on_device, cotangents = upload_frames(device, frames), device.upload("v_image", v_image)
-    gradients, options = device.buffer("gradients", table.count * table.stride), ViewOptions(camera, DEGREE)
+    gradients, options = (
+        device.buffer("gradients", table.count * table.stride),
+        ViewOptions(camera, DEGREE),
+    )
 
     def once() -> None:
         view = rasterizer.upload_view(table, options)

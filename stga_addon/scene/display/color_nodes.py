@@ -1,4 +1,5 @@
-"""Node groups for splat colors: constant, by view direction (spherical harmonics), and by the strain of triangles."""
+"""Node groups for splat colors: constant, by view direction (spherical harmonics), and by the
+strain of triangles."""
 
 from math import pi, sqrt
 from typing import Any
@@ -11,7 +12,8 @@ from .splat_attributes import SH, STRAIN_COLOR
 def constant_color(nodes: Nodes, strain: Any) -> Any:
     """The part of each splat's sRGB color, not clamped, that does not depend on the view direction.
 
-    strain: vector from SAMPLED_STRAIN, None where colors do not follow it. Coefficients as in `Splats`.
+    strain: vector from SAMPLED_STRAIN, None where colors do not follow it. Coefficients as in
+    `Splats`.
     """
     terms = [nodes.scale(_sh(nodes, 0), SH_C0), (0.5, 0.5, 0.5)]
     if strain is not None:
@@ -28,7 +30,8 @@ def view_color(nodes: Nodes, color: Any, degree: int, direction: Any) -> Any:
 
 
 def view_direction(nodes: Nodes, position: Any) -> tuple[Any, Any]:
-    """Unit vectors from the scene's active camera to each splat, in the space the splats were trained in.
+    """Unit vectors from the scene's active camera to each splat, in the space the splats were
+    trained in.
 
     Returns the direction and whether there is a camera.
     """
@@ -43,9 +46,13 @@ def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
     clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", srgb, (0, 0, 0)), (1, 1, 1))
     linear = []
     for value in nodes.components(clamped):
-        power = nodes.math("POWER", nodes.math("DIVIDE", nodes.math("ADD", value, 0.055), 1.055), 2.4)
+        power = nodes.math(
+            "POWER", nodes.math("DIVIDE", nodes.math("ADD", value, 0.055), 1.055), 2.4
+        )
         line = nodes.math("DIVIDE", value, 12.92)
-        linear.append(nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.04045), line, power))
+        linear.append(
+            nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.04045), line, power)
+        )
     return nodes.combine(*linear)
 
 
@@ -55,7 +62,9 @@ def _linear_to_srgb(nodes: Nodes, color: Any) -> Any:
     for value in nodes.components(color):
         power = nodes.math("MULTIPLY_ADD", nodes.math("POWER", value, 1 / 2.4), 1.055, -0.055)
         line = nodes.math("MULTIPLY", value, 12.92)
-        srgb.append(nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.0031308), line, power))
+        srgb.append(
+            nodes.switch("FLOAT", nodes.compare("GREATER_THAN", value, 0.0031308), line, power)
+        )
     return nodes.combine(*srgb)
 
 
@@ -78,13 +87,16 @@ def _times(nodes: Nodes, factor: float, *values: Any) -> Any:
     return nodes.math("MULTIPLY", product, factor)
 
 
-# Real spherical harmonics of a unit direction, one band each, with the signs of 3D Gaussian Splatting.
+# Real spherical harmonics of a unit direction, one band each, with the signs of 3D Gaussian
+# Splatting.
 
 
 def _first_band(nodes: Nodes, direction: Any) -> Any:
     x, y, z = nodes.components(direction)
     first = sqrt(3 / (4 * pi))
-    return _band(nodes, 1, [_times(nodes, -first, y), _times(nodes, first, z), _times(nodes, -first, x)])
+    return _band(
+        nodes, 1, [_times(nodes, -first, y), _times(nodes, first, z), _times(nodes, -first, x)]
+    )
 
 
 def _second_band(nodes: Nodes, direction: Any) -> Any:
@@ -93,7 +105,10 @@ def _second_band(nodes: Nodes, direction: Any) -> Any:
     mixed = sqrt(15 / (4 * pi))
     factors = [_times(nodes, mixed, x, y), _times(nodes, -mixed, y, z)]
     factors += [_times(nodes, sqrt(5 / (16 * pi)), nodes.math("MULTIPLY_ADD", zz, 3.0, -1.0))]
-    factors += [_times(nodes, -mixed, x, z), _times(nodes, mixed / 2, nodes.math("SUBTRACT", xx, yy))]
+    factors += [
+        _times(nodes, -mixed, x, z),
+        _times(nodes, mixed / 2, nodes.math("SUBTRACT", xx, yy)),
+    ]
     return _band(nodes, 4, factors)
 
 

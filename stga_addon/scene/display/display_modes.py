@@ -1,4 +1,5 @@
-"""Node groups and materials of the display modes: as trained, points, camera quads and, from 5.3, native splats."""
+"""Node groups and materials of the display modes: as trained, points, camera quads and, from 5.3,
+native splats."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,26 +17,31 @@ POINT_MATERIAL = "STGA Points"
 GAUSSIAN_MATERIAL = "STGA Gaussians"
 DISPLAY_COLOR = "stga_display_color"  # attribute that the splat nodes store
 EXTENT = 3.0
-"""Standard deviations from a quad's center to its sides; beyond, a Gaussian is below 1.2 % of its maximum."""
+"""Standard deviations from a quad's center to its sides; beyond, a Gaussian is below 1.2 % of its
+maximum."""
 
 
 def point_material() -> bpy.types.Material:
-    """Emits the color of a point cloud's points, with their opacity; built where the file has none."""
+    """Emits the color of a point cloud's points, with their opacity; built where the file has
+    none."""
     # EEVEE does not sort the points of a point cloud.
     return _splat_material(
-        POINT_MATERIAL, lambda nodes: _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY")), "DITHERED"
+        POINT_MATERIAL,
+        lambda nodes: _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY")),
+        "DITHERED",
     )
 
 
 def gaussian_material() -> bpy.types.Material:
     """Renders instances of a quad as Gaussians; the instance's scale is the standard deviation.
 
-    Along a ray with unit direction D through a point P of the quad, both in the instance's space, the
-    Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² − (P·D)²; its density
-    there is taken for the whole splat. Exact for Cycles up to the order of overlapping splats, and for EEVEE up to
-    their order by centers.
+    Along a ray with unit direction D through a point P of the quad, both in the instance's space,
+    the Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² −
+    (P·D)²; its density there is taken for the whole splat. Exact for Cycles up to the order of
+    overlapping splats, and for EEVEE up to their order by centers.
     """
-    # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come as close.
+    # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come as
+    # close.
     return _splat_material(GAUSSIAN_MATERIAL, _gaussian_shader, "BLENDED")
 
 
@@ -55,7 +61,11 @@ def _gaussian_shader(nodes: Nodes) -> Any:
     position = nodes.add("ShaderNodeTexCoord").outputs["Object"]
     incoming = {"Vector": geometry["Incoming"]}
     ray = nodes.out(
-        "ShaderNodeVectorTransform", incoming, vector_type="VECTOR", convert_from="WORLD", convert_to="OBJECT"
+        "ShaderNodeVectorTransform",
+        incoming,
+        vector_type="VECTOR",
+        convert_from="WORLD",
+        convert_to="OBJECT",
     )
     along = nodes.vector("DOT_PRODUCT", position, nodes.vector("NORMALIZE", ray))
     length2 = nodes.vector("DOT_PRODUCT", position, position)
@@ -63,7 +73,9 @@ def _gaussian_shader(nodes: Nodes) -> Any:
     density = nodes.math("EXPONENT", nodes.math("MULTIPLY", distance2, -0.5))
     # Whatever is behind a quad sees through it.
     front = nodes.math("SUBTRACT", 1.0, geometry["Backfacing"])
-    return _emission(nodes, color, nodes.math("MULTIPLY", nodes.math("MULTIPLY", density, front), opacity))
+    return _emission(
+        nodes, color, nodes.math("MULTIPLY", nodes.math("MULTIPLY", density, front), opacity)
+    )
 
 
 def _color_and_opacity(nodes: Nodes, attribute_type: str) -> tuple[Any, Any]:
@@ -76,11 +88,15 @@ def _color_and_opacity(nodes: Nodes, attribute_type: str) -> tuple[Any, Any]:
 
 
 def _emission(nodes: Nodes, color: Any, alpha: Any) -> Any:
-    transparent, emission = nodes.out("ShaderNodeBsdfTransparent"), nodes.out("ShaderNodeEmission", {"Color": color})
+    transparent, emission = (
+        nodes.out("ShaderNodeBsdfTransparent"),
+        nodes.out("ShaderNodeEmission", {"Color": color}),
+    )
     return nodes.out("ShaderNodeMixShader", {"Fac": alpha, "Shader": [transparent, emission]})
 
 
-# Attributes that Blender's native splats use; rotation and scale are those that the splats have by now.
+# Attributes that Blender's native splats use; rotation and scale are those that the splats have by
+# now.
 WORLD_ROTATION = "rotation"
 WORLD_SCALE = "scale"
 RADIANCE = "radiance:base"  # coefficient of degree 0, and opacity
@@ -102,14 +118,16 @@ LIMITS = {
 def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, native: Any) -> Any:
     """Geometry of the splats in the display mode that the menu socket `mode` chooses.
 
-    visible: field, which splats; size: factor on their standard deviations; native: points from NATIVE_GROUPS, None
-    in a Blender without native splats.
+    visible: field, which splats; size: factor on their standard deviations; native: points from
+    NATIVE_GROUPS, None in a Blender without native splats.
     """
     made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
-    # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads that
-    # face the camera.
+    # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads
+    # that face the camera.
     is_viewport = nodes.out("GeometryNodeIsViewport")
-    in_images = nodes.out("GeometryNodeSwitch", {"Switch": is_viewport, "False": made[QUADS]}, input_type="GEOMETRY")
+    in_images = nodes.out(
+        "GeometryNodeSwitch", {"Switch": is_viewport, "False": made[QUADS]}, input_type="GEOMETRY"
+    )
     geometries = {AS_TRAINED: in_images, **made}
     if native is not None and (points := native_splats(nodes.tree, native)) is not None:
         geometries[NATIVE] = points
@@ -125,22 +143,32 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
     # A point has one radius: the mean of the three standard deviations.
-    mean = nodes.math("DIVIDE", nodes.vector("DOT_PRODUCT", nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), (1, 1, 1)), 3)
+    mean = nodes.math(
+        "DIVIDE",
+        nodes.vector("DOT_PRODUCT", nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), (1, 1, 1)),
+        3,
+    )
     radius = nodes.math("MULTIPLY", mean, size)
-    points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible, "Radius": radius})
+    points = nodes.out(
+        "GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible, "Radius": radius}
+    )
     return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": point_material()})
 
 
 def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
     """Two triangles per splat, which cover its ellipsoid as the scene's active camera sees it.
 
-    In the ellipsoid's own space it is a sphere, and the quad faces the camera there. Instances: realizing
-    them would take twenty times as long.
+    In the ellipsoid's own space it is a sphere, and the quad faces the camera there. Instances:
+    realizing them would take twenty times as long.
     """
     side = 2 * EXTENT
-    quad = nodes.out("GeometryNodeMeshGrid", {"Size X": side, "Size Y": side, "Vertices X": 2, "Vertices Y": 2})
+    quad = nodes.out(
+        "GeometryNodeMeshGrid", {"Size X": side, "Size Y": side, "Vertices X": 2, "Vertices Y": 2}
+    )
     quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": gaussian_material()})
-    quads = nodes.out("GeometryNodeInstanceOnPoints", {"Points": splats, "Selection": visible, "Instance": quad})
+    quads = nodes.out(
+        "GeometryNodeInstanceOnPoints", {"Points": splats, "Selection": visible, "Instance": quad}
+    )
     # Per splat: its ellipsoid's transform after a rotation that turns +Z to the active camera.
     position = nodes.out("GeometryNodeInputPosition")
     rotation = nodes.attribute(WORLD_ROTATION, "QUATERNION")
@@ -158,24 +186,40 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
         nodes.out("FunctionNodeCombineTransform", {"Rotation": facing}),
     ]
     transform = nodes.out("FunctionNodeMatrixMultiply", {"Matrix": transforms})
-    return nodes.out("GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": transform})
+    return nodes.out(
+        "GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": transform}
+    )
 
 
 def _native(
-    degree: int, nodes: Nodes, splats: Any, visible: Any, size: Any, color: Any, view_dependent: Any, gray: Any
+    degree: int,
+    nodes: Nodes,
+    splats: Any,
+    visible: Any,
+    size: Any,
+    color: Any,
+    view_dependent: Any,
+    gray: Any,
 ) -> bpy.types.NodeSocket:
-    """Points with what native splats are drawn from: harmonics have the object's axes, in which they were trained.
+    """Points with what native splats are drawn from: harmonics have the object's axes, in which
+    they were trained.
 
-    color: constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as are those that are relit.
+    color: constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as are those that are
+    relit.
     """
-    relit = nodes.add("GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR").outputs
+    relit = nodes.add(
+        "GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR"
+    ).outputs
     flat = nodes.logic("OR", gray, relit["Exists"])
     shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
     color = nodes.vector("SUBTRACT", nodes.switch("VECTOR", flat, color, shown), (0.5, 0.5, 0.5))
     red, green, blue = nodes.components(nodes.scale(color, 1 / SH_C0))
     base = {"Red": red, "Green": green, "Blue": blue, "Alpha": nodes.attribute(OPACITY, "FLOAT")}
-    # A color, which 5.3 converts to four floats where it draws; of FLOAT4, this node of 5.2 stores three.
-    splats = nodes.store(splats, RADIANCE, nodes.out("FunctionNodeCombineColor", base), "FLOAT_COLOR")
+    # A color, which 5.3 converts to four floats where it draws; of FLOAT4, this node of 5.2 stores
+    # three.
+    splats = nodes.store(
+        splats, RADIANCE, nodes.out("FunctionNodeCombineColor", base), "FLOAT_COLOR"
+    )
     scale = nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size)
     splats = nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
     factor = nodes.logic("NIMPLY", view_dependent, flat)

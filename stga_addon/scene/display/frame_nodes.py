@@ -25,7 +25,11 @@ from .splat_attributes import (
 )
 
 # Temporary attributes on the head's faces.
-_FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = "stga_frame_origin", "stga_frame_rotation", "stga_frame_size"
+_FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = (
+    "stga_frame_origin",
+    "stga_frame_rotation",
+    "stga_frame_size",
+)
 
 
 def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
@@ -38,11 +42,14 @@ def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
 
 
 def shifted_frames(nodes: Nodes, mesh: Any, shift: Any, convention: str) -> Any:
-    """The mesh with its frames moved by a shift in their own axes and unit (`avatar.embedding.shifted_frames`).
+    """The mesh with its frames moved by a shift in their own axes and unit
+    (`avatar.embedding.shifted_frames`).
 
     mesh: from FRAMES, with the neutral mesh's attributes; shift: a vector field on its faces.
     """
-    shift = nodes.scale(shift, _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention))
+    shift = nodes.scale(
+        shift, _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention)
+    )
     rotation = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
     moved = nodes.out("FunctionNodeRotateVector", {"Vector": shift, "Rotation": rotation})
     origin = nodes.vector("ADD", nodes.attribute(_FRAME_ORIGIN, "FLOAT_VECTOR"), moved)
@@ -50,7 +57,8 @@ def shifted_frames(nodes: Nodes, mesh: Any, shift: Any, convention: str) -> Any:
 
 
 def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any = None) -> Any:
-    """The splats at their positions in object space, with rotation and scale stored; mesh: from `_stored_frames`."""
+    """The splats at their positions in object space, with rotation and scale stored; mesh: from
+    `_stored_frames`."""
     xyz = nodes.attribute(XYZ, "FLOAT_VECTOR")
     rotation = nodes.attribute(ROTATION, "QUATERNION")
     scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
@@ -61,8 +69,14 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
             return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
 
         size = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
-        origin, frame_rotation = sample(_FRAME_ORIGIN, "FLOAT_VECTOR"), sample(_FRAME_ROTATION, "QUATERNION")
-        xyz = nodes.out("FunctionNodeRotateVector", {"Vector": nodes.scale(xyz, size), "Rotation": frame_rotation})
+        origin, frame_rotation = (
+            sample(_FRAME_ORIGIN, "FLOAT_VECTOR"),
+            sample(_FRAME_ROTATION, "QUATERNION"),
+        )
+        xyz = nodes.out(
+            "FunctionNodeRotateVector",
+            {"Vector": nodes.scale(xyz, size), "Rotation": frame_rotation},
+        )
         xyz = nodes.vector("ADD", xyz, origin)
         rotations = {"Rotation": rotation, "Rotate By": frame_rotation}
         rotation = nodes.out("FunctionNodeRotateRotation", rotations, rotation_space="GLOBAL")
@@ -83,17 +97,20 @@ def _frame_scale(nodes: Nodes, size: Any, convention: str) -> Any:
 
 
 def _stga_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
-    """Centroid; axes [n(p0−o), ·, normal]; the triangle's area (its ratio to the neutral area is the square of k)."""
+    """Centroid; axes [n(p0−o), ·, normal]; the triangle's area (its ratio to the neutral area is
+    the square of k)."""
     origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
     edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
-    # p0 − origin from the edges: exactly zero where the corners coincide, which a difference to a rounded mean is not.
+    # p0 − origin from the edges: exactly zero where the corners coincide, which a difference to a
+    # rounded mean is not.
     first = nodes.scale(nodes.vector("ADD", edge, side), -1 / 3)
     rotation, normal, _ = _axes_to_rotation(nodes, first, edge, side, "Z")
     return origin, rotation, nodes.math("MULTIPLY", nodes.vector("LENGTH", normal), 0.5)
 
 
 def _gaussian_avatars_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
-    """Centroid; axes [n(p1−p0), normal, ·]; mean of the first edge's length and the height over it."""
+    """Centroid; axes [n(p1−p0), normal, ·]; mean of the first edge's length and the height over
+    it."""
     origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
     edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
     rotation, normal, no_edge = _axes_to_rotation(nodes, edge, edge, side, "Y")
@@ -115,11 +132,14 @@ def _axes_to_rotation(
 ) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
     """Rotation whose x axis is `first` exactly, of a triangle with two edges from its first corner.
 
-    Where `first` or the normal is degenerate, it takes the substitutes of `avatar.embedding`; the node's own differ.
-    Returns the rotation, the normal (its length twice the area) and whether `first` is degenerate.
+    Where `first` or the normal is degenerate, it takes the substitutes of `avatar.embedding`; the
+    node's own differ. Returns the rotation, the normal (its length twice the area) and whether
+    `first` is degenerate.
     """
     normal = nodes.vector("CROSS_PRODUCT", edge, side)
-    lengths = [nodes.vector("LENGTH", v) for v in (edge, side, nodes.vector("SUBTRACT", edge, side))]
+    lengths = [
+        nodes.vector("LENGTH", v) for v in (edge, side, nodes.vector("SUBTRACT", edge, side))
+    ]
     longest = nodes.math("MAXIMUM", nodes.math("MAXIMUM", lengths[0], lengths[1]), lengths[2])
     no_first = nodes.compare(
         "LESS_EQUAL", nodes.vector("LENGTH", first), nodes.math("MULTIPLY", longest, MIN_AREA_RATIO)
@@ -128,17 +148,24 @@ def _axes_to_rotation(
     no_normal = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", normal), limit)
     first = nodes.switch("VECTOR", no_first, nodes.vector("NORMALIZE", first), (1, 0, 0))
     z = nodes.math("ABSOLUTE", nodes.vector("DOT_PRODUCT", first, (0, 0, 1)))
-    helper = nodes.switch("VECTOR", nodes.compare("GREATER_THAN", z, UPRIGHT_COSINE), (0, 0, 1), (1, 0, 0))
+    helper = nodes.switch(
+        "VECTOR", nodes.compare("GREATER_THAN", z, UPRIGHT_COSINE), (0, 0, 1), (1, 0, 0)
+    )
     second = nodes.vector("CROSS_PRODUCT", first, helper)
     second = nodes.switch("VECTOR", no_normal, nodes.vector("NORMALIZE", normal), second)
     axes = {"Primary Axis": first, "Secondary Axis": second}
-    rotation = nodes.out("FunctionNodeAxesToRotation", axes, primary_axis="X", secondary_axis=normal_axis)
+    rotation = nodes.out(
+        "FunctionNodeAxesToRotation", axes, primary_axis="X", secondary_axis=normal_axis
+    )
     return rotation, normal, no_first
 
 
 FRAMES = {
     convention: NodeGroup(
-        f"STGA Triangle Frames ({convention})", {"Mesh": "Geometry"}, "Geometry", partial(_stored_frames, convention)
+        f"STGA Triangle Frames ({convention})",
+        {"Mesh": "Geometry"},
+        "Geometry",
+        partial(_stored_frames, convention),
     )
     for convention in _FRAMES
 }
@@ -152,7 +179,8 @@ PLACED: dict[str | None, NodeGroup] = {
     )
     for convention in (None, *_FRAMES)
 }
-"""Splats (and the mesh with frames) -> splats in object space, by convention; None for world space."""
+"""Splats (and the mesh with frames) -> splats in object space, by convention; None for world
+space."""
 
 
 SMOOTHED_STRAIN = "stga_smoothed_strain"
@@ -162,44 +190,67 @@ _GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
 
 
 def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
-    """The neutral mesh moved to the posed vertices, with each face's deformation tensor (`avatar.strain`) stored."""
+    """The neutral mesh moved to the posed vertices, with each face's deformation tensor
+    (`avatar.strain`) stored."""
     position, index = nodes.out("GeometryNodeInputPosition"), nodes.out("GeometryNodeInputIndex")
     moved = nodes.sample(posed, position, index, "FLOAT_VECTOR", "POINT")
     mesh = nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
     p0, p1, p2 = nodes.triangle_corners()
     e1, e2 = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
-    gram = nodes.combine(*(nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2))))
+    gram = nodes.combine(
+        *(nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2)))
+    )
     change = nodes.vector("SUBTRACT", gram, nodes.attribute(GRAM, "FLOAT_VECTOR"))
     mesh = nodes.store(mesh, _GRAM_CHANGE, change, "FLOAT_VECTOR", "FACE")
     changes = nodes.components(nodes.attribute(_GRAM_CHANGE, "FLOAT_VECTOR"))
     for half in TENSOR_HALVES:
-        columns = (nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR") for k in range(STRAIN_COMPONENTS))
-        tensor = nodes.sum(*(nodes.scale(column, by) for column, by in zip(columns, changes, strict=True)))
+        columns = (
+            nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR")
+            for k in range(STRAIN_COMPONENTS)
+        )
+        tensor = nodes.sum(
+            *(nodes.scale(column, by) for column, by in zip(columns, changes, strict=True))
+        )
         mesh = nodes.store(mesh, half, tensor, "FLOAT_VECTOR", "FACE")
     return mesh
 
 
 def _strained(nodes: Nodes, mesh: Any) -> Any:
-    """The mesh with each triangle's strain (`avatar.strain.face_strain`) stored; mesh: from `_deformed`."""
+    """The mesh with each triangle's strain (`avatar.strain.face_strain`) stored; mesh: from
+    `_deformed`."""
     # Faces to points and back: the mean over the triangles that touch a triangle.
-    means = [nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT") for half in TENSOR_HALVES]
+    means = [
+        nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT")
+        for half in TENSOR_HALVES
+    ]
     strains = []
     for index in range(STRAIN_COMPONENTS):
-        plane = (nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES)
-        products = [nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)]
+        plane = (
+            nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES
+        )
+        products = [
+            nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)
+        ]
         strains.append(nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN))
-    return nodes.store(mesh, _STRAIN, _in_range(nodes, nodes.combine(*strains)), "FLOAT_VECTOR", "FACE")
+    return nodes.store(
+        mesh, _STRAIN, _in_range(nodes, nodes.combine(*strains)), "FLOAT_VECTOR", "FACE"
+    )
 
 
 def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
     """Strain of each splat's triangle as a vector; mesh: from `_strained`."""
-    return nodes.sample(mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR")
+    return nodes.sample(
+        mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR"
+    )
 
 
 def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
     """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
-    change = nodes.vector("SUBTRACT", nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0)))
-    # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge with it.
+    change = nodes.vector(
+        "SUBTRACT", nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0))
+    )
+    # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge
+    # with it.
     inputs = {"Value": change, "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}
     smoothed = nodes.out("GeometryNodeBlurAttribute", inputs, data_type="FLOAT_VECTOR")
     return nodes.store(mesh, SMOOTHED_STRAIN, smoothed, "FLOAT_VECTOR", "FACE")
@@ -210,10 +261,14 @@ def _in_range(nodes: Nodes, strain: Any) -> Any:
     return nodes.vector("MAXIMUM", nodes.vector("MINIMUM", strain, highest), lowest)
 
 
-DEFORMED = NodeGroup("STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed)
+DEFORMED = NodeGroup(
+    "STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed
+)
 STRAIN = NodeGroup("STGA Triangle Strain", {"Deformed": "Geometry"}, "Geometry", _strained)
 SAMPLED_STRAIN = NodeGroup("STGA Sampled Strain", {"Strain": "Geometry"}, "Vector", _sampled_strain)
-SMOOTHED = NodeGroup("STGA Smoothed Strain", {"Strain": "Geometry"}, "Geometry", _with_smoothed_strain)
+SMOOTHED = NodeGroup(
+    "STGA Smoothed Strain", {"Strain": "Geometry"}, "Geometry", _with_smoothed_strain
+)
 
 
 class SignalNodes(NamedTuple):
@@ -242,7 +297,9 @@ def displayed_offsets(names: Collection[str]) -> tuple[str, ...]:
 def shifted(offset: str, convention: str) -> NodeGroup:
     """The group that moves frames by an offset: a mesh from STRAIN with FRAMES to the same mesh."""
     name = f"STGA Driven Offset ({SIGNALS[offset].label}, {convention})"
-    return NodeGroup(name, {"Frames": "Geometry"}, "Geometry", partial(_shifted, offset, convention))
+    return NodeGroup(
+        name, {"Frames": "Geometry"}, "Geometry", partial(_shifted, offset, convention)
+    )
 
 
 def _shifted(offset: str, convention: str, nodes: Nodes, mesh: Any) -> Any:

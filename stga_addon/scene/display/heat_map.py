@@ -1,4 +1,5 @@
-"""How often each triangle is selected, or how far the avatar is from the images there, as colors on the head."""
+"""How often each triangle is selected, or how far the avatar is from the images there, as colors on
+the head."""
 
 from typing import Any
 
@@ -25,18 +26,27 @@ COLORS = (
 )
 
 
-def show_heat_map(head: Any, values: np.ndarray, attribute: str = SHARE, largest: float | None = None) -> None:
+def show_heat_map(
+    head: Any, values: np.ndarray, attribute: str = SHARE, largest: float | None = None
+) -> None:
     """Color the head's triangles by values (F,) from 0 to `largest` (None: the largest value).
 
-    Its own materials stay: a modifier assigns the heat map's. The colors are the active color attribute, for solid
-    shading, and a material, for EEVEE and Cycles. attribute: SHARE or RESIDUAL, in which the values are stored.
+    Its own materials stay: a modifier assigns the heat map's. The colors are the active color
+    attribute, for solid shading, and a material, for EEVEE and Cycles. attribute: SHARE or
+    RESIDUAL, in which the values are stored.
     """
     hide_heat_map(head)
-    scaled = np.minimum(values / max(values.max(initial=0.0) if largest is None else largest, 1e-9), 1.0)
+    scaled = np.minimum(
+        values / max(values.max(initial=0.0) if largest is None else largest, 1e-9), 1.0
+    )
     channels = [np.interp(scaled, STOPS, channel) for channel in zip(*COLORS, strict=True)]
     colors = np.column_stack([*channels, np.ones(len(values))])
     write_attributes(head.data, {attribute: ("FLOAT", "value", flat_floats(values))}, "FACE")
-    write_attributes(head.data, {HEAT: ("FLOAT_COLOR", "color", flat_floats(np.repeat(colors, 3, axis=0)))}, "CORNER")
+    write_attributes(
+        head.data,
+        {HEAT: ("FLOAT_COLOR", "color", flat_floats(np.repeat(colors, 3, axis=0)))},
+        "CORNER",
+    )
     head.data.attributes.active_color_name = HEAT
     head.modifiers.new(MODIFIER, "NODES").node_group = _node_group()
 

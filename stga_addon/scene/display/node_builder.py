@@ -1,4 +1,5 @@
-"""Building node trees: short names for adding nodes, node groups that are built once per file, new materials."""
+"""Building node trees: short names for adding nodes, node groups that are built once per file, new
+materials."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,8 +22,13 @@ def new_tree(name: str) -> bpy.types.NodeTree:
 
 
 def find_tree(name: str) -> bpy.types.NodeTree | None:
-    """The tree of this name made by this version of the add-on, or None: those of other versions are not reused."""
-    trees = (tree for tree in bpy.data.node_groups if tree.name.startswith(name) and tree.get(_VERSION) == __version__)
+    """The tree of this name made by this version of the add-on, or None: those of other versions
+    are not reused."""
+    trees = (
+        tree
+        for tree in bpy.data.node_groups
+        if tree.name.startswith(name) and tree.get(_VERSION) == __version__
+    )
     return next(trees, None)
 
 
@@ -35,13 +41,14 @@ def is_splat_tree(tree: bpy.types.NodeTree) -> bool:
 class NodeGroup:
     """A node group with one output, built once per file.
 
-    Blender validates a whole tree after each edit, so building takes time quadratic in the tree's nodes; small groups
-    are fast, and can be built one at a time while the UI goes on.
+    Blender validates a whole tree after each edit, so building takes time quadratic in the tree's
+    nodes; small groups are fast, and can be built one at a time while the UI goes on.
 
     name     "." is put before it, which hides the group in Blender's menus
     inputs   name -> socket type ("Vector")
     output   socket type
-    build    takes the Nodes to build with and the inputs' sockets, in their order; returns the output's socket
+    build    takes the Nodes to build with and the inputs' sockets, in their order; returns the
+             output's socket
     """
 
     name: str
@@ -57,7 +64,9 @@ class NodeGroup:
         if (existing := find_tree(f".{self.name}")) is not None:
             return existing
         tree = new_tree(f".{self.name}")
-        tree.interface.new_socket(self.output, in_out="OUTPUT", socket_type=f"NodeSocket{self.output}")
+        tree.interface.new_socket(
+            self.output, in_out="OUTPUT", socket_type=f"NodeSocket{self.output}"
+        )
         for name, kind in self.inputs.items():
             tree.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}")
         nodes = Nodes(tree)
@@ -78,22 +87,29 @@ def new_material(name: str, build: Callable[["Nodes"], bpy.types.NodeSocket]) ->
 
 
 class Nodes:
-    """Adds nodes to a tree; methods named after what a node computes return its first enabled output socket."""
+    """Adds nodes to a tree; methods named after what a node computes return its first enabled
+    output socket."""
 
     def __init__(self, tree: bpy.types.NodeTree) -> None:
         self.tree = tree
 
-    def add(self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any) -> bpy.types.Node:
+    def add(
+        self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any
+    ) -> bpy.types.Node:
         """New node; `inputs` maps an enabled socket's name or identifier to a value or socket.
 
-        Several sockets of one name take a list. Names differ between Blender versions more often than identifiers.
-        Raises ValueError where no socket has the name.
+        Several sockets of one name take a list. Names differ between Blender versions more often
+        than identifiers. Raises ValueError where no socket has the name.
         """
         node = self.tree.nodes.new(kind)
         for name, value in properties.items():
             setattr(node, name, value)
         for name, values in (inputs or {}).items():
-            sockets = [socket for socket in node.inputs if socket.enabled and name in (socket.name, socket.identifier)]
+            sockets = [
+                socket
+                for socket in node.inputs
+                if socket.enabled and name in (socket.name, socket.identifier)
+            ]
             values = values if isinstance(values, list) else [values]
             for socket, value in zip(sockets, values, strict=True):
                 if isinstance(value, bpy.types.NodeSocket):
@@ -106,7 +122,9 @@ class Nodes:
         """Add the tree's output node and arrange all nodes in columns, from input to output."""
         _arrange(self.tree, self.add(kind, inputs))
 
-    def out(self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any) -> bpy.types.NodeSocket:
+    def out(
+        self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any
+    ) -> bpy.types.NodeSocket:
         node = self.add(kind, inputs, **properties)
         return next(socket for socket in node.outputs if socket.enabled)
 
@@ -128,7 +146,9 @@ class Nodes:
         return total
 
     def scale(self, vector: Any, factor: Any) -> bpy.types.NodeSocket:
-        return self.out("ShaderNodeVectorMath", {"Vector": vector, "Scale": factor}, operation="SCALE")
+        return self.out(
+            "ShaderNodeVectorMath", {"Vector": vector, "Scale": factor}, operation="SCALE"
+        )
 
     def components(self, vector: Any) -> list[bpy.types.NodeSocket]:
         return list(self.add("ShaderNodeSeparateXYZ", {"Vector": vector}).outputs)
@@ -137,41 +157,62 @@ class Nodes:
         return self.out("ShaderNodeCombineXYZ", {"X": x, "Y": y, "Z": z})
 
     def compare(self, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
-        return self.out("FunctionNodeCompare", {"A": a, "B": b}, data_type="FLOAT", operation=operation)
+        return self.out(
+            "FunctionNodeCompare", {"A": a, "B": b}, data_type="FLOAT", operation=operation
+        )
 
     def logic(self, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
         return self.out("FunctionNodeBooleanMath", {"Boolean": [a, b]}, operation=operation)
 
     def switch(self, kind: str, condition: Any, false: Any, true: Any) -> bpy.types.NodeSocket:
-        return self.out("GeometryNodeSwitch", {"Switch": condition, "False": false, "True": true}, input_type=kind)
+        return self.out(
+            "GeometryNodeSwitch",
+            {"Switch": condition, "False": false, "True": true},
+            input_type=kind,
+        )
 
     def attribute(self, name: Any, data_type: str) -> bpy.types.NodeSocket:
         return self.out("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=data_type)
 
-    def store(self, geometry: Any, name: str, value: Any, data_type: str, domain: str = "POINT") -> Any:
+    def store(
+        self, geometry: Any, name: str, value: Any, data_type: str, domain: str = "POINT"
+    ) -> Any:
         inputs = {"Geometry": geometry, "Name": name, "Value": value}
-        return self.out("GeometryNodeStoreNamedAttribute", inputs, data_type=data_type, domain=domain)
+        return self.out(
+            "GeometryNodeStoreNamedAttribute", inputs, data_type=data_type, domain=domain
+        )
 
-    def sample(self, geometry: Any, value: Any, index: Any, data_type: str, domain: str = "FACE") -> Any:
+    def sample(
+        self, geometry: Any, value: Any, index: Any, data_type: str, domain: str = "FACE"
+    ) -> Any:
         inputs = {"Geometry": geometry, "Value": value, "Index": index}
         return self.out("GeometryNodeSampleIndex", inputs, data_type=data_type, domain=domain)
 
     def on_domain(self, value: Any, data_type: str, domain: str) -> bpy.types.NodeSocket:
-        """A field interpolated to another domain: faces to points and back are means of the touching elements."""
-        return self.out("GeometryNodeFieldOnDomain", {"Value": value}, data_type=data_type, domain=domain)
+        """A field interpolated to another domain: faces to points and back are means of the
+        touching elements."""
+        return self.out(
+            "GeometryNodeFieldOnDomain", {"Value": value}, data_type=data_type, domain=domain
+        )
 
     def triangle_corners(self) -> list[bpy.types.NodeSocket]:
-        """Positions of the three corners of each face, in the order in which it lists its vertices."""
+        """Positions of the three corners of each face, in the order in which it lists its
+        vertices."""
         position, found = self.out("GeometryNodeInputPosition"), []
         for number in range(3):
             corner = self.out("GeometryNodeCornersOfFace", {"Sort Index": number})
             point = self.out("GeometryNodeVertexOfCorner", {"Corner Index": corner})
             inputs = {"Index": point, "Value": position}
-            found.append(self.out("GeometryNodeFieldAtIndex", inputs, data_type="FLOAT_VECTOR", domain="POINT"))
+            found.append(
+                self.out(
+                    "GeometryNodeFieldAtIndex", inputs, data_type="FLOAT_VECTOR", domain="POINT"
+                )
+            )
         return found
 
     def object_info(self, obj: Any, space: str = "RELATIVE") -> bpy.types.Node:
-        """Object Info: "RELATIVE" gives geometry and location in the space of the object that has the modifier."""
+        """Object Info: "RELATIVE" gives geometry and location in the space of the object that has
+        the modifier."""
         return self.add("GeometryNodeObjectInfo", {"Object": obj}, transform_space=space)
 
 

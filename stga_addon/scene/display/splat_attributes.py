@@ -1,4 +1,5 @@
-"""Splats and their light as attributes of Blender meshes: names, how they are written, how they are read back."""
+"""Splats and their light as attributes of Blender meshes: names, how they are written, how they are
+read back."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -22,14 +23,18 @@ XYZ = "stga_xyz"
 ROTATION = "stga_rotation"
 SCALE = "stga_scale"  # standard deviations, linear
 OPACITY = "stga_opacity"  # 0 to 1
-COLOR = "stga_color"  # constant part, scene-linear: all the nodes need for splats of SH degree 0 without strain
-RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame (`render.scene_splats`): where it is there, it counts
+# constant part, scene-linear: all the nodes need for splats of SH degree 0 without strain
+COLOR = "stga_color"
+# scene-linear, of one frame (`render.scene_splats`): where it is there, it counts
+RELIT_COLOR = "stga_relit_color"
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"
-NEUTRAL_AREA = "stga_neutral_area"  # of the splat's triangle, m²; also on the faces that have driven offsets
+# of the splat's triangle, m²; also on the faces that have driven offsets
+NEUTRAL_AREA = "stga_neutral_area"
 
-# On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz and xy yz zx.
+# On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz
+# and xy yz zx.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
 GRAM, TENSOR, PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
 RANGE = ("stga_strain_lowest", "stga_strain_highest")
@@ -41,7 +46,8 @@ Attributes = dict[str, tuple[str, str, np.ndarray]]
 
 @dataclass(frozen=True)
 class SplatAttributes:
-    """Attributes for the vertices of a splat object, and for the faces of its neutral mesh; light of the avatar."""
+    """Attributes for the vertices of a splat object, and for the faces of its neutral mesh; light
+    of the avatar."""
 
     splats: Attributes
     neutral: Attributes
@@ -49,7 +55,8 @@ class SplatAttributes:
 
 
 def avatar_attributes(avatar: Avatar) -> SplatAttributes:
-    """What displaying an avatar writes into Blender; uses no bpy, so that a thread can compute it."""
+    """What displaying an avatar writes into Blender; uses no bpy, so that a thread can compute
+    it."""
     areas = face_areas(avatar.neutral, avatar.faces)
     splats = {
         **splat_attributes(avatar.splats),
@@ -67,7 +74,9 @@ def _neutral_attributes(avatar: Avatar, areas: np.ndarray) -> Attributes:
     for offset, coefficients in avatar.driven_offsets.items():
         for index in range(coefficients.shape[1]):
             vectors[DRIVEN_OFFSET.format(offset, index)] = coefficients[:, index]
-    attributes: Attributes = {name: ("FLOAT_VECTOR", "vector", flat_floats(vector)) for name, vector in vectors.items()}
+    attributes: Attributes = {
+        name: ("FLOAT_VECTOR", "vector", flat_floats(vector)) for name, vector in vectors.items()
+    }
     if avatar.driven_offsets:
         attributes[NEUTRAL_AREA] = ("FLOAT", "value", flat_floats(areas))
     return attributes
@@ -76,28 +85,41 @@ def _neutral_attributes(avatar: Avatar, areas: np.ndarray) -> Attributes:
 def splat_attributes(splats: Splats) -> Attributes:
     """The splats' activated values: unit rotations, linear scales, opacities of 0 to 1."""
     norm = np.linalg.norm(splats.rotation, axis=-1, keepdims=True)
-    rotation = np.where(norm > 0, splats.rotation / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
+    rotation = np.where(
+        norm > 0, splats.rotation / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0]
+    )
     attributes = {
         XYZ: ("FLOAT_VECTOR", "vector", flat_floats(splats.xyz)),
         ROTATION: ("QUATERNION", "value", flat_floats(rotation)),
         SCALE: ("FLOAT_VECTOR", "vector", flat_floats(np.exp(splats.log_scale.astype(np.float64)))),
-        OPACITY: ("FLOAT", "value", flat_floats(1 / (1 + np.exp(-splats.opacity.astype(np.float64))))),
+        OPACITY: (
+            "FLOAT",
+            "value",
+            flat_floats(1 / (1 + np.exp(-splats.opacity.astype(np.float64)))),
+        ),
         COLOR: ("FLOAT_COLOR", "color", flat_floats(_base_color(splats.sh[:, 0]))),
     }
     for name, coefficients in ((SH, splats.sh), (STRAIN_COLOR, splats.strain_color)):
         for index in range(coefficients.shape[1]):
-            attributes[name.format(index)] = ("FLOAT_VECTOR", "vector", flat_floats(coefficients[:, index]))
+            attributes[name.format(index)] = (
+                "FLOAT_VECTOR",
+                "vector",
+                flat_floats(coefficients[:, index]),
+            )
     return attributes
 
 
 def write_splats(mesh: Any, attributes: Attributes) -> None:
-    """Give the mesh one vertex per splat, with these attributes; overwrites what there is in place."""
+    """Give the mesh one vertex per splat, with these attributes; overwrites what there is in
+    place."""
     positions = attributes[XYZ][2]
     if len(mesh.vertices) != len(positions) // 3:
         mesh.clear_geometry()
         mesh.vertices.add(len(positions) // 3)
     # Through the attribute, which takes all values at once; `MeshVertex.co` takes them one by one.
-    write_attributes(mesh, {"position": ("FLOAT_VECTOR", "vector", positions), **attributes}, "POINT")
+    write_attributes(
+        mesh, {"position": ("FLOAT_VECTOR", "vector", positions), **attributes}, "POINT"
+    )
     mesh[tags.REVISION] = uuid4().hex
     mesh.update()
 
@@ -110,7 +132,8 @@ def write_attributes(mesh: Any, attributes: Attributes, domain: str) -> None:
 
 
 def read_splats(mesh: Any) -> Splats:
-    """The splats stored in a splat object's mesh, with unit rotations; all count as bound to their triangles."""
+    """The splats stored in a splat object's mesh, with unit rotations; all count as bound to their
+    triangles."""
     attributes = mesh.attributes
     count = len(mesh.vertices)
 
@@ -122,8 +145,13 @@ def read_splats(mesh: Any) -> Splats:
 
     opacity = read_values(attributes[OPACITY].data, "value", 1)[:, 0].astype(np.float64)
     scale = read_values(attributes[SCALE].data, "vector", 3).astype(np.float64)
-    face = read_values(attributes[FACE].data, "value", 1, np.int32)[:, 0] if FACE in attributes else None
-    with np.errstate(divide="ignore"):  # opacities of 0 and 1 are logits of −∞ and ∞, which the kernels accept
+    face = (
+        read_values(attributes[FACE].data, "value", 1, np.int32)[:, 0]
+        if FACE in attributes
+        else None
+    )
+    # opacities of 0 and 1 are logits of −∞ and ∞, which the kernels accept
+    with np.errstate(divide="ignore"):
         return Splats(
             xyz=read_values(attributes[XYZ].data, "vector", 3),
             rotation=read_values(attributes[ROTATION].data, "value", 4),
@@ -139,7 +167,9 @@ def read_splats(mesh: Any) -> Splats:
 def read_driven_offsets(neutral: Any) -> dict[str, np.ndarray]:
     """`Avatar.driven_offsets` as stored in a neutral mesh."""
     found = {
-        name: read_vectors(neutral, [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)])
+        name: read_vectors(
+            neutral, [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)]
+        )
         for name, offset in OFFSETS.items()
     }
     return {name: coefficients for name, coefficients in found.items() if coefficients is not None}
@@ -153,7 +183,8 @@ def read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
 
 
 def _base_color(dc: np.ndarray) -> np.ndarray:
-    """(N, 4) scene-linear RGBA, as color attributes are stored; the SH coefficients (N, 3) give sRGB."""
+    """(N, 4) scene-linear RGBA, as color attributes are stored; the SH coefficients (N, 3) give
+    sRGB."""
     linear = srgb_to_linear(np.clip(0.5 + SH_C0 * np.asarray(dc, np.float64), 0.0, 1.0))
     return np.concatenate([linear, np.ones((len(dc), 1))], axis=-1)
 
@@ -201,7 +232,9 @@ def read_light(mesh: Any) -> AvatarLight | None:
         return None
     rest = json.loads(mesh[PROPERTY])
     vectors = [read_values(mesh.attributes[name].data, "vector", 3) for name in VECTORS]
-    occlusion, roughness = (read_values(mesh.attributes[name].data, "value", 1)[:, 0] for name in NUMBERS)
+    occlusion, roughness = (
+        read_values(mesh.attributes[name].data, "value", 1)[:, 0] for name in NUMBERS
+    )
     return AvatarLight(
         radiance=np.array(rest["radiance"], np.float32).reshape(9, 3),
         transfer=np.concatenate(vectors[:3], axis=1),

@@ -1,7 +1,7 @@
 """The geometry node tree that displays splats, without Python at playback.
 
-For splats that follow a head it computes each triangle's frame on the head's *evaluated* mesh, samples the frames by
-the splats' face index and composes position, rotation and scale.
+For splats that follow a head it computes each triangle's frame on the head's *evaluated* mesh,
+samples the frames by the splats' face index and composes position, rotation and scale.
 """
 
 from typing import Any, NamedTuple
@@ -12,7 +12,14 @@ from ...capture.meshes import SELECTED_WEIGHT
 from .. import tags
 from ..compat import NATIVE_SPLATS
 from ..layers import FROZEN_COLOR
-from .color_nodes import LINEAR_TO_SRGB, SH_BANDS, SRGB_TO_LINEAR, constant_color, view_color, view_direction
+from .color_nodes import (
+    LINEAR_TO_SRGB,
+    SH_BANDS,
+    SRGB_TO_LINEAR,
+    constant_color,
+    view_color,
+    view_direction,
+)
 from .display_modes import AS_TRAINED, DISPLAY_COLOR, MODES, NATIVE_GROUPS, displayed
 from .frame_nodes import DEFORMED, FRAMES, PLACED, SAMPLED_STRAIN, SIGNALS, STRAIN, shifted
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
@@ -48,9 +55,15 @@ class TreeOptions(NamedTuple):
 
     @property
     def tree_name(self) -> str:
-        """At most 59 characters: Blender before 5.0 has room for 63, and adds ".001" to a name that is taken."""
-        driven = [*(["color"] if self.strain_color else []), *(SIGNALS[name].label for name in self.offsets)]
-        return f"STGA Splats ({', '.join([self.convention or 'world', f'SH {self.degree}', *driven])})"
+        """At most 59 characters: Blender before 5.0 has room for 63, and adds ".001" to a name that
+        is taken."""
+        driven = [
+            *(["color"] if self.strain_color else []),
+            *(SIGNALS[name].label for name in self.offsets),
+        ]
+        return (
+            f"STGA Splats ({', '.join([self.convention or 'world', f'SH {self.degree}', *driven])})"
+        )
 
 
 def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
@@ -70,7 +83,8 @@ def find_splat_tree(options: TreeOptions) -> bpy.types.NodeTree | None:
 
 
 def build_next_node_group(options: TreeOptions) -> bool:
-    """Build one node group that `splat_tree` needs, the tree itself last; returns False if all exist.
+    """Build one node group that `splat_tree` needs, the tree itself last; returns False if all
+    exist.
 
     Calling it from a timer until it returns False keeps the UI responsive meanwhile.
     """
@@ -118,20 +132,37 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
     add(SIZE, "Float", "Factor on the splats' size", default_value=1.0, min_value=0.0)
     fraction = {"default_value": 0.0, "min_value": 0.0, "max_value": 1.0}
     add(OPACITY_THRESHOLD, "Float", "Hide splats with a lower opacity", **fraction)
-    percentage = {"default_value": 100.0, "min_value": 0.0, "max_value": 100.0, "subtype": "PERCENTAGE"}
+    percentage = {
+        "default_value": 100.0,
+        "min_value": 0.0,
+        "max_value": 100.0,
+        "subtype": "PERCENTAGE",
+    }
     add(PERCENTAGE, "Float", "Show only a random part of the splats", **percentage)
     if degree > 0:
         description = "Colors as the scene's active camera sees them; off: their constant part"
         add(VIEW_DEPENDENT, "Bool", description, default_value=True)
     if embedded:
-        add(SHOW_SELECTION, "Bool", "Gray out splats that the current frame's selection freezes", default_value=False)
-        add(SELECTED_ONLY, "Bool", "Hide splats that the current frame's selection freezes", default_value=False)
+        add(
+            SHOW_SELECTION,
+            "Bool",
+            "Gray out splats that the current frame's selection freezes",
+            default_value=False,
+        )
+        add(
+            SELECTED_ONLY,
+            "Bool",
+            "Hide splats that the current frame's selection freezes",
+            default_value=False,
+        )
 
 
 def _build(nodes: Nodes, options: TreeOptions) -> None:
     inputs = nodes.add("NodeGroupInput").outputs
     splats = inputs["Geometry"]
-    opaque = nodes.compare("GREATER_EQUAL", nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD])
+    opaque = nodes.compare(
+        "GREATER_EQUAL", nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD]
+    )
     # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
     random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
     visible = nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", random, inputs[PERCENTAGE]))
@@ -169,7 +200,8 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
 
 
 def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
-    """Scene-linear color of each splat; strain: a vector field, None where colors do not follow it."""
+    """Scene-linear color of each splat; strain: a vector field, None where colors do not follow
+    it."""
     color = nodes.attribute(COLOR, "FLOAT_COLOR")
     if strain is None and degree == 0:
         return color
@@ -180,17 +212,27 @@ def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
         return color
     direction, has_camera = view_direction(nodes, nodes.out("GeometryNodeInputPosition"))
     from_camera = nodes.group(SRGB_TO_LINEAR, view_color(nodes, srgb, degree, direction))
-    return nodes.switch("RGBA", nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera), color, from_camera)
+    return nodes.switch(
+        "RGBA", nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera), color, from_camera
+    )
 
 
 def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
-    """Field: splats whose triangles the current frame's selection leaves out; none where the frame has no selection."""
-    frame = nodes.out("FunctionNodeValueToString", {"Value": nodes.add("GeometryNodeInputSceneTime").outputs["Frame"]})
-    name = nodes.out("FunctionNodeReplaceString", {"String": f"{tags.GROUP_PREFIX}#", "Find": "#", "Replace": frame})
+    """Field: splats whose triangles the current frame's selection leaves out; none where the frame
+    has no selection."""
+    frame = nodes.out(
+        "FunctionNodeValueToString",
+        {"Value": nodes.add("GeometryNodeInputSceneTime").outputs["Frame"]},
+    )
+    name = nodes.out(
+        "FunctionNodeReplaceString",
+        {"String": f"{tags.GROUP_PREFIX}#", "Find": "#", "Replace": frame},
+    )
     group = nodes.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
     weight, exists = (socket for socket in group.outputs if socket.enabled)
     selected = nodes.compare("GREATER_EQUAL", weight, SELECTED_WEIGHT)
-    # Compared on the points: a boolean interpolated to a face is true where it is true at all the face's points.
+    # Compared on the points: a boolean interpolated to a face is true where it is true at all the
+    # face's points.
     frozen = nodes.logic("NIMPLY", exists, nodes.on_domain(selected, "BOOLEAN", "POINT"))
     return nodes.sample(mesh, frozen, nodes.attribute(FACE, "INT"), "BOOLEAN")
 
@@ -200,7 +242,9 @@ _FROZEN_SPLATS = NodeGroup("STGA Frozen Splats", {"Mesh": "Geometry"}, "Bool", _
 
 def _relit_color(nodes: Nodes, color: Any) -> bpy.types.NodeSocket:
     """Field: the relit color of a frame where the splats have one, else `color`."""
-    stored = nodes.add("GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR")
+    stored = nodes.add(
+        "GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR"
+    )
     relit, exists = (socket for socket in stored.outputs if socket.enabled)
     return nodes.switch("RGBA", exists, color, relit)
 

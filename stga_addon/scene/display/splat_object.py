@@ -37,20 +37,22 @@ TRANSPARENT_BOUNCES = 64
 
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
-    """A sentence where the view transform changes the colors of splats that EEVEE and Cycles render, else None."""
+    """A sentence where the view transform changes the colors of splats that EEVEE and Cycles
+    render, else None."""
     if scene.view_settings.view_transform == "Standard":
         return None
     return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"
 
 
 def shows_nodes(scene: bpy.types.Scene) -> bool:
-    """Whether the scene is rendered by EEVEE or Cycles, which show what geometry nodes make of splats."""
+    """Whether the scene is rendered by EEVEE or Cycles, which show what geometry nodes make of
+    splats."""
     return scene.render.engine == "CYCLES" or scene.render.engine.startswith("BLENDER_EEVEE")
 
 
 def use_transparent_bounces(scene: bpy.types.Scene) -> None:
-    """Let Cycles, where its add-on is enabled, see through overlapping splats without ending rays between them at
-    random; limits that are higher stay."""
+    """Let Cycles, where its add-on is enabled, see through overlapping splats without ending rays
+    between them at random; limits that are higher stay."""
     cycles = getattr(scene, "cycles", None)
     for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
         setattr(cycles, limit, max(getattr(cycles, limit), TRANSPARENT_BOUNCES))
@@ -67,18 +69,24 @@ SETTING_NAMES = {
 """Inputs of the splat modifier -> fields of `DisplaySettings`."""
 
 
-def show_avatar(avatar: Avatar, head: Any, name: str | None = None, prepared: SplatAttributes | None = None) -> Any:
+def show_avatar(
+    avatar: Avatar, head: Any, name: str | None = None, prepared: SplatAttributes | None = None
+) -> Any:
     """Make a splat object that follows the evaluated mesh of the object `head`; returns it.
 
-    head: a mesh object with the avatar's triangles, in their order. prepared: `avatar_attributes` of the avatar,
-    computed here by default. Raises StgaError where the head has other triangles.
+    head: a mesh object with the avatar's triangles, in their order. prepared: `avatar_attributes`
+    of the avatar, computed here by default. Raises StgaError where the head has other triangles.
     """
     check_head(avatar, head)
     prepared = prepared or avatar_attributes(avatar)
-    local = (collection for collection in head.users_collection if collection.library is None)  # or all are linked
+    # or all are linked
+    local = (collection for collection in head.users_collection if collection.library is None)
     collection = next(local, bpy.context.scene.collection)
     splat_object = _splat_object(name or f"{head.name} splats", prepared.splats, collection)
-    splat_object[tags.CONVENTION], splat_object[tags.ANTIALIASED] = avatar.convention, avatar.antialiased
+    splat_object[tags.CONVENTION], splat_object[tags.ANTIALIASED] = (
+        avatar.convention,
+        avatar.antialiased,
+    )
     _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
@@ -100,9 +108,13 @@ def show_world_splats(splats: Splats, name: str) -> Any:
 
 
 def can_update(splat_object: Any, avatar: Avatar) -> bool:
-    """Whether `update_splats` can show the avatar in this object: the same in all but its splats and its strain."""
+    """Whether `update_splats` can show the avatar in this object: the same in all but its splats
+    and its strain."""
     try:
-        tree, neutral = splat_modifier(splat_object).node_group, get_input(splat_object, splat_nodes.NEUTRAL)
+        tree, neutral = (
+            splat_modifier(splat_object).node_group,
+            get_input(splat_object, splat_nodes.NEUTRAL),
+        )
     except StgaError:
         return False
     stored = splat_object.get(tags.CONVENTION), splat_object.get(tags.ANTIALIASED)
@@ -132,7 +144,8 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
 
 
 def stored_light(splat_object: Any) -> AvatarLight | None:
-    """The light of the object's avatar; None where it does not know that, or has lost its modifier."""
+    """The light of the object's avatar; None where it does not know that, or has lost its
+    modifier."""
     try:
         neutral = get_input(splat_object, splat_nodes.NEUTRAL)
     except StgaError:
@@ -141,12 +154,14 @@ def stored_light(splat_object: Any) -> AvatarLight | None:
 
 
 def build_next_node_group(avatar: Avatar) -> bool:
-    """Build one of the node groups that `show_avatar` needs; returns False if all exist (see `splat_nodes`)."""
+    """Build one of the node groups that `show_avatar` needs; returns False if all exist (see
+    `splat_nodes`)."""
     return splat_nodes.build_next_node_group(_tree_options(avatar))
 
 
 def check_head(avatar: Avatar, head: Any) -> None:
-    """Raise StgaError unless `head` is a mesh object with the avatar's triangles, in their order."""
+    """Raise StgaError unless `head` is a mesh object with the avatar's triangles, in their
+    order."""
     if head is None or head.type != "MESH":
         raise StgaError("head: expected a mesh object that the avatar's splats can follow")
     if not has_triangles(head.data, avatar.faces):
@@ -157,7 +172,8 @@ def check_head(avatar: Avatar, head: Any) -> None:
 
 
 def hide_object(obj: Any, scene: Any) -> None:
-    """Hide an object, such as a head that would cover its splats; a linked one stays visible in renders."""
+    """Hide an object, such as a head that would cover its splats; a linked one stays visible in
+    renders."""
     if obj.library is None:
         obj.hide_render = True
     for layer in scene.view_layers:
@@ -166,9 +182,14 @@ def hide_object(obj: Any, scene: Any) -> None:
 
 
 def splat_modifier(splat_object: Any) -> Any:
-    """The geometry nodes modifier that displays the splats. Raises StgaError where the object has none."""
+    """The geometry nodes modifier that displays the splats. Raises StgaError where the object has
+    none."""
     for modifier in splat_object.modifiers if splat_object is not None else ():
-        if modifier.type == "NODES" and modifier.node_group is not None and is_splat_tree(modifier.node_group):
+        if (
+            modifier.type == "NODES"
+            and modifier.node_group is not None
+            and is_splat_tree(modifier.node_group)
+        ):
             return modifier
     raise StgaError(f"{getattr(splat_object, 'name', None)}: is not an object that shows splats")
 
@@ -193,9 +214,12 @@ def get_input(splat_object: Any, name: str) -> Any:
 
 
 def input_identifier(modifier: Any, name: str) -> str | None:
-    """Identifier ("Socket_2") of a modifier's input by its displayed name; None where it has no such input."""
+    """Identifier ("Socket_2") of a modifier's input by its displayed name; None where it has no
+    such input."""
     items = modifier.node_group.interface.items_tree
-    return next((item.identifier for item in items if item.in_out == "INPUT" and item.name == name), None)
+    return next(
+        (item.identifier for item in items if item.in_out == "INPUT" and item.name == name), None
+    )
 
 
 def display_mode(splat_object: Any) -> str:
@@ -206,7 +230,8 @@ def display_mode(splat_object: Any) -> str:
 
 
 def display_settings(modifier: Any) -> DisplaySettings:
-    """The display settings of a splat object, by its `splat_modifier`; defaults for those that its splats lack."""
+    """The display settings of a splat object, by its `splat_modifier`; defaults for those that its
+    splats lack."""
     chosen = {
         SETTING_NAMES[item.name]: modifier_input(modifier, item.identifier)
         for item in modifier.node_group.interface.items_tree
@@ -216,7 +241,8 @@ def display_settings(modifier: Any) -> DisplaySettings:
 
 
 def stored_avatar(splat_object: Any) -> Avatar:
-    """The avatar that `show_avatar` made a splat object of, with unit rotations and without regions."""
+    """The avatar that `show_avatar` made a splat object of, with unit rotations and without
+    regions."""
     neutral = get_input(splat_object, splat_nodes.NEUTRAL)
     if neutral is None:
         raise StgaError(f"{splat_object.name}: its neutral mesh is missing; show the avatar again")
@@ -248,7 +274,11 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for instance in depsgraph.object_instances:
         owner = instance.parent if instance.is_instance else instance.object
-        if owner is not None and owner.original == splat_object and instance.object.type == "POINTCLOUD":
+        if (
+            owner is not None
+            and owner.original == splat_object
+            and instance.object.type == "POINTCLOUD"
+        ):
             attributes = instance.object.data.attributes
             return (
                 read_values(attributes["position"].data, "vector", 3),
@@ -276,7 +306,8 @@ def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
 def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
     modifier = splat_object.modifiers.new("STGA Splats", "NODES")
     modifier.node_group = splat_nodes.splat_tree(options)
-    set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)  # the default reaches it in some versions only
+    # the default reaches it in some versions only
+    set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)
     for scene in splat_object.users_scene:
         use_transparent_bounces(scene)
 
@@ -284,5 +315,8 @@ def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
     splats = avatar.splats
     return splat_nodes.TreeOptions(
-        avatar.convention, splats.sh_degree, splats.strain_color.shape[1] > 0, displayed_offsets(avatar.driven_offsets)
+        avatar.convention,
+        splats.sh_degree,
+        splats.strain_color.shape[1] > 0,
+        displayed_offsets(avatar.driven_offsets),
     )

@@ -1,4 +1,5 @@
-"""Splats, triangle frames, light and a view as the float32 arrays that the shaders read; numpy only.
+"""Splats, triangle frames, light and a view as the float32 arrays that the shaders read; numpy
+only.
 
 Every array is a list of texels (vec4), in the order that `shaders.py` documents.
 """
@@ -30,14 +31,16 @@ MAX_INDEX = 1 << 24
 MAX_SHORT_KEY, MAX_LONG_KEY = (1 << 16) - 1, (1 << 24) - (1 << 8)
 """Largest sort keys: of 16 bits, and of 24, as many as float32 has, less what rounding may add."""
 MAX_RELATIVE_STEP = 1e-5
-"""Largest step of depth from one short key to the next, as a share of the nearest splat's depth: 5 µm at 0.5 m."""
+"""Largest step of depth from one short key to the next, as a share of the nearest splat's depth: 5
+µm at 0.5 m."""
 
 
 @dataclass(frozen=True)
 class View:
     """A camera, and the part of its space in which splats are drawn.
 
-    far: meters; clip_planes (P, 4), P ≤ 6, in world space: a splat is drawn where plane · (center, 1) ≥ 0 for all.
+    far: meters; clip_planes (P, 4), P ≤ 6, in world space: a splat is drawn where plane · (center,
+    1) ≥ 0 for all.
     """
 
     camera: Camera
@@ -49,8 +52,8 @@ class View:
 class StaticSplats:
     """What does not change while layers show the same splats.
 
-    positions (3, N): in the splats' triangles; face (N,) index into all layers' triangles. texels: name -> (M, 4) for
-    the textures.
+    positions (3, N): in the splats' triangles; face (N,) index into all layers' triangles. texels:
+    name -> (M, 4) for the textures.
     """
 
     def __init__(self, layers: Sequence[SceneLayer]) -> None:
@@ -72,23 +75,30 @@ class StaticSplats:
             begin, first_face = rows.stop, first_face + len(layer.frames.origin)
             first_color += len(colors[-1])
         if max(first_color, 3 * count, 4 * first_face) > MAX_INDEX:
-            raise StgaError(f"{count} splats with their colors are too many to display as trained; choose Points")
+            raise StgaError(
+                f"{count} splats with their colors are too many to display as trained; choose Points"
+            )
         centers[:, 3] = self.face
         self.positions = np.ascontiguousarray(centers[:, :3].T)
-        self.texels = {"centers": centers, "axes": axes.reshape(-1, 4), "colors": np.concatenate(colors)}
+        self.texels = {
+            "centers": centers,
+            "axes": axes.reshape(-1, 4),
+            "colors": np.concatenate(colors),
+        }
 
     def __len__(self) -> int:
         return len(self.face)
 
 
 def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
-    """What a `StaticSplats` of these layers was made of; valid while it keeps the layers' splats alive."""
+    """What a `StaticSplats` of these layers was made of; valid while it keeps the layers' splats
+    alive."""
     return tuple((id(layer.splats), len(layer.frames.origin)) for layer in layers)
 
 
 def _axes(splats: Splats, layer: int) -> np.ndarray:
-    """(N, 3, 4): the standard deviations along the splat's axes as vectors, beside them opacity, a random value in
-    0…100 for the display's percentage, and the layer's index."""
+    """(N, 3, 4): the standard deviations along the splat's axes as vectors, beside them opacity, a
+    random value in 0…100 for the display's percentage, and the layer's index."""
     axes = np.empty((len(splats), 3, 4), np.float32)
     deviation = np.exp(splats.log_scale.astype(np.float64))
     axes[..., :3] = np.swapaxes(to_matrices(normalized(splats.rotation)) * deviation[:, None], 1, 2)
@@ -113,9 +123,10 @@ def frame_block(frames: FaceFrames) -> np.ndarray:
 class PosedFrames:
     """The triangles of all layers as a camera sees them.
 
-    texels (4, F, 4) float32: three rows of the map to camera space, then strain and whether the triangle is frozen.
-    depth_rows (4, F) float32: the third row, less `base` meters: far from the camera, float32 would round away the
-    differences by which splats are sorted.
+    texels (4, F, 4) float32: three rows of the map to camera space, then strain and whether the
+    triangle is frozen.
+    depth_rows (4, F) float32: the third row, less `base` meters: far from the camera, float32 would
+    round away the differences by which splats are sorted.
     """
 
     texels: np.ndarray
@@ -123,10 +134,16 @@ class PosedFrames:
     base: float
 
 
-def posed_frames(layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], view: View) -> PosedFrames:
+def posed_frames(
+    layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], view: View
+) -> PosedFrames:
     """Compose `frame_block` of each layer with its object and the camera, in float64."""
     count = sum(len(layer.frames.origin) for layer in layers)
-    texels, depth_rows, base = np.zeros((4, count, 4), np.float32), np.empty((4, count), np.float32), None
+    texels, depth_rows, base = (
+        np.zeros((4, count, 4), np.float32),
+        np.empty((4, count), np.float32),
+        None,
+    )
     begin = 0
     for layer, block in zip(layers, blocks, strict=True):
         to_camera = view.camera.world_to_camera @ layer.to_world
@@ -143,10 +160,13 @@ def posed_frames(layers: Sequence[SceneLayer], blocks: Sequence[np.ndarray], vie
     return PosedFrames(texels, depth_rows, base or 0.0)
 
 
-def drawing_order(static: StaticSplats, frames: PosedFrames, view: View, short_keys: bool = False) -> np.ndarray:
+def drawing_order(
+    static: StaticSplats, frames: PosedFrames, view: View, short_keys: bool = False
+) -> np.ndarray:
     """Indices (M,) float32 of the splats within the view's near and far ends, farthest first.
 
-    short_keys: whether splats that are a few micrometers apart in depth may be swapped, which takes half the time.
+    short_keys: whether splats that are a few micrometers apart in depth may be swapped, which takes
+    half the time.
     """
     depth = _depths(static, frames)
     near, far, chosen = view.near - frames.base, view.far - frames.base, None
@@ -161,10 +181,11 @@ def drawing_order(static: StaticSplats, frames: PosedFrames, view: View, short_k
 
 
 def _ascending(depth: np.ndarray, base: float, short_keys: bool) -> np.ndarray:
-    """Indices that sort depths (M,), less `base`, by keys of 24 bits in two passes; changes `depth`.
+    """Indices that sort depths (M,), less `base`, by keys of 24 bits in two passes; changes
+    `depth`.
 
-    Keys and passes have 8 or 16 bits, for which numpy uses radix sort. With short_keys, one pass by keys of 16 bits,
-    except where these would swap splats farther apart, as in a large scene.
+    Keys and passes have 8 or 16 bits, for which numpy uses radix sort. With short_keys, one pass by
+    keys of 16 bits, except where these would swap splats farther apart, as in a large scene.
     """
     nearest, farthest = float(depth.min()), float(depth.max())
     span = max(farthest - nearest, 1e-30)
@@ -179,8 +200,12 @@ def _ascending(depth: np.ndarray, base: float, short_keys: bool) -> np.ndarray:
 
 
 def _depths(static: StaticSplats, frames: PosedFrames) -> np.ndarray:
-    """(N,) float32 of all splats, along the view axis, less `frames.base`; row by row, which is fastest."""
-    depth, product = np.take(frames.depth_rows[3], static.face, mode="clip"), np.empty(len(static), np.float32)
+    """(N,) float32 of all splats, along the view axis, less `frames.base`; row by row, which is
+    fastest."""
+    depth, product = (
+        np.take(frames.depth_rows[3], static.face, mode="clip"),
+        np.empty(len(static), np.float32),
+    )
     for row, coordinate in zip(frames.depth_rows, static.positions, strict=False):
         np.take(row, static.face, out=product, mode="clip")
         product *= coordinate
@@ -189,21 +214,29 @@ def _depths(static: StaticSplats, frames: PosedFrames) -> np.ndarray:
 
 
 def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.ndarray:
-    """(VIEW_TEXELS + LAYER_TEXELS · L, 4) float32: what the shader knows of the view and of each layer."""
+    """(VIEW_TEXELS + LAYER_TEXELS · L, 4) float32: what the shader knows of the view and of each
+    layer."""
     camera = view.camera
     texels = np.zeros((VIEW_TEXELS + LAYER_TEXELS * len(layers), 4), np.float32)
-    planes = np.zeros((0, 4)) if view.clip_planes is None else view.clip_planes @ np.linalg.inv(camera.world_to_camera)
+    planes = (
+        np.zeros((0, 4))
+        if view.clip_planes is None
+        else view.clip_planes @ np.linalg.inv(camera.world_to_camera)
+    )
     texels[0] = camera.fl_x, camera.fl_y, camera.cx, camera.cy
     texels[1] = camera.width, camera.height, len(planes), 0
     texels[2 : 2 + len(planes)] = planes
-    for layer, first, row in zip(layers, static.rows, texels[VIEW_TEXELS:].reshape(-1, LAYER_TEXELS, 4), strict=True):
+    for layer, first, row in zip(
+        layers, static.rows, texels[VIEW_TEXELS:].reshape(-1, LAYER_TEXELS, 4), strict=True
+    ):
         settings = layer.settings
         row[0] = first
         if not settings.view_dependent:
             row[0, 3] = 0
         strained = bool(layer.frames.strain.shape[1] and layer.splats.strain_color.shape[1])
         row[1] = layer.antialiased, strained, settings.size, settings.opacity_threshold
-        # From directions in camera space to the space that splats were trained in: without scale and reflection.
+        # From directions in camera space to the space that splats were trained in: without scale
+        # and reflection.
         u, _, v = np.linalg.svd((camera.world_to_camera @ layer.to_world)[:3, :3])
         row[2:5, :3] = (u @ v).T
         row[2:5, 3] = settings.percentage, settings.show_selection, settings.selected_only
@@ -213,14 +246,15 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
 SURFACE_TEXELS, VERTEX_TEXELS, LIGHT_TEXELS, MAP_TEXELS = 4, 3, 4, 4
 """Of a splat, of a vertex, of a point that stands for a light, and of a shadow map."""
 RELIT_TEXELS = 14
-"""Of a layer: share and factor of color; roughness, specular, first light and number of lights; eye, damping; typical
-albedo; nine harmonics of the world as highlights show them; gain and share of what is kept of recorded colors
-(`light.relight`)."""
+"""Of a layer: share and factor of color; roughness, specular, first light and number of lights;
+eye, damping; typical albedo; nine harmonics of the world as highlights show them; gain and share of
+what is kept of recorded colors (`light.relight`)."""
 MAX_MAPS = 16
 
 
 def surface(layers: Sequence[SceneLayer]) -> np.ndarray:
-    """(N · SURFACE_TEXELS, 4): what does not change of all splats; 0 for those of layers that are not relit."""
+    """(N · SURFACE_TEXELS, 4): what does not change of all splats; 0 for those of layers that are
+    not relit."""
     parts, first = [], 0
     for layer in layers:
         texels = np.zeros((len(layer.splats), SURFACE_TEXELS, 4), np.float32)
@@ -246,8 +280,8 @@ class ShadowView:
 class RelitScene:
     """What changes with pose or light, for layers that are relit.
 
-    vertices (V · VERTEX_TEXELS, 4): position, normal, irradiance of the world and of skin around. lights (M, 4): as of
-    `with_eye`. maps: the shadow maps, in order.
+    vertices (V · VERTEX_TEXELS, 4): position, normal, irradiance of the world and of skin around.
+    lights (M, 4): as of `with_eye`. maps: the shadow maps, in order.
     """
 
     vertices: np.ndarray
@@ -280,7 +314,9 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
 def with_eye(scene: RelitScene, layers: Sequence[SceneLayer], eye: np.ndarray) -> np.ndarray:
     """`RelitScene.lights` for a camera at eye (3,)."""
     lights = scene.lights.copy()
-    for block, layer in zip(lights[: len(layers) * RELIT_TEXELS].reshape(-1, RELIT_TEXELS, 4), layers, strict=True):
+    for block, layer in zip(
+        lights[: len(layers) * RELIT_TEXELS].reshape(-1, RELIT_TEXELS, 4), layers, strict=True
+    ):
         block[2, :3] = layer.eye_in_avatar(eye)
     return lights
 
@@ -296,7 +332,8 @@ def _fill(block: np.ndarray, relit: Relit, kept: Kept, first: int, count: int) -
 
 
 def _lights(relit: Relit, maps: list[ShadowView], map_rows: list[np.ndarray]) -> np.ndarray:
-    """(points · LIGHT_TEXELS, 4); adds the shadow maps that they need. Lights beyond MAX_MAPS throw no shadow."""
+    """(points · LIGHT_TEXELS, 4); adds the shadow maps that they need. Lights beyond MAX_MAPS throw
+    no shadow."""
     bounds = head_bounds(relit.mesh)
     faces = relit.relighter.avatar.faces
     casters = *relit.casters, *relit.relighter.lash_casters(relit.mesh, relit.lighting)
@@ -339,9 +376,13 @@ class _Normals:
     def __call__(self, mesh: np.ndarray) -> np.ndarray:
         rows = [np.ascontiguousarray(row, np.float32) for row in mesh.T]
         a, b, c = ([row[corner] for row in rows] for corner in self._corners)
-        u, v = [q - p for p, q in zip(a, b, strict=True)], [q - p for p, q in zip(a, c, strict=True)]
+        u, v = (
+            [q - p for p, q in zip(a, b, strict=True)],
+            [q - p for p, q in zip(a, c, strict=True)],
+        )
         total = [
-            np.add.reduceat((u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2])[self._face], self._first) for k in range(3)
+            np.add.reduceat((u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2])[self._face], self._first)
+            for k in range(3)
         ]
         scale = 1 / np.maximum(np.sqrt(sum(row * row for row in total)), 1e-20)
         found = np.zeros(self._shape, np.float32)

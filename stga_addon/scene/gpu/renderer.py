@@ -1,4 +1,5 @@
-"""Draws layers of splats with Blender's `gpu` module: off-screen, into a viewport, or to an image in memory.
+"""Draws layers of splats with Blender's `gpu` module: off-screen, into a viewport, or to an image
+in memory.
 
 Needs a GPU context: a viewport's drawing, or a render engine with `bl_use_gpu_context`.
 """
@@ -10,7 +11,15 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
-from gpu.types import Buffer, GPUBatch, GPUFrameBuffer, GPUIndexBuf, GPUTexture, GPUVertBuf, GPUVertFormat
+from gpu.types import (
+    Buffer,
+    GPUBatch,
+    GPUFrameBuffer,
+    GPUIndexBuf,
+    GPUTexture,
+    GPUVertBuf,
+    GPUVertFormat,
+)
 from mathutils import Vector
 
 from ...avatar.embedding import FaceFrames
@@ -37,8 +46,9 @@ from .shaders import (
 )  # fmt: skip
 
 NEAR_PER_SQUARE = 3e-4
-"""Meters from a lamp at which its map begins, over the squared distance of the head: float32 then tells depths there
-0.2 mm apart, and less where the map begins nearer. What is nearer throws no shadow."""
+"""Meters from a lamp at which its map begins, over the squared distance of the head: float32 then
+tells depths there 0.2 mm apart, and less where the map begins nearer. What is nearer throws no
+shadow."""
 
 
 class RelitTextures:
@@ -55,8 +65,11 @@ class RelitTextures:
         self.textures: dict[str, Any] = {}
 
     def update(self, layers: Sequence[SceneLayer], eye: np.ndarray) -> dict[str, Any]:
-        """The textures by name, for a camera at eye (3,); must be called before a framebuffer is bound."""
-        relighters = tuple((id(layer.splats), layer.relit and id(layer.relit.relighter)) for layer in layers)
+        """The textures by name, for a camera at eye (3,); must be called before a framebuffer is
+        bound."""
+        relighters = tuple(
+            (id(layer.splats), layer.relit and id(layer.relit.relighter)) for layer in layers
+        )
         if relighters != self._surface_of:
             self.textures["surface"], self._surface_of = texture(surface(layers)), relighters
         scene_of = tuple(id(layer.relit) for layer in layers)
@@ -73,9 +86,13 @@ class RelitTextures:
         rows = max(1, -(-len(maps) // MAP_COLUMNS))
         if self._atlas is None or self._atlas[0] != rows:
             size = MAP_SIZE * MAP_COLUMNS, MAP_SIZE * rows
-            depths, tested = GPUTexture(size, format="R32F"), GPUTexture(size, format="DEPTH_COMPONENT32F")
+            depths, tested = (
+                GPUTexture(size, format="R32F"),
+                GPUTexture(size, format="DEPTH_COMPONENT32F"),
+            )
             target = GPUFrameBuffer(depth_slot=tested, color_slots=(depths,))
-            self._atlas = rows, depths, target, tested  # a framebuffer does not keep its textures alive
+            # a framebuffer does not keep its textures alive
+            self._atlas = rows, depths, target, tested
         _, depths, target, _ = self._atlas
         known, self._batches = self._batches, {}
         with target.bind():
@@ -100,7 +117,9 @@ class RelitTextures:
             shader.uniform_float(name, (*axis, -float(view.origin @ axis)))
         distance = float(((drawn.meshes[0][0] - view.origin) @ view.axes[:, 2]).max())
         near = min(max(1e-3, NEAR_PER_SQUARE * distance**2), abs(distance) / 2)
-        shader.uniform_float("lens", (2 * view.scale / view.size, float(view.is_parallel), near, 0.0))
+        shader.uniform_float(
+            "lens", (2 * view.scale / view.size, float(view.is_parallel), near, 0.0)
+        )
         for mesh in drawn.meshes:
             key = id(mesh[0]), id(mesh[1])
             if key not in self._batches:
@@ -125,9 +144,11 @@ WIDTH_SHARE, MARGIN_PX = 0.15, 6.0
 
 
 def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
-    """(M, 2, 4) float32: for each bone two ends in pixels (x0, y0, x1, y1), and a radius beside three zeros.
+    """(M, 2, 4) float32: for each bone two ends in pixels (x0, y0, x1, y1), and a radius beside
+    three zeros.
 
-    space, region: the SpaceView3D and RegionView3D, drawn with width × height pixels, from the bottom left.
+    space, region: the SpaceView3D and RegionView3D, drawn with width × height pixels, from the
+    bottom left.
     """
     overlay = space.overlay
     if not (overlay.show_overlays and overlay.show_bones):
@@ -154,7 +175,8 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
 
 
 def _bone_ends(rig: Any) -> Iterator[tuple[Any, Any, float]]:
-    """Head, tail and half the width, in the world, of each visible bone; of one with a shape, a sphere around that."""
+    """Head, tail and half the width, in the world, of each visible bone; of one with a shape, a
+    sphere around that."""
     matrix = rig.matrix_world
     size = matrix.median_scale
     for bone in rig.pose.bones:
@@ -166,8 +188,14 @@ def _bone_ends(rig: Any) -> Iterator[tuple[Any, Any, float]]:
             continue
         owner = bone.custom_shape_transform or bone
         center = matrix @ owner.matrix @ bone.custom_shape_translation
-        reach = max(Vector(corner).length for corner in shape.bound_box) * max(map(abs, bone.custom_shape_scale_xyz))
-        yield center, center, size * reach * (bone.length if bone.use_custom_shape_bone_size else 1.0)
+        reach = max(Vector(corner).length for corner in shape.bound_box) * max(
+            map(abs, bone.custom_shape_scale_xyz)
+        )
+        yield (
+            center,
+            center,
+            size * reach * (bone.length if bone.use_custom_shape_bone_size else 1.0),
+        )
 
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
@@ -181,7 +209,8 @@ SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "basic render")
 
 
 def fastest_format() -> str:
-    """The format that a viewport is drawn in: half the traffic on a card, but software would convert each pixel."""
+    """The format that a viewport is drawn in: half the traffic on a card, but software would
+    convert each pixel."""
     name = gpu.platform.renderer_get().lower()
     return EXACT if any(software in name for software in SOFTWARE_RENDERERS) else COMPACT
 
@@ -210,8 +239,8 @@ class SplatRenderer:
     def draw(self, layers: Sequence[SceneLayer], view: View) -> None:
         """Draw layers, sorted together, to this renderer's own targets.
 
-        In two passes: the first projects and colors each splat, into a texel of the projected textures; the second
-        reads these and draws the splats from far to near.
+        In two passes: the first projects and colors each splat, into a texel of the projected
+        textures; the second reads these and draws the splats from far to near.
         """
         size = view.camera.width, view.camera.height
         if self._size != size:
@@ -231,7 +260,9 @@ class SplatRenderer:
         color, depth = _pixels(self._color, 4)[::-1], _pixels(self._depth, 2)[::-1]
         alpha = np.ascontiguousarray(color[..., 3])
         rgb = np.ascontiguousarray(color[..., :3].transpose(2, 0, 1))
-        return ComposedImage(rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None)
+        return ComposedImage(
+            rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None
+        )
 
     def composite(
         self,
@@ -243,13 +274,17 @@ class SplatRenderer:
         scene: Any = None,
         has_background: bool = False,
     ) -> None:
-        """Put what was drawn last into the active framebuffer, which blends linearly and has the scene's depth.
+        """Put what was drawn last into the active framebuffer, which blends linearly and has the
+        scene's depth.
 
-        corner: pixel of the framebuffer for the image's bottom left. to_depth (a, b, c, d): depth in −1…1 is
-        (a + b·z) / (c + d·z) at z meters along the view axis. behind: sRGB expected behind the splats, if known.
-        test_depth: whether objects in front hide splats; not where the framebuffer lacks the scene's depth.
-        bones: as of `front_bones`. Near them, splats are put into `scene`, the framebuffer that a viewport shows below
-        the active one. Of that, if it has drawn its background there (`has_background`), what they cover is taken out.
+        corner: pixel of the framebuffer for the image's bottom left. to_depth (a, b, c, d): depth
+        in −1…1 is (a + b·z) / (c + d·z) at z meters along the view axis. behind: sRGB expected
+        behind the splats, if known.
+        test_depth: whether objects in front hide splats; not where the framebuffer lacks the
+        scene's depth.
+        bones: as of `front_bones`. Near them, splats are put into `scene`, the framebuffer that a
+        viewport shows below the active one. Of that, if it has drawn its background there
+        (`has_background`), what they cover is taken out.
         """
         draw = partial(self._composite_part, corner, to_depth, test_depth)
         if scene is None or bones is None or not len(bones):
@@ -273,7 +308,8 @@ class SplatRenderer:
         gpu.state.blend_set("SUBTRACT" if part == BEHIND else "ALPHA_PREMULT")
         gpu.state.depth_mask_set(False)
         gpu.state.depth_test_set("LESS_EQUAL" if test_depth else "NONE")
-        shader, bone_image = self._composite_shader, _image(bones)  # a texture lives as long as its name
+        # a texture lives as long as its name
+        shader, bone_image = self._composite_shader, _image(bones)
         shader.bind()
         shader.uniform_sampler("color_image", self._color)
         shader.uniform_sampler("depth_image", self._depth)
@@ -289,7 +325,9 @@ class SplatRenderer:
     def _update_static(self, layers: Sequence[SceneLayer]) -> StaticSplats:
         if self._static is None or self._static.key != packing.static_key(layers):
             self._static = StaticSplats(layers)
-            self._static_textures = {name: texture(texels) for name, texels in self._static.texels.items()}
+            self._static_textures = {
+                name: texture(texels) for name, texels in self._static.texels.items()
+            }
             size = TEXTURE_WIDTH, texture_rows(len(self._static))
             self._projected = {name: GPUTexture(size, format=EXACT) for name in PROJECTED_TEXTURES}
             self._projected_target = GPUFrameBuffer(color_slots=tuple(self._projected.values()))
@@ -297,15 +335,19 @@ class SplatRenderer:
         return self._static
 
     def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
-        """Project and color the splats, farthest first, into the projected textures; returns how many there are."""
+        """Project and color the splats, farthest first, into the projected textures; returns how
+        many there are."""
         static = self._update_static(layers)
         # Blocks are computed again only for frames that are new.
         known = self._blocks
         self._blocks = {
-            id(layer.frames): known.get(id(layer.frames)) or (layer.frames, packing.frame_block(layer.frames))
+            id(layer.frames): known.get(id(layer.frames))
+            or (layer.frames, packing.frame_block(layer.frames))
             for layer in layers
         }
-        frames = packing.posed_frames(layers, [self._blocks[id(layer.frames)][1] for layer in layers], view)
+        frames = packing.posed_frames(
+            layers, [self._blocks[id(layer.frames)][1] for layer in layers], view
+        )
         order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0
@@ -336,7 +378,9 @@ class SplatRenderer:
         shader.bind()
         for name in PROJECTED_TEXTURES:
             shader.uniform_sampler(name, self._projected[name])
-        self._splat_rectangles.draw_instanced(shader, instance_start=0, instance_count=-(-count // BLOCK_SPLATS))
+        self._splat_rectangles.draw_instanced(
+            shader, instance_start=0, instance_count=-(-count // BLOCK_SPLATS)
+        )
         gpu.state.blend_set("NONE")
 
 
@@ -362,6 +406,7 @@ def _image(texels: np.ndarray) -> Any:
 def _pixels(texture: Any, channels: int) -> np.ndarray:
     """(H, W, channels) float32, bottom row first."""
     buffer = texture.read()
-    # Of several axes, a buffer tells numpy the wrong strides in some versions. The copy is made while it lives.
+    # Of several axes, a buffer tells numpy the wrong strides in some versions. The copy is made
+    # while it lives.
     buffer.dimensions = (texture.height * texture.width * channels,)
     return np.array(buffer, np.float32).reshape(texture.height, texture.width, channels)

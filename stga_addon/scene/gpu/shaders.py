@@ -1,25 +1,30 @@
-"""GLSL that projects, lights and draws splats and puts them into a viewport; shaders made of it, and textures.
+"""GLSL that projects, lights and draws splats and puts them into a viewport; shaders made of it,
+and textures.
 
 Textures of `packing.py`, each 2048 texels wide and read by texel index:
     orders   per splat drawn, farthest first: index of the splat (one channel)
     centers  per splat: xyz in its triangle's frame, index of the triangle
-    axes     per splat: three axes times standard deviations; beside them opacity, random percentage, layer
+    axes     per splat: three axes times standard deviations; beside them opacity, random
+             percentage, layer
     colors   per splat: spherical harmonics, then strain colors
-    frames   three rows of the triangles' maps to camera space (all triangles' first rows, then second, …), then strain
-    table    the view: focal lengths and principal point; width, height, number of clip planes; 6 clip planes;
-             per layer: first color, first splat, colors per splat, degree; antialiased, strained, size, opacity
-             threshold; three rows of the matrix to directions, with percentage, show selection, selected only
+    frames   three rows of the triangles' maps to camera space (all triangles' first rows, then
+             second, …), then strain
+    table    the view: focal lengths and principal point; width, height, number of clip planes; 6
+             clip planes; per layer: first color, first splat, colors per splat, degree;
+             antialiased, strained, size, opacity threshold; three rows of the matrix to directions,
+             with percentage, show selection, selected only
 Where the scene lights splats, as `light.relight.Relighter` does:
-    surface   per splat: recorded sRGB without what depends on the view, roughness; irradiance of the capture,
-              occlusion; corners of its triangle; their weights
+    surface   per splat: recorded sRGB without what depends on the view, roughness; irradiance of
+              the capture, occlusion; corners of its triangle; their weights
     vertices  per vertex: position; normal; irradiance of the world and of skin around
     lights    per layer RELIT_TEXELS; rows of `light.lamps.light_rows`; shadow maps
     shadows   depth of all shadow maps, MAP_COLUMNS beside each other
 
-From these, a first pass computes what is drawn of each splat, once for the four corners of its rectangle; a second
-pass draws the rectangles. In between are textures as wide, in the order of drawing:
-    places   center in normalized device coordinates, depth in meters, standard deviations up to the rectangle's sides
-             (0: the splat is not drawn)
+From these, a first pass computes what is drawn of each splat, once for the four corners of its
+rectangle; a second pass draws the rectangles. In between are textures as wide, in the order of
+drawing:
+    places   center in normalized device coordinates, depth in meters, standard deviations up to the
+             rectangle's sides (0: the splat is not drawn)
     sides    the rectangle's two half axes in normalized device coordinates
     shades   color in sRGB, opacity
 """
@@ -187,8 +192,8 @@ void main()
 def shadow_map_shader() -> Any:
     """Draws triangles into a shadow map: depth in meters along the light's axis.
 
-    row_x, row_y, row_z: as packed by `packing`; lens: scale to normalized device coordinates, whether parallel,
-    least depth in perspective.
+    row_x, row_y, row_z: as packed by `packing`; lens: scale to normalized device coordinates,
+    whether parallel, least depth in perspective.
     """
     info = GPUShaderCreateInfo()
     info.vertex_in(0, "VEC3", "position")
@@ -205,13 +210,16 @@ def shadow_map_shader() -> Any:
 
 
 MIN_ALPHA = 1 / 255
-"""A splat adds nothing to a pixel where its alpha is less, as in the rasterizer; a pixel with less shows nothing."""
+"""A splat adds nothing to a pixel where its alpha is less, as in the rasterizer; a pixel with less
+shows nothing."""
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
 BLOCK_SPLATS = 128
-"""Splats drawn by one instance: GPUs, and software even more, are slow at instances of four vertices.
+"""Splats drawn by one instance: GPUs, and software even more, are slow at instances of four
+vertices.
 
-A divisor of TEXTURE_WIDTH: the last instance then reads no further than the projected textures' last row."""
+A divisor of TEXTURE_WIDTH: the last instance then reads no further than the projected textures'
+last row."""
 
 _DEFINES = f"""
 #define WIDTH {TEXTURE_WIDTH}
@@ -397,7 +405,8 @@ void main()
 
 
 def projection_shader(relit: bool = False) -> Any:
-    """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`; others become 0.
+    """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`;
+    others become 0.
 
     relit: for layers of which at least one is lit by the scene, with RELIT_TEXTURES.
     """
@@ -411,12 +420,15 @@ def projection_shader(relit: bool = False) -> Any:
     for name in ("faces", "count"):
         info.push_constant("INT", name)
     info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(_TEXEL_FUNCTION + _HARMONICS + (RELIT_FUNCTIONS if relit else "") + _PROJECTION_FRAGMENT)
+    info.fragment_source(
+        _TEXEL_FUNCTION + _HARMONICS + (RELIT_FUNCTIONS if relit else "") + _PROJECTION_FRAGMENT
+    )
     return gpu.shader.create_from_info(info)
 
 
 def splat_shader() -> Any:
-    """Second pass: draws PROJECTED_TEXTURES, a rectangle for each splat, in instances of BLOCK_SPLATS of them.
+    """Second pass: draws PROJECTED_TEXTURES, a rectangle for each splat, in instances of
+    BLOCK_SPLATS of them.
 
     Two color targets: sRGB premultiplied, and (depth · alpha, alpha).
     """
@@ -438,10 +450,11 @@ def splat_shader() -> Any:
 
 
 def composite_shader() -> Any:
-    """Puts the two targets of `splat_shader` into a viewport, with depth; outputs display-linear, premultiplied.
+    """Puts the two targets of `splat_shader` into a viewport, with depth; outputs display-linear,
+    premultiplied.
 
-    part.x: 0 all that is not near a bone; 1 what is; 2 what is, as the light of `behind` that it covers. part.y: how
-    many bones; bones: for each, two texels as `front_bones` returns them.
+    part.x: 0 all that is not near a bone; 1 what is; 2 what is, as the light of `behind` that it
+    covers. part.y: how many bones; bones: for each, two texels as `front_bones` returns them.
     """
     info = GPUShaderCreateInfo()
     info.typedef_source(_DEFINES)

@@ -53,17 +53,22 @@ def light_of(light: Any, matrix: Any) -> Light | None:
     if found.kind == "area":
         area = found.size[0] * found.size[1] * (np.pi / 4 if found.shape == "ellipse" else 1.0)
     else:
-        area = float(np.pi * (np.tan(found.angle / 2) if found.kind == "sun" else found.radius) ** 2)
+        area = float(
+            np.pi * (np.tan(found.angle / 2) if found.kind == "sun" else found.radius) ** 2
+        )
     return replace(found, color=color * area)
 
 
 def in_avatar_space(light: Light, to_world: np.ndarray) -> Light:
-    """The light in the space that `to_world` (4, 4) takes to the world; what arrives at a surface stays the same."""
+    """The light in the space that `to_world` (4, 4) takes to the world; what arrives at a surface
+    stays the same."""
     to_avatar = np.linalg.inv(to_world)
     found = light.transformed(to_avatar)
     if light.kind == "sun":
         return found
-    return replace(found, color=found.color * float(np.cbrt(abs(np.linalg.det(to_avatar[:3, :3])))) ** 2)
+    return replace(
+        found, color=found.color * float(np.cbrt(abs(np.linalg.det(to_avatar[:3, :3])))) ** 2
+    )
 
 
 def is_linked(light_object: Any, receivers: tuple[Any, ...]) -> bool:
@@ -104,7 +109,8 @@ def _node_factor(light: Any) -> np.ndarray:
 class WorldLight(NamedTuple):
     """What a world's light depends on; equal where its light is.
 
-    color: scene-linear, with strength; of a texture, what its pixels are multiplied with. image: the texture's image.
+    color: scene-linear, with strength; of a texture, what its pixels are multiplied with. image:
+    the texture's image.
     rotation (9,): row by row, from directions of the world to those of the texture.
     """
 
@@ -114,7 +120,8 @@ class WorldLight(NamedTuple):
 
 
 def world_light(world: Any) -> WorldLight | None:
-    """The light of a world: one color, or an environment texture on its Background node; None for any other nodes."""
+    """The light of a world: one color, or an environment texture on its Background node; None for
+    any other nodes."""
     if world is None:
         return WorldLight((0.0, 0.0, 0.0))
     tree = world_nodes(world)
@@ -131,14 +138,23 @@ def world_light(world: Any) -> WorldLight | None:
     if not color.is_linked:
         return WorldLight(tuple(channel * strength for channel in color.default_value[:3]))
     texture = color.links[0].from_node
-    if texture.type != "TEX_ENVIRONMENT" or texture.projection != "EQUIRECTANGULAR" or texture.image is None:
+    if (
+        texture.type != "TEX_ENVIRONMENT"
+        or texture.projection != "EQUIRECTANGULAR"
+        or texture.image is None
+    ):
         return None
     rotation = _rotation(texture.inputs["Vector"])
-    return None if rotation is None else WorldLight((strength,) * 3, texture.image, tuple(rotation.ravel().tolist()))
+    return (
+        None
+        if rotation is None
+        else WorldLight((strength,) * 3, texture.image, tuple(rotation.ravel().tolist()))
+    )
 
 
 def split_world(light: WorldLight) -> tuple[np.ndarray, tuple[Light, ...]]:
-    """Harmonics (9, 3) of `WorldLight`, and its suns, both in the world's axes; reads the image's pixels."""
+    """Harmonics (9, 3) of `WorldLight`, and its suns, both in the world's axes; reads the image's
+    pixels."""
     if light.image is None:
         return uniform(light.color), ()
     radiance = image_pixels(light.image)[::-1] * np.array(light.color)
@@ -153,7 +169,11 @@ def image_pixels(image: Any) -> np.ndarray:
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)
     pixels = pixels.reshape(height, width, image.channels)[..., :3]
-    return pixels if image.is_float or image.colorspace_settings.name != "sRGB" else srgb_to_linear(pixels)
+    return (
+        pixels
+        if image.is_float or image.colorspace_settings.name != "sRGB"
+        else srgb_to_linear(pixels)
+    )
 
 
 def _rotation(vector: Any) -> np.ndarray | None:

@@ -34,9 +34,11 @@ class SceneLight:
         self, splat_object: Any, head: Any, avatar: Avatar, vertices: np.ndarray, to_world: np.ndarray,
         visible: Sequence[tuple[Any, Any]], depsgraph: Any,
     ) -> Relit | None:  # fmt: skip
-        """How the scene lights an avatar whose head has vertices (V, 3); None where its colors are as recorded.
+        """How the scene lights an avatar whose head has vertices (V, 3); None where its colors are
+        as recorded.
 
-        The same object as long as all is the same, `vertices` by identity. to_world (4, 4): from the avatar's space.
+        The same object as long as all is the same, `vertices` by identity. to_world (4, 4): from
+        the avatar's space.
         """
         settings = current_settings(depsgraph)
         if avatar.light is None or settings is None or settings.mode == "recorded":
@@ -47,7 +49,10 @@ class SceneLight:
         relighter = self._relighters.get(uid)
         if relighter is None or relighter.avatar is not avatar:
             relighter = self._relighters[uid] = Relighter(avatar)
-        key, place = (_key(lighting), id(relighter), id(vertices), id(casters)), (uid, to_world.tobytes())
+        key, place = (
+            (_key(lighting), id(relighter), id(vertices), id(casters)),
+            (uid, to_world.tobytes()),
+        )
         known = self._relit.get(place)
         if known is None or known[0] != key:
             if len(self._relit) > MAX_KEPT:  # objects that move leave an entry at each place
@@ -59,13 +64,18 @@ class SceneLight:
         self, settings: Any, receivers: tuple[Any, ...], to_world: np.ndarray, visible: Sequence[tuple[Any, Any]],
         depsgraph: Any,
     ) -> Lighting:  # fmt: skip
-        """The scene's light in the space that `to_world` (4, 4) takes to the world, for objects `receivers`."""
+        """The scene's light in the space that `to_world` (4, 4) takes to the world, for objects
+        `receivers`."""
         chosen = lighting_settings(depsgraph.scene).lights
         lights = []
         for each, matrix in visible:
             if each.type != "LIGHT" or (chosen is not None and each.name not in chosen.all_objects):
                 continue
-            light = light_of(each.evaluated_get(depsgraph).data, matrix) if is_linked(each, receivers) else None
+            light = (
+                light_of(each.evaluated_get(depsgraph).data, matrix)
+                if is_linked(each, receivers)
+                else None
+            )
             if light is not None:
                 lights.append(in_avatar_space(light, to_world))
         white = np.maximum(np.array(settings.white, np.float64), 1e-3)
@@ -79,8 +89,8 @@ class SceneLight:
         )
 
     def _world(self, depsgraph: Any, to_world: np.ndarray) -> tuple[np.ndarray, tuple[Light, ...]]:
-        """Harmonics (9, 3) and suns in the space that `to_world` takes to the world; black where the world's nodes are
-        not understood."""
+        """Harmonics (9, 3) and suns in the space that `to_world` takes to the world; black where
+        the world's nodes are not understood."""
         light = world_light(depsgraph.scene_eval.world)
         if light is None:
             return no_world(), ()
@@ -120,8 +130,8 @@ class Casters:
     def of(
         self, head: Any, to_world: np.ndarray, visible: Iterable[tuple[Any, Any]], depsgraph: Any
     ) -> tuple[Caster, ...]:
-        """Those that throw shadows onto `head`, in the space that `to_world` (4, 4) takes to the world; the same
-        objects until the scene changes.
+        """Those that throw shadows onto `head`, in the space that `to_world` (4, 4) takes to the
+        world; the same objects until the scene changes.
 
         visible: objects and their matrices, as of `visible_objects`.
         """
@@ -130,7 +140,9 @@ class Casters:
         key = head, to_world.tobytes()
         if key not in self._placed:
             to_avatar = np.linalg.inv(to_world)
-            self._placed[key] = tuple(_moved(caster, to_avatar) for owner, caster in self._read if owner != head)
+            self._placed[key] = tuple(
+                _moved(caster, to_avatar) for owner, caster in self._read if owner != head
+            )
         return self._placed[key]
 
 
@@ -143,7 +155,8 @@ def _casters(visible: Iterable[tuple[Any, Any]], depsgraph: Any) -> Iterable[tup
             if head is not None and head not in heads:
                 heads.add(head)
                 local = head.evaluated_get(depsgraph).matrix_world
-                placed = each.evaluated_get(depsgraph).matrix_world  # instances move splats and head together
+                # instances move splats and head together
+                placed = each.evaluated_get(depsgraph).matrix_world
                 yield head, _read(head, matrix @ placed.inverted_safe() @ local, depsgraph)
         elif each.type == "MESH" and each.visible_shadow and each.get(tags.KIND) != tags.HEAD:
             yield each, _read(each, matrix, depsgraph)
@@ -153,7 +166,9 @@ def _read(owner: Any, matrix: Any, depsgraph: Any) -> Caster:
     mesh = owner.evaluated_get(depsgraph).data
     mesh.calc_loop_triangles()
     faces = read_values(mesh.loop_triangles, "vertices", 3, np.int32)
-    return _moved(Caster(mesh_vertices(mesh).astype(np.float64), faces), np.array(matrix, np.float64))
+    return _moved(
+        Caster(mesh_vertices(mesh).astype(np.float64), faces), np.array(matrix, np.float64)
+    )
 
 
 def _moved(caster: Caster, matrix: np.ndarray) -> Caster:
@@ -165,13 +180,20 @@ HIDDEN_RAYS = ("camera", "diffuse", "glossy", "transmission", "volume_scatter")
 
 
 def throws_shadow(splat_object: Any) -> bool:
-    """Whether the head of a splat object is set up to throw its shadow, and nothing else, in images."""
+    """Whether the head of a splat object is set up to throw its shadow, and nothing else, in
+    images."""
     head = get_input(splat_object, splat_nodes.HEAD)
-    return head is not None and not head.hide_render and not head.visible_camera and bool(head.visible_shadow)
+    return (
+        head is not None
+        and not head.hide_render
+        and not head.visible_camera
+        and bool(head.visible_shadow)
+    )
 
 
 def throw_shadow(splat_object: Any, is_on: bool) -> None:
-    """Let the head's mesh throw its shadow onto the scene without being seen, or hide it from images again."""
+    """Let the head's mesh throw its shadow onto the scene without being seen, or hide it from
+    images again."""
     head = get_input(splat_object, splat_nodes.HEAD)
     head.hide_render = not is_on
     head.visible_shadow = True

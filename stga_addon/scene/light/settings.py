@@ -24,7 +24,12 @@ class LightingSettings(bpy.types.PropertyGroup):  # type: ignore[misc]
         ),
     )
     mix: bpy.props.FloatProperty(
-        name="Mix", description="Share of the scene's light", default=0.5, min=0.0, max=1.0, subtype="FACTOR"
+        name="Mix",
+        description="Share of the scene's light",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
     )
     exposure: bpy.props.FloatProperty(
         name="Exposure",
@@ -43,15 +48,27 @@ class LightingSettings(bpy.types.PropertyGroup):  # type: ignore[misc]
         max=1.0,
     )
     roughness: bpy.props.FloatProperty(
-        name="Roughness", description="Of highlights on skin", default=SKIN_ROUGHNESS, min=0.05, max=1.0
+        name="Roughness",
+        description="Of highlights on skin",
+        default=SKIN_ROUGHNESS,
+        min=0.05,
+        max=1.0,
     )
     specular: bpy.props.FloatProperty(
-        name="Highlights", description="Factor of highlights; 0: none", default=1.0, min=0.0, soft_max=2.0
+        name="Highlights",
+        description="Factor of highlights; 0: none",
+        default=1.0,
+        min=0.0,
+        soft_max=2.0,
     )
     shadows: bpy.props.BoolProperty(
-        name="Shadows", description="Lights are blocked by the head and by other objects", default=True
+        name="Shadows",
+        description="Lights are blocked by the head and by other objects",
+        default=True,
     )
-    world: bpy.props.BoolProperty(name="World", description="The scene's world lights avatars, too", default=True)
+    world: bpy.props.BoolProperty(
+        name="World", description="The scene's world lights avatars, too", default=True
+    )
     lights: bpy.props.PointerProperty(
         name="Lights",
         description="Only the lights of this collection light avatars; empty: all",
@@ -69,7 +86,9 @@ def current_settings(depsgraph: Any) -> Any:
 
     Those of a viewport are in the scene itself: a change of them does not evaluate it anew.
     """
-    return lighting_settings(depsgraph.scene if depsgraph.mode == "VIEWPORT" else depsgraph.scene_eval)
+    return lighting_settings(
+        depsgraph.scene if depsgraph.mode == "VIEWPORT" else depsgraph.scene_eval
+    )
 
 
 def settings_values(scene: Any) -> tuple[Any, ...]:
@@ -78,7 +97,11 @@ def settings_values(scene: Any) -> tuple[Any, ...]:
     if settings is None:
         return ()
     names = LightingSettings.__annotations__
-    return tuple(tuple(value) if name == "white" else value for name in names for value in [getattr(settings, name)])
+    return tuple(
+        tuple(value) if name == "white" else value
+        for name in names
+        for value in [getattr(settings, name)]
+    )
 
 
 def register() -> None:

@@ -1,4 +1,5 @@
-"""A video drawn by Blender's GPU and encoded by Blender's FFmpeg: where no Python here has the rasterizer."""
+"""A video drawn by Blender's GPU and encoded by Blender's FFmpeg: where no Python here has the
+rasterizer."""
 
 import shutil
 import struct
@@ -24,7 +25,9 @@ class DrawnVideo:
     background: sRGB in 0…1; None: transparent in PNGs, black in a video.
     """
 
-    def __init__(self, folder: Path, output: Path, background: tuple[float, float, float] | None) -> None:
+    def __init__(
+        self, folder: Path, output: Path, background: tuple[float, float, float] | None
+    ) -> None:
         self._folder, self._output, self._background = folder, output, background
         self._images: list[Path] = []
 
@@ -32,10 +35,14 @@ class DrawnVideo:
         """Draw an image. Raises StgaError where the GPU cannot, or the disk is full."""
         image = draw_image(list(layers), camera)
         if image is None:
-            raise StgaError("The video cannot be drawn: this Blender has no GPU context, or not the memory")
+            raise StgaError(
+                "The video cannot be drawn: this Blender has no GPU context, or not the memory"
+            )
         path = self._folder / f"{len(self._images) + 1:04d}.png"
         with replacing(path) as partial:
-            partial.write_bytes(png_bytes(finished(image, self._background, is_video(self._output))))
+            partial.write_bytes(
+                png_bytes(finished(image, self._background, is_video(self._output)))
+            )
         self._images.append(path)
 
     def encode(self, fps: float) -> None:
@@ -50,20 +57,28 @@ class DrawnVideo:
 
 
 def png_bytes(pixels: np.ndarray) -> bytes:
-    """A PNG of (H, W, 3 or 4) uint8 sRGB, as the PNG specification (ISO/IEC 15948) lays it out; no pillow is needed."""
+    """A PNG of (H, W, 3 or 4) uint8 sRGB, as the PNG specification (ISO/IEC 15948) lays it out; no
+    pillow is needed."""
     height, width, channels = pixels.shape
     rows = np.zeros((height, 1 + width * channels), np.uint8)  # the filter of each row: none
     rows[:, 1:] = pixels.reshape(height, -1)
     header = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
+    chunks = (
+        (b"IHDR", header),
+        (b"sRGB", b"\0"),
+        (b"IDAT", zlib.compress(rows.tobytes(), 6)),
+        (b"IEND", b""),
+    )
     packed = (
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
     )
     return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
 def _encode(images: Sequence[Path], fps: float) -> Path:
-    """Encode with the sequencer of a scene of its own, which is removed; returns the file beside the images."""
+    """Encode with the sequencer of a scene of its own, which is removed; returns the file beside
+    the images."""
     size = bpy.data.images.load(str(images[0]))
     width, height = size.size
     bpy.data.images.remove(size)
@@ -75,7 +90,8 @@ def _encode(images: Sequence[Path], fps: float) -> Path:
             strip.elements.append(image.name)
         scene.frame_start, scene.frame_end = 1, len(images)
         render = scene.render
-        render.resolution_x, render.resolution_y = width + width % 2, height + height % 2  # even, as the format needs
+        # even, as the format needs
+        render.resolution_x, render.resolution_y = width + width % 2, height + height % 2
         render.resolution_percentage = 100
         render.fps = max(round(fps), 1)
         render.fps_base = render.fps / fps

@@ -1,7 +1,9 @@
-"""The render engine "STGA Splats": final images, animations and viewports that show splats exactly as trained.
+"""The render engine "STGA Splats": final images, animations and viewports that show splats exactly
+as trained.
 
-The GPU draws them, or, where it cannot, the training rasterizer. It renders splats and nothing else; meshes are
-composited by its alpha and depth. Registering it imports no rasterizer: that happens with the first image.
+The GPU draws them, or, where it cannot, the training rasterizer. It renders splats and nothing
+else; meshes are composited by its alpha and depth. Registering it imports no rasterizer: that
+happens with the first image.
 """
 
 import logging
@@ -28,9 +30,7 @@ from .view_transform import combined, inverse_view, measure, needs_inverse, scen
 from .viewport_display import ENGINE
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
-VIEW_TRANSFORM_UNKNOWN = (
-    "The view transform could not be measured in time and changes the splats' colors; render again, or choose Standard"
-)
+VIEW_TRANSFORM_UNKNOWN = "The view transform could not be measured in time and changes the splats' colors; render again, or choose Standard"
 
 _rasterizer = Rasterizer(lambda: "", lambda: "auto")
 
@@ -44,7 +44,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_use_eevee_viewport = True  # Material Preview stays EEVEE's
     bl_use_gpu_context = has_gpu_context()
 
-    # No __init__: its signature differs between Blender's versions. Created when a viewport is first drawn.
+    # No __init__: its signature differs between Blender's versions. Created when a viewport is
+    # first drawn.
     _viewport: EngineViewport | None = None
 
     def update_render_passes(self, scene: Any = None, renderlayer: Any = None) -> None:
@@ -58,9 +59,13 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             passes = self._render(depsgraph)
         except StgaError as error:
             passes, message = {}, str(error)
-        except Exception as error:  # raised here, it would not stop Blender from saving an image without passes
+        # raised here, it would not stop Blender from saving an image without passes
+        except Exception as error:
             traceback.print_exc()
-            passes, message = {}, f"Unexpected error ({type(error).__name__}: {error}); see the console"
+            passes, message = (
+                {},
+                f"Unexpected error ({type(error).__name__}: {error}); see the console",
+            )
         self._write_result(depsgraph, passes)
         if message:
             self.report({"ERROR"}, message)  # raised in scripts; nothing is saved
@@ -127,7 +132,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
 
 def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None:
-    """A final image drawn by the GPU; None where this Blender has no GPU context, or not the memory."""
+    """A final image drawn by the GPU; None where this Blender has no GPU context, or not the
+    memory."""
     if not has_gpu_context():
         return None
     try:
@@ -135,28 +141,40 @@ def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None
         renderer.draw(layers, View(camera))
         return renderer.read(with_depth=True)
     except Exception as error:  # of many kinds, by device and version
-        logging.getLogger(__name__).info("GPU rendering is not available (%s); the rasterizer renders", error)
+        logging.getLogger(__name__).info(
+            "GPU rendering is not available (%s); the rasterizer renders", error
+        )
         return None
 
 
 def _border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
-    """x, y, width and height in pixels of the render region, from the bottom left, rounded as Blender does."""
+    """x, y, width and height in pixels of the render region, from the bottom left, rounded as
+    Blender does."""
     if not render.use_border:
         return 0, 0, width, height
-    left, right = (int(np.float32(edge) * np.float32(width)) for edge in (render.border_min_x, render.border_max_x))
-    low, high = (int(np.float32(edge) * np.float32(height)) for edge in (render.border_min_y, render.border_max_y))
+    left, right = (
+        int(np.float32(edge) * np.float32(width))
+        for edge in (render.border_min_x, render.border_max_x)
+    )
+    low, high = (
+        int(np.float32(edge) * np.float32(height))
+        for edge in (render.border_min_y, render.border_max_y)
+    )
     return left, low, right - left, high - low
 
 
 @persistent
 def _before_render(*_: Any) -> None:
-    """Measure the view transforms of all scenes that a render may ask this engine for; a compositor may ask for any."""
+    """Measure the view transforms of all scenes that a render may ask this engine for; a compositor
+    may ask for any."""
     for scene in list(bpy.data.scenes):
         if scene.render.engine == ENGINE:
             measure(scene)
 
 
-def register(find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto") -> None:
+def register(
+    find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto"
+) -> None:
     """find_python, find_device: as in `Rasterizer`."""
     global _rasterizer
     _rasterizer = Rasterizer(find_python, find_device)

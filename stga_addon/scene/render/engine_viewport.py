@@ -1,4 +1,5 @@
-"""A viewport of the render engine: drawn by the GPU, or, where that fails, images of the rasterizer from a thread."""
+"""A viewport of the render engine: drawn by the GPU, or, where that fails, images of the rasterizer
+from a thread."""
 
 import threading
 import time
@@ -36,7 +37,8 @@ MIN_SCALE = 1 / 8
 class RenderRequest:
     """What one viewport image shows.
 
-    layers: the scene's splats; camera: at the viewport's full size; background: scene-linear RGB, None if transparent.
+    layers: the scene's splats; camera: at the viewport's full size; background: scene-linear RGB,
+    None if transparent.
     """
 
     layers: Sequence[PosedSplats]
@@ -51,10 +53,11 @@ class RenderRequest:
 
 
 class ViewportRenderer:
-    """Renders the latest request in a thread, which ends once that request has its full-resolution image.
+    """Renders the latest request in a thread, which ends once that request has its full-resolution
+    image.
 
-    render: (request, scale) -> image (H, W, 4) float32, scale being a fraction of the camera's size.
-    The thread touches nothing of Blender; the main thread polls `is_busy` and `take_update`.
+    render: (request, scale) -> image (H, W, 4) float32, scale being a fraction of the camera's
+    size. The thread touches nothing of Blender; the main thread polls `is_busy` and `take_update`.
 
     image  the last image rendered, or None
     error  why the last request failed, else empty
@@ -71,7 +74,8 @@ class ViewportRenderer:
         self.error = ""
 
     def request(self, request: RenderRequest) -> bool:
-        """Render this next, instead of what was requested before; returns False if it is the same."""
+        """Render this next, instead of what was requested before; returns False if it is the
+        same."""
         with self._lock:
             if self._request is not None and request.key() == self._request.key():
                 return False
@@ -111,7 +115,8 @@ class ViewportRenderer:
                 self.image, self.error = self._render(request, scale), ""
             except StgaError as error:
                 self.error, scale = str(error), 1.0
-            except Exception as error:  # shown in the viewport: an exception would end the thread unseen
+            # shown in the viewport: an exception would end the thread unseen
+            except Exception as error:
                 self.error, scale = f"{type(error).__name__}: {error}", 1.0
             elapsed_s = time.perf_counter() - begin
             if scale < 1 or elapsed_s < MAX_RENDER_TIME_S:
@@ -120,8 +125,11 @@ class ViewportRenderer:
             with self._lock:
                 self._has_update = True
 
-    def _next_step(self, last: RenderRequest | None, scale: float) -> tuple[RenderRequest, float] | None:
-        """The request to render now and its scale; None ends the thread. last, scale: the image just rendered."""
+    def _next_step(
+        self, last: RenderRequest | None, scale: float
+    ) -> tuple[RenderRequest, float] | None:
+        """The request to render now and its scale; None ends the thread. last, scale: the image
+        just rendered."""
         with self._lock:
             latest = self._request
             if latest is None or (latest is last and scale == 1):
@@ -154,7 +162,8 @@ class ViewportImage:
 POLL_INTERVAL_S = 1 / 60
 
 _active: dict[ViewportRenderer, "ref[Any]"] = {}
-"""Renderers whose threads run, and the engines of their viewports; Blender frees an engine with its viewport."""
+"""Renderers whose threads run, and the engines of their viewports; Blender frees an engine with its
+viewport."""
 
 
 def redraw_when_rendered(renderer: ViewportRenderer, engine: Any) -> None:
@@ -176,9 +185,11 @@ def stop_redraws() -> None:
 
 
 def _poll() -> float | None:
-    """Redraw what has changed; returns the seconds until the next call, None once every thread has ended."""
+    """Redraw what has changed; returns the seconds until the next call, None once every thread has
+    ended."""
     for renderer in list(_active):
-        is_busy = renderer.is_busy()  # before the update is taken, so that the last one is not missed
+        # before the update is taken, so that the last one is not missed
+        is_busy = renderer.is_busy()
         if not _redraw(renderer):
             renderer.cancel()
             del _active[renderer]
@@ -188,7 +199,8 @@ def _poll() -> float | None:
 
 
 def _redraw(renderer: ViewportRenderer) -> bool:
-    """Redraw the renderer's viewport if there is something new; False where the viewport was closed."""
+    """Redraw the renderer's viewport if there is something new; False where the viewport was
+    closed."""
     engine = _active[renderer]()
     if engine is None:
         return False
@@ -203,7 +215,8 @@ def _redraw(renderer: ViewportRenderer) -> bool:
 class Rasterizer:
     """A render client whose Python and device the main thread looks up, for render threads.
 
-    find_python   the interpreter that renders where Blender's own cannot; raises StgaError where there is none
+    find_python   the interpreter that renders where Blender's own cannot; raises StgaError where
+                  there is none
     find_device   the device, as `render.device.Composer` takes it
     """
 
@@ -249,11 +262,16 @@ class EngineViewport:
         self._lighting: tuple[Any, ...] = ()
 
     def update(self, depsgraph: Any) -> None:
-        """The scene has changed: pose the splats again, and read meshes again that were edited themselves."""
+        """The scene has changed: pose the splats again, and read meshes again that were edited
+        themselves."""
         self._layers = None
         self._cache.light.casters.forget()
         self._cache.discard(
-            {update.id.original for update in depsgraph.updates if isinstance(update.id, bpy.types.Mesh)}
+            {
+                update.id.original
+                for update in depsgraph.updates
+                if isinstance(update.id, bpy.types.Mesh)
+            }
         )
 
     def draw(self, context: Any, depsgraph: Any) -> bool:
@@ -276,12 +294,19 @@ class EngineViewport:
         camera = viewport_camera(context.region_data, region.width, region.height)
         # Posed again for another camera where highlights depend on it.
         assert self._layers is not None
-        seen_from = camera.position.tobytes() if any(layer.relit for layer in self._layers) else b"anywhere"
+        seen_from = (
+            camera.position.tobytes() if any(layer.relit for layer in self._layers) else b"anywhere"
+        )
         if seen_from != self._posed_for:
-            self._posed, self._posed_for = [layer.posed(camera.position) for layer in self._layers], seen_from
+            self._posed, self._posed_for = (
+                [layer.posed(camera.position) for layer in self._layers],
+                seen_from,
+            )
         if not self.renderer.is_busy():
             self._rasterizer.update()
-        return self.renderer.request(RenderRequest(self._posed, camera, scene_background(depsgraph.scene)))
+        return self.renderer.request(
+            RenderRequest(self._posed, camera, scene_background(depsgraph.scene))
+        )
 
     def _update_layers(self, context: Any, depsgraph: Any) -> bool:
         """Read the scene if it has changed; returns False, and sets `error`, where that fails."""
@@ -300,7 +325,11 @@ class EngineViewport:
         color = scene_background(depsgraph.scene)
         if color is not None:
             gpu.state.active_framebuffer_get().clear(color=(*color, 1.0))
-        if not is_drawn_by_engine(context) or not self._update_layers(context, depsgraph) or not self._layers:
+        if (
+            not is_drawn_by_engine(context)
+            or not self._update_layers(context, depsgraph)
+            or not self._layers
+        ):
             return
         self._gpu = self._gpu or SplatRenderer()
         x, y, width, height = gpu.state.viewport_get()
@@ -310,6 +339,7 @@ class EngineViewport:
 
 
 def _render_request(client: RenderClient, request: RenderRequest, scale: float) -> np.ndarray:
-    """(H, W, 4) float32 scene-linear RGBA, bottom row first; runs in the viewport's render thread."""
+    """(H, W, 4) float32 scene-linear RGBA, bottom row first; runs in the viewport's render
+    thread."""
     image = client.compose(request.layers, request.camera.scaled(scale))
     return np.ascontiguousarray(combined(image.rgb, image.alpha, request.background)[::-1])

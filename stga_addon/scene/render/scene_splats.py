@@ -1,4 +1,5 @@
-"""The splats of a scene's visible objects, posed at its frame, and their relit colors stored for EEVEE and Cycles."""
+"""The splats of a scene's visible objects, posed at its frame, and their relit colors stored for
+EEVEE and Cycles."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -15,7 +16,13 @@ from .. import tags
 from ..arrays import flat_floats, mesh_vertices
 from ..display import splat_nodes
 from ..display.splat_attributes import RELIT_COLOR, read_splats, write_attributes
-from ..display.splat_object import display_settings, get_input, splat_modifier, stored_avatar, stored_light
+from ..display.splat_object import (
+    display_settings,
+    get_input,
+    splat_modifier,
+    stored_avatar,
+    stored_light,
+)
 from ..layers import SceneLayer
 from ..light.scene_light import SceneLight
 from ..light.settings import lighting_settings
@@ -23,10 +30,12 @@ from ..vertex_groups import frame_selection
 
 
 class SplatCache:
-    """Avatars and world splats as last read from Blender's meshes, and avatars' frames on their heads' last shapes.
+    """Avatars and world splats as last read from Blender's meshes, and avatars' frames on their
+    heads' last shapes.
 
-    Reading attributes takes longer than posing splats, and an animated head does not change them. `write_splats` gives
-    a mesh a new revision, so that neither undo nor a loaded file brings up what another state of the mesh held.
+    Reading attributes takes longer than posing splats, and an animated head does not change them.
+    `write_splats` gives a mesh a new revision, so that neither undo nor a loaded file brings up
+    what another state of the mesh held.
 
     light  of the scene, as last read
     """
@@ -51,7 +60,9 @@ class SplatCache:
             self._stored[key] = stored
         return self._stored[key]
 
-    def frames(self, splat_object: Any, avatar: Avatar, vertices: np.ndarray) -> tuple[np.ndarray, FaceFrames]:
+    def frames(
+        self, splat_object: Any, avatar: Avatar, vertices: np.ndarray
+    ) -> tuple[np.ndarray, FaceFrames]:
         """The avatar's frames on a head of this shape (V, 3), and the shape as first given."""
         key = (*_key(splat_object.data), splat_object.session_uid)
         known = self._frames.get(key)
@@ -69,17 +80,25 @@ def _key(mesh: Any) -> tuple[Any, ...]:
 
 
 def visible_layers(
-    depsgraph: Any, cache: SplatCache, view: Any = None, is_wanted: Callable[[Any], bool] = lambda splat_object: True
+    depsgraph: Any,
+    cache: SplatCache,
+    view: Any = None,
+    is_wanted: Callable[[Any], bool] = lambda splat_object: True,
 ) -> list[SceneLayer]:
     """The splats of each visible object at the depsgraph's frame.
 
-    view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects.
-    Raises StgaError where the head of an object is gone or has other triangles than its splats.
+    view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among
+    splat objects. Raises StgaError where the head of an object is gone or has other triangles than
+    its splats.
     """
     if view is None:
         visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
     else:
-        visible = [candidate for candidate in depsgraph.view_layer.objects if candidate.visible_get(viewport=view)]
+        visible = [
+            candidate
+            for candidate in depsgraph.view_layer.objects
+            if candidate.visible_get(viewport=view)
+        ]
     shown = [found for each in visible for found in _with_instances(each, depsgraph, Matrix())]
     return [
         _layer(visible, matrix, depsgraph, cache, shown)
@@ -92,18 +111,24 @@ def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
     if layer.exclude or layer.collection.hide_render:
         return []
-    own = [candidate for candidate in layer.collection.objects if _is_rendered(candidate, depsgraph)]
+    own = [
+        candidate for candidate in layer.collection.objects if _is_rendered(candidate, depsgraph)
+    ]
     inside = (each for child in layer.children for each in _rendered_objects(child, depsgraph))
     return list(dict.fromkeys([*own, *inside]))
 
 
 def _is_rendered(candidate: Any, depsgraph: Any) -> bool:
-    """By the evaluated object: while an animation is rendered, keyframes do not reach the original."""
+    """By the evaluated object: while an animation is rendered, keyframes do not reach the
+    original."""
     return not candidate.evaluated_get(depsgraph).hide_render
 
 
-def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iterator[tuple[Any, Matrix]]:
-    """An object and its world matrix; of an instanced collection also its members, once per instance."""
+def _with_instances(
+    visible: Any, depsgraph: Any, parent_matrix: Matrix
+) -> Iterator[tuple[Any, Matrix]]:
+    """An object and its world matrix; of an instanced collection also its members, once per
+    instance."""
     matrix = parent_matrix @ visible.evaluated_get(depsgraph).matrix_world
     yield visible, matrix
     collection = visible.instance_collection if visible.instance_type == "COLLECTION" else None
@@ -115,7 +140,11 @@ def _with_instances(visible: Any, depsgraph: Any, parent_matrix: Matrix) -> Iter
 
 
 def _layer(
-    splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache, shown: Sequence[tuple[Any, Matrix]]
+    splat_object: Any,
+    matrix: Matrix,
+    depsgraph: Any,
+    cache: SplatCache,
+    shown: Sequence[tuple[Any, Matrix]],
 ) -> SceneLayer:
     stored = cache.get(splat_object)
     to_world = np.array(matrix, np.float64)
@@ -141,11 +170,15 @@ def _head_vertices(splat_object: Any, head: Any, n_faces: int, depsgraph: Any) -
     posed = head.evaluated_get(depsgraph)
     if posed.type != "MESH" or len(posed.data.loops) != 3 * n_faces:
         if head.mode == "EDIT":
-            raise StgaError(f"{head.name}: is in Edit Mode; {splat_object.name} is drawn again when you leave it")
+            raise StgaError(
+                f"{head.name}: is in Edit Mode; {splat_object.name} is drawn again when you leave it"
+            )
         raise StgaError(
             f"{head.name}: has other triangles than {splat_object.name}, which follows it; check its modifiers"
         )
-    to_splats = splat_object.evaluated_get(depsgraph).matrix_world.inverted_safe() @ posed.matrix_world
+    to_splats = (
+        splat_object.evaluated_get(depsgraph).matrix_world.inverted_safe() @ posed.matrix_world
+    )
     matrix = np.array(to_splats, np.float64)
     return mesh_vertices(posed.data) @ matrix[:3, :3].T + matrix[:3, 3]
 
@@ -158,10 +191,14 @@ def relight_frame(splat_object: Any, scene: Any) -> None:
     depsgraph = bpy.context.evaluated_depsgraph_get()
     layers = visible_layers(depsgraph, SplatCache(), is_wanted=lambda shown: shown == splat_object)
     if not layers or layers[0].relit is None:
-        raise StgaError(f"{splat_object.name}: is lit as recorded; choose Scene or Mix in the panel Lighting")
+        raise StgaError(
+            f"{splat_object.name}: is lit as recorded; choose Scene or Mix in the panel Lighting"
+        )
     if scene.camera is None:
         raise StgaError("The scene has no camera, from which highlights are seen")
-    eye = layers[0].eye_in_avatar(np.array(scene.camera.evaluated_get(depsgraph).matrix_world)[:3, 3])
+    eye = layers[0].eye_in_avatar(
+        np.array(scene.camera.evaluated_get(depsgraph).matrix_world)[:3, 3]
+    )
     relit = layers[0].relit
     color = relit.relighter.radiance(relit.mesh, eye, relit.lighting, relit.casters)
     values = flat_floats(np.concatenate([np.maximum(color, 0), np.ones((len(color), 1))], axis=1))
@@ -181,7 +218,8 @@ def forget_frame(splat_object: Any) -> bool:
 
 
 def light_hint(scene: Any) -> str | None:
-    """A sentence where EEVEE and Cycles show splats in another light than the scene's at its frame, else None."""
+    """A sentence where EEVEE and Cycles show splats in another light than the scene's at its frame,
+    else None."""
     settings = lighting_settings(scene)
     if settings is None or settings.mode == "recorded":
         return None
@@ -191,5 +229,7 @@ def light_hint(scene: Any) -> str | None:
         frame = shown.data.get(tags.RELIT_FRAME) if RELIT_COLOR in shown.data.attributes else None
         if frame != scene.frame_current:
             now = "colors as recorded" if frame is None else f"the light of frame {frame}"
-            return f"EEVEE and Cycles render {now}; Relight Frame gives them the light of this frame"
+            return (
+                f"EEVEE and Cycles render {now}; Relight Frame gives them the light of this frame"
+            )
     return None

@@ -1,6 +1,8 @@
-"""Scene-linear colors of splats: the inverse of a scene's view transform, and what lies behind them.
+"""Scene-linear colors of splats: the inverse of a scene's view transform, and what lies behind
+them.
 
-Blender's own color management converts a grid of scene-linear colors to a picture; that table is inverted.
+Blender's own color management converts a grid of scene-linear colors to a picture; that table is
+inverted.
 """
 
 import tempfile
@@ -23,7 +25,8 @@ GRID, INVERSE_GRID = 41, 25
 DARKEST, BRIGHTEST = -14.0, 6.0
 """Range of the scene-linear samples, in log2; the first sample is 0."""
 INVERSE_STEPS, MAX_STEP, DAMPING = 15, 4, 1e-3
-"""Of finding a color of the inverse; a step is in samples, and damped where colors hardly change: in the dark."""
+"""Of finding a color of the inverse; a step is in samples, and damped where colors hardly change:
+in the dark."""
 CHUNK = 1 << 16
 """Pixels converted at a time, which bounds the memory."""
 MAIN_THREAD_TIMEOUT_S = 10.0
@@ -36,7 +39,8 @@ _measured: dict[tuple[Any, ...], "InverseView"] = {}
 class InverseView:
     """The inverse of a view transform.
 
-    shown: (G, G, G, 3) sRGB 0…1 of the scene-linear colors whose red, green and blue are `axis` (G,), in that order.
+    shown: (G, G, G, 3) sRGB 0…1 of the scene-linear colors whose red, green and blue are `axis`
+    (G,), in that order.
     """
 
     def __init__(self, axis: np.ndarray, shown: np.ndarray) -> None:
@@ -51,7 +55,8 @@ class InverseView:
         return interpolate(self._shown, place.reshape(-1, 3)).reshape(linear.shape)
 
     def to_linear(self, srgb: np.ndarray) -> np.ndarray:
-        """Scene-linear colors (…, 3) float32 that the view transform shows as `srgb`, or as nearly as it can."""
+        """Scene-linear colors (…, 3) float32 that the view transform shows as `srgb`, or as nearly
+        as it can."""
         flat = np.sqrt(np.clip(srgb, 0, 1)).reshape(-1, 3) * (INVERSE_GRID - 1)
         linear = np.empty(flat.shape, np.float32)
         for begin in range(0, len(flat), CHUNK):
@@ -60,16 +65,21 @@ class InverseView:
         return linear.reshape(srgb.shape)
 
     def _solve(self, target: np.ndarray) -> np.ndarray:
-        """Places (M, 3) in the table, in samples, that show colors (M, 3) most nearly, by damped Gauss-Newton steps."""
+        """Places (M, 3) in the table, in samples, that show colors (M, 3) most nearly, by damped
+        Gauss-Newton steps."""
         last = len(self._axis) - 1
         gray = np.maximum.accumulate(np.einsum("iiic->i", self._shown) / 3)
         place = np.interp(target, gray, np.arange(last + 1))
-        slopes = np.stack(np.gradient(self._shown, axis=(0, 1, 2)), -1).reshape(*self._shown.shape[:3], 9)
+        slopes = np.stack(np.gradient(self._shown, axis=(0, 1, 2)), -1).reshape(
+            *self._shown.shape[:3], 9
+        )
         for _ in range(INVERSE_STEPS):
             rest = interpolate(self._shown, place) - target
             jacobian = interpolate(slopes, place).reshape(-1, 3, 3)
             transposed = jacobian.transpose(0, 2, 1)
-            step = np.linalg.solve(transposed @ jacobian + DAMPING * np.eye(3), transposed @ rest[..., None])[..., 0]
+            step = np.linalg.solve(
+                transposed @ jacobian + DAMPING * np.eye(3), transposed @ rest[..., None]
+            )[..., 0]
             place = np.clip(place - np.clip(step, -MAX_STEP, MAX_STEP), 0, last)
         return place
 
@@ -92,7 +102,9 @@ def keeps_colors(scene: Any) -> bool:
     view = scene.view_settings
     plain = view.view_transform == "Standard" and view.look == "None" and not view.use_curve_mapping
     balanced = not getattr(view, "use_white_balance", False)  # from Blender 4.3 on
-    return bool(plain and balanced and view.exposure == 0 and view.gamma == 1 and working_space() == REC709)
+    return bool(
+        plain and balanced and view.exposure == 0 and view.gamma == 1 and working_space() == REC709
+    )
 
 
 def needs_inverse(scene: Any) -> bool:
@@ -108,8 +120,9 @@ def inverse_view(scene: Any) -> InverseView | None:
 def measure(scene: Any) -> None:
     """Find `inverse_view` if it is needed, before rendering.
 
-    Blender calls this in its render thread, and data may be changed by the main thread only; that is waited for. Once
-    the render engine has the GPU, it must not be: the main thread then waits for the GPU to draw.
+    Blender calls this in its render thread, and data may be changed by the main thread only; that
+    is waited for. Once the render engine has the GPU, it must not be: the main thread then waits
+    for the GPU to draw.
     """
     key = _settings(scene)
     if key in _measured:
@@ -121,7 +134,9 @@ def measure(scene: Any) -> None:
 
     def work() -> None:
         try:
-            axis = np.append(0, 2 ** (np.linspace(DARKEST, BRIGHTEST, GRID - 1) - scene.view_settings.exposure))
+            axis = np.append(
+                0, 2 ** (np.linspace(DARKEST, BRIGHTEST, GRID - 1) - scene.view_settings.exposure)
+            )
             shown = _shown(scene, axis)
             _keep(key, InverseView(axis, shown))
         finally:
@@ -153,7 +168,8 @@ def _settings(scene: Any) -> tuple[Any, ...]:
 
 
 def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
-    """(G, G, G, 3) sRGB 0…1 that Blender shows on an sRGB display of the scene-linear colors of an `axis` (G,)."""
+    """(G, G, G, 3) sRGB 0…1 that Blender shows on an sRGB display of the scene-linear colors of an
+    `axis` (G,)."""
     size = len(axis)
     pixels = np.ones((size, size, size, 4), np.float32)
     pixels[..., :3] = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
@@ -197,12 +213,17 @@ def _read(path: Path, count: int) -> np.ndarray:
 
 
 def combined(
-    rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] | None, view: InverseView | None = None
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    background: tuple[float, ...] | None,
+    view: InverseView | None = None,
 ) -> np.ndarray:
-    """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W), alpha (H, W).
+    """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W),
+    alpha (H, W).
 
-    Splats are blended in sRGB. So `background`, scene-linear (3,), is added as the sRGB that it is shown as, before the
-    conversion. Where it is None the image stays transparent, and the color is converted as if it covered its pixel.
+    Splats are blended in sRGB. So `background`, scene-linear (3,), is added as the sRGB that it is
+    shown as, before the conversion. Where it is None the image stays transparent, and the color is
+    converted as if it covered its pixel.
     view: the inverse of the view transform, None where that shows sRGB as it is.
     """
     to_linear = srgb_to_linear if view is None else view.to_linear
@@ -233,7 +254,8 @@ def srgb(linear: Any) -> tuple[float, float, float]:
 def scene_background(scene: Any) -> tuple[float, ...] | None:
     """Scene-linear color behind the splats, None where the film is transparent.
 
-    From the world's Background node if its inputs are constants, else its viewport color; black without a world.
+    From the world's Background node if its inputs are constants, else its viewport color; black
+    without a world.
     """
     if scene.render.film_transparent:
         return None
@@ -242,7 +264,8 @@ def scene_background(scene: Any) -> tuple[float, ...] | None:
 
 
 def world_color(scene: Any) -> tuple[float, ...] | None:
-    """Scene-linear color of the scene's world, None where it is not one color; black without a world."""
+    """Scene-linear color of the scene's world, None where it is not one color; black without a
+    world."""
     world = scene.world
     if world is None:
         return 0.0, 0.0, 0.0

@@ -1,7 +1,8 @@
-"""GPU display: draws avatars as trained in every 3D viewport, in every shading mode, over what Blender has drawn.
+"""GPU display: draws avatars as trained in every 3D viewport, in every shading mode, over what
+Blender has drawn.
 
-An object is drawn where its display mode is *As Trained*. Playback, posing and edits need no handler of their own: each
-redraw reads the evaluated head.
+An object is drawn where its display mode is *As Trained*. Playback, posing and edits need no
+handler of their own: each redraw reads the evaluated head.
 """
 
 import traceback
@@ -69,7 +70,8 @@ class GpuDisplay:
         self._cache.light.casters.forget()
 
     def _before(self) -> None:
-        """Keep the framebuffer of the scene's colors: after it, Blender binds that of the overlays, which lie above."""
+        """Keep the framebuffer of the scene's colors: after it, Blender binds that of the overlays,
+        which lie above."""
         self._scene_target = gpu.state.active_framebuffer_get()
 
     def _draw(self) -> None:
@@ -80,7 +82,9 @@ class GpuDisplay:
             self.problem = str(error)
         except Exception as error:  # raised again at each redraw otherwise: reported once, then off
             traceback.print_exc()
-            self._fail(f"Splats cannot be drawn as trained here ({type(error).__name__}: {error}); points are shown")
+            self._fail(
+                f"Splats cannot be drawn as trained here ({type(error).__name__}: {error}); points are shown"
+            )
         finally:
             self._scene_target = None
 
@@ -88,9 +92,13 @@ class GpuDisplay:
         space, depsgraph = context.space_data, context.evaluated_depsgraph_get()
         if is_drawn_by_engine(context):
             return
-        everything = is_engine_view(context)  # and nothing else, although its depth buffer has other displays of splats
+        # and nothing else, although its depth buffer has other displays of splats
+        everything = is_engine_view(context)
         layers = visible_layers(
-            depsgraph, self._cache, space, lambda shown: everything or display_mode(shown) == AS_TRAINED
+            depsgraph,
+            self._cache,
+            space,
+            lambda shown: everything or display_mode(shown) == AS_TRAINED,
         )
         if not layers:
             if not any(is_shown_as_trained(candidate) for candidate in bpy.data.objects):
@@ -112,7 +120,8 @@ class GpuDisplay:
         self.stop()
         self.problem, self.failed = problem, True
         print(f"STGA: {problem}")
-        bpy.app.timers.register(show_points, persistent=True)  # while drawing, Blender's data cannot be changed
+        # while drawing, Blender's data cannot be changed
+        bpy.app.timers.register(show_points, persistent=True)
 
 
 display = GpuDisplay()
@@ -128,7 +137,8 @@ def is_shown_as_trained(candidate: Any) -> bool:
 
 
 def show_points() -> float | None:
-    """Display as points what is to be displayed as trained, from a timer: also what is added or opened later."""
+    """Display as points what is to be displayed as trained, from a timer: also what is added or
+    opened later."""
     for candidate in bpy.data.objects:
         if candidate.library is None and is_shown_as_trained(candidate):
             set_input(candidate, splat_nodes.DISPLAY, POINTS)
@@ -143,17 +153,21 @@ def is_engine_view(context: Any) -> bool:
 def is_drawn_by_engine(context: Any) -> bool:
     """Whether the render engine draws the splats itself, below overlays and bones.
 
-    It draws before the view transform. Where that would change colors, the display draws them, after it.
+    It draws before the view transform. Where that would change colors, the display draws them,
+    after it.
     """
     return is_engine_view(context) and keeps_colors(context.scene)
 
 
 def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float, ...]]:
-    """The view of a RegionView3D, and how `SplatRenderer.composite` gets from its z to the depth buffer's."""
+    """The view of a RegionView3D, and how `SplatRenderer.composite` gets from its z to the depth
+    buffer's."""
     camera = viewport_camera(region, width, height)
     matrix = np.array(region.window_matrix, np.float64)
     # A view that is not in perspective is drawn from this far behind Blender's camera.
-    back = float((camera.world_to_camera @ np.linalg.inv(np.array(region.view_matrix, np.float64))[:, 3])[2])
+    back = float(
+        (camera.world_to_camera @ np.linalg.inv(np.array(region.view_matrix, np.float64))[:, 3])[2]
+    )
     a, b, c, d = matrix[2, 3], -matrix[2, 2], matrix[3, 3], -matrix[3, 2]
     near, far = (back + (a - c * end) / (d * end - b) for end in (-1.0, 1.0))
     planes = np.array(region.clip_planes, np.float64) if region.use_clip_planes else None
@@ -164,10 +178,13 @@ def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float
 def expected_background(context: Any) -> tuple[float, ...] | None:
     """sRGB color that the viewport shows behind everything, None where that is not one color.
 
-    Splats were trained to be blended in sRGB, and a viewport blends linearly: their soft edges are right over what is
-    known to be behind them.
+    Splats were trained to be blended in sRGB, and a viewport blends linearly: their soft edges are
+    right over what is known to be behind them.
     """
-    shading, theme = context.space_data.shading, context.preferences.themes[0].view_3d.space.gradients
+    shading, theme = (
+        context.space_data.shading,
+        context.preferences.themes[0].view_3d.space.gradients,
+    )
     source = background_source(context)
     if source == "THEME":
         return None if theme.background_type == "RADIAL" else tuple(theme.high_gradient)
@@ -175,7 +192,11 @@ def expected_background(context: Any) -> tuple[float, ...] | None:
         return srgb(shading.background_color)
     if source == "WORLD":
         return srgb(context.scene.world.color) if context.scene.world else (0.0, 0.0, 0.0)
-    if source == "SCENE" and keeps_colors(context.scene) and not context.scene.render.film_transparent:
+    if (
+        source == "SCENE"
+        and keeps_colors(context.scene)
+        and not context.scene.render.film_transparent
+    ):
         color = world_color(context.scene)
         return None if color is None else srgb(color)
     return None
@@ -190,12 +211,17 @@ def has_scene_depth(space: Any) -> bool:
 
 
 def background_source(context: Any) -> str:
-    """What gives a viewport its background: THEME, VIEWPORT, WORLD (its color for viewports), SCENE or STUDIO."""
+    """What gives a viewport its background: THEME, VIEWPORT, WORLD (its color for viewports), SCENE
+    or STUDIO."""
     shading = context.space_data.shading
     if shading.type in ("SOLID", "WIREFRAME"):
         return str(shading.background_type)
-    uses_world = shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
-    return "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
+    uses_world = (
+        shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
+    )
+    return (
+        "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
+    )
 
 
 @persistent

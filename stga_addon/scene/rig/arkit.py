@@ -1,4 +1,5 @@
-"""ARKit's 52 shapes in Blender: controls on a FLAME rig, and heads that have shape keys of these names."""
+"""ARKit's 52 shapes in Blender: controls on a FLAME rig, and heads that have shape keys of these
+names."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -38,10 +39,12 @@ def has_controls(rig: Any) -> bool:
 
 
 def add_controls(head: Any, rig: Any, found: HeadMap) -> None:
-    """Add a slider per ARKit shape to the rig, which drives expressions, jaw and eyes by arithmetic alone.
+    """Add a slider per ARKit shape to the rig, which drives expressions, jaw and eyes by arithmetic
+    alone.
 
-    Driven sliders and bones take their values from the controls, not from keyframes; `remove_controls` gives them back.
-    Controls that are there already keep their values and keyframes.
+    Driven sliders and bones take their values from the controls, not from keyframes;
+    `remove_controls` gives them back. Controls that are there already keep their values and
+    keyframes.
     """
     remove_drivers(head, rig)
     for name, reach in zip(ARKIT_SHAPES, found.reach.tolist(), strict=True):
@@ -58,9 +61,13 @@ def add_controls(head: Any, rig: Any, found: HeadMap) -> None:
     rig[SUMS] = [0.0] * sum(map(len, parts))
     slot, paths = 0, []
     for column_parts in parts:
-        paths.append([f"{property_path(SUMS)}[{slot + number}]" for number in range(len(column_parts))])
+        paths.append(
+            [f"{property_path(SUMS)}[{slot + number}]" for number in range(len(column_parts))]
+        )
         for text, columns in column_parts:
-            variables = {VARIABLES[k]: (rig, property_path(ARKIT_SHAPES[c])) for k, c in enumerate(columns)}
+            variables = {
+                VARIABLES[k]: (rig, property_path(ARKIT_SHAPES[c])) for k, c in enumerate(columns)
+            }
             variables["o"] = (rig, property_path("jawOpen"))
             add_driver(rig, property_path(SUMS), slot, text, variables)
             slot += 1
@@ -69,13 +76,16 @@ def add_controls(head: Any, rig: Any, found: HeadMap) -> None:
         key = expression_key(head, component)
         if terms and key in head.data.shape_keys.key_blocks:
             variables = {VARIABLES[k]: (rig, path) for k, path in enumerate(terms)}
-            add_driver(head.data.shape_keys, key_value_path(key), -1, "+".join(variables), variables)
+            add_driver(
+                head.data.shape_keys, key_value_path(key), -1, "+".join(variables), variables
+            )
     for joint, rows in JOINT_ROWS.items():
         _drive_joint(rig, joint, [paths[count + row] for row in rows])
 
 
 def remove_controls(head: Any, rig: Any) -> None:
-    """Remove the controls with their drivers and keyframes: expressions, jaw and eyes play their own again."""
+    """Remove the controls with their drivers and keyframes: expressions, jaw and eyes play their
+    own again."""
     remove_drivers(head, rig)
     if rig.animation_data is not None and rig.animation_data.action is not None:
         curves, controls = action_curves(rig), control_paths().values()
@@ -91,17 +101,26 @@ def remove_drivers(head: Any, rig: Any) -> None:
         return
     for owner in (rig, head.data.shape_keys):
         for driver in [] if owner.animation_data is None else list(owner.animation_data.drivers):
-            targets = [target.data_path for variable in driver.driver.variables for target in variable.targets]
-            if driver.data_path == property_path(SUMS) or any(path.startswith(property_path(SUMS)) for path in targets):
+            targets = [
+                target.data_path
+                for variable in driver.driver.variables
+                for target in variable.targets
+            ]
+            if driver.data_path == property_path(SUMS) or any(
+                path.startswith(property_path(SUMS)) for path in targets
+            ):
                 owner.animation_data.drivers.remove(driver)
     del rig[SUMS]
 
 
 def shape_key_names(head: Any) -> dict[int, str]:
-    """Column of the 52 -> the shape key of an object that has its name in any spelling; empty without any."""
+    """Column of the 52 -> the shape key of an object that has its name in any spelling; empty
+    without any."""
     keys = head.data.shape_keys if head.type == "MESH" else None
     blocks = [] if keys is None else [block.name for block in keys.key_blocks[1:]]
-    return {COLUMN[name]: block for block in reversed(blocks) if (name := arkit_name(block)) is not None}
+    return {
+        COLUMN[name]: block for block in reversed(blocks) if (name := arkit_name(block)) is not None
+    }
 
 
 def apply_weights(
@@ -113,11 +132,12 @@ def apply_weights(
     as_strip: bool = False,
     neck: np.ndarray | None = None,
 ) -> None:
-    """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T, 52), one row per
-    Blender frame from `start` on.
+    """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T,
+    52), one row per Blender frame from `start` on.
 
     neck  (T, 3) axis-angle of the neck, where the owner is a rig; None: it keeps its own animation
-    The previous animation is kept as `rig.motion.apply_motion` keeps it. Raises StgaError as `check_keyable` does.
+    The previous animation is kept as `rig.motion.apply_motion` keeps it. Raises StgaError as
+    `check_keyable` does.
     """
     bones = [] if neck is None else ["neck"]
     check_keyable(owner, bones)
@@ -127,7 +147,8 @@ def apply_weights(
     curves, at = action_curves(owner), np.asarray(numbers)
     for column, path in paths.items():
         values = weights[:, column]
-        keyed = slice(None) if (values != values[0]).any() else slice(1)  # a shape that never moves: once
+        # a shape that never moves: once
+        keyed = slice(None) if (values != values[0]).any() else slice(1)
         write_curve(curves, path, 0, at[keyed], values[keyed])
     if neck is not None:
         key_turns(owner, "neck", numbers, neck)
@@ -142,25 +163,37 @@ def control_paths() -> dict[int, str]:
 
 
 def checked_shape_keys(head: Any) -> dict[int, str]:
-    """Column -> data path of the shape keys with ARKit names. Raises StgaError where the object has none."""
+    """Column -> data path of the shape keys with ARKit names. Raises StgaError where the object has
+    none."""
     names = shape_key_names(head)
     if not names:
-        raise StgaError(f"{head.name}: has neither a FLAME rig nor shape keys with ARKit's names, such as jawOpen")
+        raise StgaError(
+            f"{head.name}: has neither a FLAME rig nor shape keys with ARKit's names, such as jawOpen"
+        )
     return {column: key_value_path(name) for column, name in names.items()}
 
 
 def _parts(linear: np.ndarray, products: np.ndarray) -> list[tuple[str, list[int]]]:
-    """Expressions, each within Blender's limit, and the shapes that their variables are, whose sum is one parameter."""
+    """Expressions, each within Blender's limit, and the shapes that their variables are, whose sum
+    is one parameter."""
     found: list[tuple[str, list[int]]] = []
     text = ""
     columns: list[int] = []
     for column in np.flatnonzero(np.abs(linear) + np.abs(products) > NEGLIGIBLE).tolist():
         for _ in range(2):
-            variable, factor, product = VARIABLES[len(columns)], float(linear[column]), float(products[column])
+            variable, factor, product = (
+                VARIABLES[len(columns)],
+                float(linear[column]),
+                float(products[column]),
+            )
             # mouthClose counts up to jawOpen (`effective_weights`).
             value = f"min({variable},max(o,0))" if column == MOUTH_CLOSE else variable
             has_product = abs(product) > NEGLIGIBLE
-            term = f"+{value}*({factor:.4e}{product:+.4e}*o)" if has_product else f"{factor:+.4e}*{value}"
+            term = (
+                f"+{value}*({factor:.4e}{product:+.4e}*o)"
+                if has_product
+                else f"{factor:+.4e}*{value}"
+            )
             if len(text) + len(term) <= MAX_EXPRESSION and len(columns) + 1 < len(VARIABLES):
                 break
             found.append((text, columns))
@@ -170,8 +203,11 @@ def _parts(linear: np.ndarray, products: np.ndarray) -> list[tuple[str, list[int
 
 
 def _drive_joint(rig: Any, joint: str, terms: Sequence[Sequence[str]]) -> None:
-    """Drive a bone's quaternion by its axis-angle, whose three components are sums of at most one term each."""
-    variables = {letter: (rig, paths[0]) for letter, paths in zip("abc", terms, strict=True) if paths}
+    """Drive a bone's quaternion by its axis-angle, whose three components are sums of at most one
+    term each."""
+    variables = {
+        letter: (rig, paths[0]) for letter, paths in zip("abc", terms, strict=True) if paths
+    }
     if not variables:
         return
     squared = "+".join(f"{letter}*{letter}" for letter in variables)

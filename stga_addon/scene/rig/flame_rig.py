@@ -1,13 +1,16 @@
-"""FLAME as a Blender rig whose mesh equals FLAME's forward pass, on tracked frames and for any pose set by hand.
+"""FLAME as a Blender rig whose mesh equals FLAME's forward pass, on tracked frames and for any pose
+set by hand.
 
-Expression coefficients are shape keys, joint rotations are pose bones, pose correctives are shape keys driven by the
-bones, and linear blend skinning is the armature modifier. The first identity components are shape keys too, relative
-to the tracked person: with all of them at zero the head is that person's.
+Expression coefficients are shape keys, joint rotations are pose bones, pose correctives are shape
+keys driven by the bones, and linear blend skinning is the armature modifier. The first identity
+components are shape keys too, relative to the tracked person: with all of them at zero the head is
+that person's.
 
-FLAME regresses its joints from the *shaped* vertices, so the sliders displace a joint's center of rotation by
-d = D·sliders, which a bone's rest position cannot follow. Such a joint's bone is therefore the child of a hidden bone
-`<name>_joint`, driven to d, and the parent of a hidden bone `<name>_deform`, driven to -d, which the vertices follow.
-All drivers are arithmetic, which Blender evaluates without Python.
+FLAME regresses its joints from the *shaped* vertices, so the sliders displace a joint's center of
+rotation by d = D·sliders, which a bone's rest position cannot follow. Such a joint's bone is
+therefore the child of a hidden bone `<name>_joint`, driven to d, and the parent of a hidden bone
+`<name>_deform`, driven to -d, which the vertices follow. All drivers are arithmetic, which Blender
+evaluates without Python.
 """
 
 from collections.abc import Iterable, Sequence
@@ -43,7 +46,8 @@ from .keyframes import (
 )
 
 BONE_LENGTH = 0.03  # meters; only how long the bones are displayed
-NEGLIGIBLE_DISPLACEMENT = 1e-6  # meters along an axis that a joint may be off when all sliders are at their limits
+# meters along an axis that a joint may be off when all sliders are at their limits
+NEGLIGIBLE_DISPLACEMENT = 1e-6
 QUATERNION = ("w", "x", "y", "z")
 SQUARED_NORM = "(w*w+x*x+y*y+z*z)"  # keyed quaternions are interpolated without normalization
 # (rotation - identity) / 2 as quadratic forms of the quaternion, row by row.
@@ -52,7 +56,8 @@ ROTATION_MINUS_IDENTITY = (
     ("x*y+w*z", "-x*x-z*z", "y*z-w*x"),
     ("x*z-w*y", "y*z+w*x", "-x*x-y*y"),
 )
-# A driver's variables, one per term: few enough for Blender's limit of 255 characters per expression.
+# A driver's variables, one per term: few enough for Blender's limit of 255 characters per
+# expression.
 VARIABLES = "abcdfghijklmnopqrs"
 
 
@@ -63,18 +68,23 @@ def add_rig(
     warn: Warn = log_warning,
     correctives: str = "all",
 ) -> Any:
-    """Rig and animate `head`, the mesh object of the sequence's neutral mesh; returns the armature object.
+    """Rig and animate `head`, the mesh object of the sequence's neutral mesh; returns the armature
+    object.
 
-    head has its "Basis" shape key; frames: the sequence's frames, one per timestep. The evaluated mesh equals
-    `flame_forward` within 1e-5 m. Vertex offsets that change by frame become one shape key per timestep, which `warn`
-    reports, as it does coefficients beyond ±10. correctives: "all", or "moving" for the shape keys and drivers of
-    those joints only that turn in the frames.
+    head has its "Basis" shape key; frames: the sequence's frames, one per timestep. The evaluated
+    mesh equals `flame_forward` within 1e-5 m. Vertex offsets that change by frame become one shape
+    key per timestep, which `warn` reports, as it does coefficients beyond ±10. correctives: "all",
+    or "moving" for the shape keys and drivers of those joints only that turn in the frames.
     """
     model = sequence.model
-    basis = shaped_vertices(model, sequence.shape, np.zeros(model.n_expression), sequence.static_offset)
+    basis = shaped_vertices(
+        model, sequence.shape, np.zeros(model.n_expression), sequence.static_offset
+    )
     sliders = slider_components(model)
     # (5, 3, K): how far each component of the shape moves each joint.
-    directions = np.einsum("jv,vck->jck", model.j_regressor, model.shapedirs[:, :, list(sliders.values())])
+    directions = np.einsum(
+        "jv,vck->jck", model.j_regressor, model.shapedirs[:, :, list(sliders.values())]
+    )
     has_offsets = any(frame.dynamic_offset is not None for frame in frames)
     displaced = [has_offsets or any(_significant_terms(direction)) for direction in directions]
     _remove_bone_groups(head, _rigs(head))
@@ -84,7 +94,11 @@ def add_rig(
         head[EXPRESSION_NAMES] = ",".join(model.expression_names)
     for name, component in sliders.items():
         _new_shape_key(head, name, basis + model.shapedirs[:, :, component], MAX_SLIDER)
-    corrected = np.ones(len(JOINTS), bool) if correctives == "all" else joint_angles(frames) > MIN_JOINT_ANGLE_DEG
+    corrected = (
+        np.ones(len(JOINTS), bool)
+        if correctives == "all"
+        else joint_angles(frames) > MIN_JOINT_ANGLE_DEG
+    )
     _add_pose_correctives(head, rig, model, basis, corrected)
     key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
@@ -98,7 +112,11 @@ def add_rig(
 def rig_of(head: Any) -> Any:
     """The armature object that moves `head`. Raises StgaError where it has no FLAME rig."""
     for modifier in head.modifiers:
-        if modifier.type == "ARMATURE" and modifier.object is not None and modifier.object.get(tags.KIND) == tags.RIG:
+        if (
+            modifier.type == "ARMATURE"
+            and modifier.object is not None
+            and modifier.object.get(tags.KIND) == tags.RIG
+        ):
             return modifier.object
     raise StgaError(
         f"{head.name}: has no FLAME rig, because it was not imported from FLAME parameters; its splats follow "
@@ -110,7 +128,9 @@ def remove_rig(head: Any) -> None:
     """Remove the rig of `head` and the modifiers that bind the head to it, where it has one."""
     rigs = _rigs(head)
     _remove_bone_groups(head, rigs)
-    for modifier in [old for old in head.modifiers if old.type == "ARMATURE" and old.object in rigs]:
+    for modifier in [
+        old for old in head.modifiers if old.type == "ARMATURE" and old.object in rigs
+    ]:
         head.modifiers.remove(modifier)
     remove(rigs)
 
@@ -125,10 +145,18 @@ def _rigs(head: Any) -> list[Any]:
     return [child for child in head.parent.children if child.get(tags.KIND) == tags.RIG]
 
 
-def _place_armature(head: Any, joints: np.ndarray, parents: np.ndarray, displaced: Sequence[bool]) -> Any:
+def _place_armature(
+    head: Any, joints: np.ndarray, parents: np.ndarray, displaced: Sequence[bool]
+) -> Any:
     root = head.parent
     title = f"{root.name} rig"
-    rig = place(root, tags.RIG, title, _armature(title, joints, parents, displaced), next(iter(_rigs(head)), None))
+    rig = place(
+        root,
+        tags.RIG,
+        title,
+        _armature(title, joints, parents, displaced),
+        next(iter(_rigs(head)), None),
+    )
     rig.show_in_front = True
     bpy.context.view_layer.update()  # creates the pose bones
     for name in JOINTS:  # an earlier import's
@@ -157,8 +185,13 @@ def _armature(name: str, joints: np.ndarray, parents: np.ndarray, displaced: Seq
         chain = [parent_bone(bone), bone, deform_bone(bone)] if displaced[joint] else [bone]
         for link in chain:
             edited, head = armature.edit_bones.new(link), joints[joint].tolist()
-            # Along +Y without roll it has the identity as rest orientation: its rotation is FLAME's own.
-            edited.head, edited.tail, edited.roll = head, (head[0], head[1] + BONE_LENGTH, head[2]), 0.0
+            # Along +Y without roll it has the identity as rest orientation: its rotation is FLAME's
+            # own.
+            edited.head, edited.tail, edited.roll = (
+                head,
+                (head[0], head[1] + BONE_LENGTH, head[2]),
+                0.0,
+            )
             edited.parent = armature.edit_bones[above] if above else None
             above = link
     bpy.ops.object.mode_set(mode="OBJECT")
@@ -180,7 +213,9 @@ def _skin(head: Any, rig: Any, weights: np.ndarray, displaced: Sequence[bool]) -
         group = head.vertex_groups.new(name=_skinning_bone(joint, displaced))
         for vertex in np.flatnonzero(column).tolist():
             group.add([vertex], column[vertex], "REPLACE")
-    modifier = next((old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig), None)
+    modifier = next(
+        (old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig), None
+    )
     modifier = modifier or head.modifiers.new(rig.name, "ARMATURE")
     modifier.object = rig
     modifier.use_vertex_groups, modifier.use_bone_envelopes = True, False
@@ -194,8 +229,11 @@ def _new_shape_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> 
     key.value = 0.0  # a key made from a script starts at 1
 
 
-def _add_pose_correctives(head: Any, rig: Any, model: FlameModel, basis: np.ndarray, corrected: np.ndarray) -> None:
-    """FLAME's pose correctives, nine per joint, each driven by one entry of the joint's rotation minus identity.
+def _add_pose_correctives(
+    head: Any, rig: Any, model: FlameModel, basis: np.ndarray, corrected: np.ndarray
+) -> None:
+    """FLAME's pose correctives, nine per joint, each driven by one entry of the joint's rotation
+    minus identity.
 
     corrected (5,) bool: joints that get theirs.
     """
@@ -207,12 +245,20 @@ def _add_pose_correctives(head: Any, rig: Any, model: FlameModel, basis: np.ndar
         name = f"pose_{bone}_{row}{column}"
         _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
         expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
-        rotation = {letter: (rig, f"{rotation_path(bone)}[{element}]") for element, letter in enumerate(QUATERNION)}
+        rotation = {
+            letter: (rig, f"{rotation_path(bone)}[{element}]")
+            for element, letter in enumerate(QUATERNION)
+        }
         add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
 
 
 def _add_offset_keys(
-    head: Any, rig: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], basis: np.ndarray, warn: Warn
+    head: Any,
+    rig: Any,
+    sequence: FlameSequence,
+    frames: Sequence[FlameFrame],
+    basis: np.ndarray,
+    warn: Warn,
 ) -> None:
     warn(
         f"{head.name}: the capture has a dynamic_offset per frame, which a rig cannot represent; added one shape key"
@@ -228,7 +274,8 @@ def _add_offset_keys(
 def _significant_terms(directions: np.ndarray) -> list[list[int]]:
     """Per axis, the columns of directions (3, K) that displace the joint.
 
-    The smallest are left out, as long as all of them together stay negligible with the sliders at their limits.
+    The smallest are left out, as long as all of them together stay negligible with the sliders at
+    their limits.
     """
     kept = []
     for coefficients in np.abs(directions):
@@ -238,10 +285,14 @@ def _significant_terms(directions: np.ndarray) -> list[list[int]]:
     return kept
 
 
-def _drive_joint(head: Any, rig: Any, joint: str, sliders: Sequence[str], directions: np.ndarray) -> None:
-    """Drive a joint's helper bones by directions (3, K) · sliders, plus the per-frame offset where there is one.
+def _drive_joint(
+    head: Any, rig: Any, joint: str, sliders: Sequence[str], directions: np.ndarray
+) -> None:
+    """Drive a joint's helper bones by directions (3, K) · sliders, plus the per-frame offset where
+    there is one.
 
-    Blender limits an expression's length, so partial sums are driven first, in a property of the rig.
+    Blender limits an expression's length, so partial sums are driven first, in a property of the
+    rig.
     """
     summands = _drive_partial_sums(head, rig, joint, sliders, directions)
     for axis in range(3):
@@ -249,7 +300,10 @@ def _drive_joint(head: Any, rig: Any, joint: str, sliders: Sequence[str], direct
         if offset_property(joint) in rig:
             paths.append(f"{property_path(offset_property(joint))}[{axis}]")
         if paths:
-            total, variables = "+".join(VARIABLES[: len(paths)]), _variables((rig, path) for path in paths)
+            total, variables = (
+                "+".join(VARIABLES[: len(paths)]),
+                _variables((rig, path) for path in paths),
+            )
             add_driver(rig, location_path(parent_bone(joint)), axis, total, variables)
             add_driver(rig, location_path(deform_bone(joint)), axis, f"-({total})", variables)
 

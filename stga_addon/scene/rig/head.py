@@ -1,4 +1,5 @@
-"""The tracked head as an animated Blender mesh, and meshes with shape keys as linear head models."""
+"""The tracked head as an animated Blender mesh, and meshes with shape keys as linear head
+models."""
 
 from typing import Any
 
@@ -14,14 +15,16 @@ from .flame_rig import add_rig, remove_rig
 
 
 def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "all") -> Any:
-    """The capture's head as a mesh object, animated so that Blender's frame number is the capture's timestep.
+    """The capture's head as a mesh object, animated so that Blender's frame number is the capture's
+    timestep.
 
-    A FLAME capture becomes a rig (see `flame_rig.add_rig`); any other gets one shape key per timestep, `t00012`, with
-    value 1 at its own frame, so that the evaluated mesh of that frame is the timestep's mesh; frames between two
-    timesteps blend them. Object coordinates are the capture's (meters, y-up). Regions become boolean face attributes
-    `stga_region_<name>`. Importing the same folder or file again replaces the last import; vertex groups and materials
-    are kept if the triangles are the same. `warn` receives one sentence per problem. correctives: see `add_rig`.
-    Raises StgaError where a timestep cannot be read; the scene is then unchanged.
+    A FLAME capture becomes a rig (see `flame_rig.add_rig`); any other gets one shape key per
+    timestep, `t00012`, with value 1 at its own frame, so that the evaluated mesh of that frame is
+    the timestep's mesh; frames between two timesteps blend them. Object coordinates are the
+    capture's (meters, y-up). Regions become boolean face attributes `stga_region_<name>`. Importing
+    the same folder or file again replaces the last import; vertex groups and materials are kept if
+    the triangles are the same. `warn` receives one sentence per problem. correctives: see
+    `add_rig`. Raises StgaError where a timestep cannot be read; the scene is then unchanged.
     """
     sequence = capture.flame
     if sequence is not None:
@@ -48,7 +51,9 @@ def _place_head(capture: Capture) -> Any:
         _update_mesh(head, capture)
     else:
         title = f"{root.name} head"
-        head = place(root, tags.HEAD, title, triangle_mesh(title, capture.neutral, capture.faces), head)
+        head = place(
+            root, tags.HEAD, title, triangle_mesh(title, capture.neutral, capture.faces), head
+        )
     for region, members in capture.regions.items():
         attribute = head.data.attributes.new(tags.REGION_PREFIX + region, "BOOLEAN", "FACE")
         attribute.data.foreach_set("value", np.ascontiguousarray(members, bool))
@@ -58,14 +63,16 @@ def _place_head(capture: Capture) -> Any:
 
 
 def _update_mesh(head: Any, capture: Capture) -> None:
-    """Import into a mesh with the same triangles, which keeps its materials, vertex groups and painted attributes."""
+    """Import into a mesh with the same triangles, which keeps its materials, vertex groups and
+    painted attributes."""
     reset(head)
     mesh = head.data
     mesh.vertices.foreach_set("co", flat_floats(capture.neutral))
     mesh.update()
     for name in [name for name in mesh.attributes.keys() if name.startswith(tags.REGION_PREFIX)]:  # noqa: SIM118
         mesh.attributes.remove(mesh.attributes[name])
-    for group in reversed(list(head.vertex_groups)):  # last first: removing a group renumbers those after it
+    # last first: removing a group renumbers those after it
+    for group in reversed(list(head.vertex_groups)):
         timestep = tags.group_timestep(group.name)
         if timestep is not None and timestep not in capture.timesteps:
             head.vertex_groups.remove(group)
@@ -78,13 +85,16 @@ def has_shape_keys(thing: Any) -> bool:
 
 
 def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
-    """Basis (V, 3) in meters, y up, triangles (F, 3), and names and displacements (V, 3, K) of the other shape keys.
+    """Basis (V, 3) in meters, y up, triangles (F, 3), and names and displacements (V, 3, K) of the
+    other shape keys.
 
-    In world space, turned from Blender's axes, in which a head looks along -y: z up becomes y up. Modifiers, values
-    and drivers are left out. Raises StgaError for an object without shape keys.
+    In world space, turned from Blender's axes, in which a head looks along -y: z up becomes y up.
+    Modifiers, values and drivers are left out. Raises StgaError for an object without shape keys.
     """
     if not has_shape_keys(thing):
-        raise StgaError(f"{thing.name}: has no shape keys; a head model needs a basis and expressions")
+        raise StgaError(
+            f"{thing.name}: has no shape keys; a head model needs a basis and expressions"
+        )
     turn = Z_UP_TO_Y_UP @ np.array(thing.matrix_world)
     basis = thing.data.shape_keys.reference_key
     mean = _points(basis) @ turn[:3, :3].T + turn[:3, 3]

@@ -1,4 +1,5 @@
-"""Motion of a FLAME head: applied, sampled, set live, and compared with what its avatar was trained on."""
+"""Motion of a FLAME head: applied, sampled, set live, and compared with what its avatar was trained
+on."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -38,7 +39,8 @@ from .keyframes import (
 )
 
 MESH_TOLERANCE = 1e-4
-"""Metres that the mesh in the scene may differ from FLAME's forward pass of the sampled parameters."""
+"""Metres that the mesh in the scene may differ from FLAME's forward pass of the sampled
+parameters."""
 
 
 def apply_motion(
@@ -53,22 +55,29 @@ def apply_motion(
 ) -> None:
     """Animate the chosen parts of a FLAME head by `frames`, one per Blender frame from `start` on.
 
-    The previous animation is kept. As an action, the new one is a copy of the old in which the parts are replaced, and
-    the old action stays in the file. As a strip, both are in the NLA editor, and the new one has effect only where it
-    lasts. tracked: the sequence that the head was imported from and the Blender frame of each of its timesteps, where
-    its per-frame offsets are to play along; without, they stay zero. Raises StgaError where the head has no rig, or
-    one that cannot take the motion; nothing is changed then.
+    The previous animation is kept. As an action, the new one is a copy of the old in which the
+    parts are replaced, and the old action stays in the file. As a strip, both are in the NLA
+    editor, and the new one has effect only where it lasts. tracked: the sequence that the head was
+    imported from and the Blender frame of each of its timesteps, where its per-frame offsets are to
+    play along; without, they stay zero. Raises StgaError where the head has no rig, or one that
+    cannot take the motion; nothing is changed then.
     """
     rig = rig_of(head)
     check_keyable(rig, JOINTS)
     check_keyable(head.data.shape_keys)
-    used = np.any([frame.expr != 0 for frame in frames], axis=0) if "expression" in parts else np.zeros(0, bool)
+    used = (
+        np.any([frame.expr != 0 for frame in frames], axis=0)
+        if "expression" in parts
+        else np.zeros(0, bool)
+    )
     for component in np.flatnonzero(used).tolist():
         if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
             raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
     # Coefficients of the sliders that the motion lacks are zero.
     sliders = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
-    padded = [np.pad(frame.expr[:sliders], (0, max(0, sliders - len(frame.expr)))) for frame in frames]
+    padded = [
+        np.pad(frame.expr[:sliders], (0, max(0, sliders - len(frame.expr)))) for frame in frames
+    ]
     frames = [replace(frame, expr=expr) for frame, expr in zip(frames, padded, strict=True)]
     owners = animated_by(head, rig, parts)
     for owner in owners:
@@ -90,11 +99,13 @@ def apply_motion(
 def sample_motion(
     head: Any, sequence: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning
 ) -> FlameSequence:
-    """FLAME parameters of the head as animated in the scene, in each of the frames `numbers`: timesteps from 0.
+    """FLAME parameters of the head as animated in the scene, in each of the frames `numbers`:
+    timesteps from 0.
 
-    sequence: the one that the head was imported from, for model and identity; identity sliders are read in the first
-    frame. `warn` reports where FLAME's parameters do not reproduce the mesh in the scene: another modifier, a sculpted
-    key, a scaled bone. Raises StgaError where the head has no rig.
+    sequence: the one that the head was imported from, for model and identity; identity sliders are
+    read in the first frame. `warn` reports where FLAME's parameters do not reproduce the mesh in
+    the scene: another modifier, a sculpted key, a scaled bone. Raises StgaError where the head has
+    no rig.
     """
     rig = rig_of(head)
     frames: list[FlameFrame] = []
@@ -114,11 +125,14 @@ def sample_motion(
             f"{head.name}: its mesh differs from FLAME's by up to {1000 * largest_error:.1f} mm, because something"
             " that is no FLAME parameter moves it; the exported parameters leave that out"
         )
-    return FlameSequence(sequence.model, shape, sequence.static_offset, tuple(range(len(frames))), frames.__getitem__)
+    return FlameSequence(
+        sequence.model, shape, sequence.static_offset, tuple(range(len(frames))), frames.__getitem__
+    )
 
 
 def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
-    """FLAME parameters of the head as it is posed in the scene now, keyed or not. Raises StgaError without a rig."""
+    """FLAME parameters of the head as it is posed in the scene now, keyed or not. Raises StgaError
+    without a rig."""
     return _sample_frame(head, rig_of(head), model)
 
 
@@ -127,12 +141,18 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
     rotations = {name: bones[name].matrix.to_3x3().normalized() for name in JOINTS}
     vectors = {}
     for name, parent in zip(JOINTS, model.parents.tolist(), strict=True):
-        local = rotations[name] if parent < 0 else rotations[JOINTS[parent]].transposed() @ rotations[name]
+        local = (
+            rotations[name]
+            if parent < 0
+            else rotations[JOINTS[parent]].transposed() @ rotations[name]
+        )
         vectors[name] = to_axis_angle(np.array(local.to_quaternion()))
     root, above = bones["root"], bones.get(parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
     return FlameFrame(
-        expr=np.array([_key_value(head, expression_key(head, k)) for k in range(model.n_expression)]),
+        expr=np.array(
+            [_key_value(head, expression_key(head, k)) for k in range(model.n_expression)]
+        ),
         rotation=vectors["root"],
         neck_pose=vectors["neck"],
         jaw_pose=vectors["jaw"],
@@ -148,7 +168,8 @@ def _key_value(head: Any, name: str) -> float:
 
 
 def _dynamic_offset(head: Any) -> np.ndarray | None:
-    """(V, 3) sum of the tracked per-frame offsets at their current values; None where all are zero."""
+    """(V, 3) sum of the tracked per-frame offsets at their current values; None where all are
+    zero."""
     total = None
     for key in offset_keys(head):
         value = _key_value(head, key.name)
@@ -185,14 +206,24 @@ class LivePose:
         self._properties: dict[str, Any] = {}
         self._offsets: list[str] = []
         if rig is None:
-            self._rows = {column: names.index(name) for column, name in shape_key_names(head).items()}
+            self._rows = {
+                column: names.index(name) for column, name in shape_key_names(head).items()
+            }
             return
-        self._values[[is_expression_key(name) or name.startswith(OFFSET_KEY) for name in names]] = 0.0
-        self._rows = dict(enumerate(row for row, name in enumerate(names) if is_expression_key(name)))
-        self._turns = {joint: tuple(rig.pose.bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
+        self._values[[is_expression_key(name) or name.startswith(OFFSET_KEY) for name in names]] = (
+            0.0
+        )
+        self._rows = dict(
+            enumerate(row for row, name in enumerate(names) if is_expression_key(name))
+        )
+        self._turns = {
+            joint: tuple(rig.pose.bones[joint].rotation_quaternion) for joint in LIVE_JOINTS
+        }
         self._offsets = [name for joint in JOINTS if (name := offset_property(joint)) in rig]
         controls = [] if self.takes_frames else list(ARKIT_SHAPES)
-        self._properties = {name: tuple(rig[name]) for name in self._offsets} | {name: rig[name] for name in controls}
+        self._properties = {name: tuple(rig[name]) for name in self._offsets} | {
+            name: rig[name] for name in controls
+        }
 
     @property
     def is_there(self) -> bool:
@@ -203,7 +234,8 @@ class LivePose:
         return keys is not None and has_rig and len(keys.key_blocks) == len(self._sliders)
 
     def set_frame(self, frame: FlameFrame) -> None:
-        """Pose a FLAME head: expressions, jaw, eyes and neck; tracked per-frame offsets are switched off."""
+        """Pose a FLAME head: expressions, jaw, eyes and neck; tracked per-frame offsets are
+        switched off."""
         for component, row in self._rows.items():
             self._values[row] = frame.expr[component] if component < len(frame.expr) else 0.0
         self._set_sliders(self._values)
@@ -211,7 +243,8 @@ class LivePose:
         self._set_turns(dict(zip(LIVE_JOINTS, from_axis_angle(np.stack(turns)), strict=True)))
 
     def set_weights(self, weights: Sequence[float] | np.ndarray, neck: np.ndarray) -> None:
-        """Set the 52 weights on controls or shape keys, and turn the neck of a FLAME head by an axis-angle (3,)."""
+        """Set the 52 weights on controls or shape keys, and turn the neck of a FLAME head by an
+        axis-angle (3,)."""
         limited = np.clip(weights, *WEIGHT_RANGE)
         if self._rig is None:
             for column, row in self._rows.items():
@@ -269,7 +302,9 @@ def stored_range(head: Any) -> TrainedRange | None:
     values = {name: np.array(kept[name], np.float64) for name in kept.keys()}  # noqa: SIM118, an IDPropertyGroup
     if set(values) != {f"{field} {part}" for field in FIELDS for part in PART_FIELDS}:
         return None
-    return TrainedRange(*({part: values[f"{field} {part}"] for part in PART_FIELDS} for field in FIELDS))
+    return TrainedRange(
+        *({part: values[f"{field} {part}"] for part in PART_FIELDS} for field in FIELDS)
+    )
 
 
 def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
@@ -278,7 +313,8 @@ def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
     names = [expression_key(head, k) for k in range(len(trained.middle["face"]))]
     expr = np.array([keys[name].value if name in keys else 0.0 for name in names])
     jaw, left, right = (
-        to_axis_angle(np.array(bones[bone].rotation_quaternion)) for bone in ("jaw", "left_eye", "right_eye")
+        to_axis_angle(np.array(bones[bone].rotation_quaternion))
+        for bone in ("jaw", "left_eye", "right_eye")
     )
     zero = np.zeros(3)
     frame = FlameFrame(expr, zero, zero, jaw, zero, np.concatenate([left, right]))

@@ -1,4 +1,5 @@
-"""How many frames later one camera's video shows the same moment than another's: from their sound, or from motion."""
+"""How many frames later one camera's video shows the same moment than another's: from their sound,
+or from motion."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -17,15 +18,19 @@ MOTION_SIZE = 32
 MIN_CORRELATION = 0.2
 """Correlation below which nothing is shared."""
 MIN_DISTINCTION = 1.5
-"""How many times the best lag's score has to exceed that of any that is more than NEIGHBORHOOD_S away."""
+"""How many times the best lag's score has to exceed that of any that is more than NEIGHBORHOOD_S
+away."""
 NEIGHBORHOOD_S = 0.2
 
 
-def clock_offsets(videos: Mapping[str, Video], fps: float, by: str) -> tuple[dict[str, int], tuple[str, ...]]:
-    """Camera -> frames by which its recording shows a moment later than the first camera's, and a sentence for each.
+def clock_offsets(
+    videos: Mapping[str, Video], fps: float, by: str
+) -> tuple[dict[str, int], tuple[str, ...]]:
+    """Camera -> frames by which its recording shows a moment later than the first camera's, and a
+    sentence for each.
 
-    by: "sound"; "motion": how much changes from frame to frame; "auto": sound where all have it. Raises StgaError where
-    a video has no sound, or where the recordings do not agree on one offset.
+    by: "sound"; "motion": how much changes from frame to frame; "auto": sound where all have it.
+    Raises StgaError where a video has no sound, or where the recordings do not agree on one offset.
     """
     by = by if by != "auto" else "sound" if all(map(has_sound, videos.values())) else "motion"
     read: Callable[[Video], tuple[np.ndarray, float]] = _loudness if by == "sound" else _motion
@@ -50,11 +55,12 @@ def clock_offsets(videos: Mapping[str, Video], fps: float, by: str) -> tuple[dic
 
 
 def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[int, float, float]:
-    """The lag at which signal[t + lag] follows reference[t] most certainly, their correlation there (−1 to 1), and how
-    many times its score exceeds all that are farther than NEIGHBORHOOD_S away.
+    """The lag at which signal[t + lag] follows reference[t] most certainly, their correlation there
+    (−1 to 1), and how many times its score exceeds all that are farther than NEIGHBORHOOD_S away.
 
-    Signals (N,) and (M,) of `rate` values a second. The score is the correlation over the values that both have,
-    MIN_OVERLAP_S at least, times the root of their number: of few values, chance makes a high correlation.
+    Signals (N,) and (M,) of `rate` values a second. The score is the correlation over the values
+    that both have, MIN_OVERLAP_S at least, times the root of their number: of few values, chance
+    makes a high correlation.
     """
     size = len(reference) + len(signal) - 1
     least = min(len(reference), len(signal), round(MIN_OVERLAP_S * rate))
@@ -67,9 +73,13 @@ def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[in
     count = np.maximum(np.round(sums(one, other)), 1)
     mean, means = sums(reference, other) / count, sums(one, signal) / count
     shared = sums(reference, signal) / count - mean * means
-    spread = (sums(reference**2, other) / count - mean**2) * (sums(one, signal**2) / count - means**2)
+    spread = (sums(reference**2, other) / count - mean**2) * (
+        sums(one, signal**2) / count - means**2
+    )
     smallest = 1e-6 * reference.var() * signal.var()
-    correlation = np.where((count >= least) & (spread > smallest), shared / np.sqrt(np.maximum(spread, 1e-30)), -1.0)
+    correlation = np.where(
+        (count >= least) & (spread > smallest), shared / np.sqrt(np.maximum(spread, 1e-30)), -1.0
+    )
     score = correlation * np.sqrt(count)
     best = int(score.argmax())
     far = np.abs(np.arange(size) - best) > NEIGHBORHOOD_S * rate
@@ -83,7 +93,8 @@ def has_sound(video: Video) -> bool:
 
 
 def _loudness(video: Video) -> tuple[np.ndarray, float]:
-    """Rise of the sound's loudness every SOUND_HOP samples, and its begin in seconds after that of the pictures."""
+    """Rise of the sound's loudness every SOUND_HOP samples, and its begin in seconds after that of
+    the pictures."""
     from av import AudioResampler
 
     with opened_video(video.path) as container:
@@ -115,7 +126,9 @@ def _motion(video: Video) -> tuple[np.ndarray, float]:
     changes, last = [0.0], None
     for number in frames.timesteps:
         small = (
-            Image.fromarray(frames.image(number)).convert("L").resize((MOTION_SIZE, MOTION_SIZE), Image.Resampling.BOX)
+            Image.fromarray(frames.image(number))
+            .convert("L")
+            .resize((MOTION_SIZE, MOTION_SIZE), Image.Resampling.BOX)
         )
         gray = np.asarray(small, np.float64)
         if last is not None:

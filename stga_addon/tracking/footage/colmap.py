@@ -54,7 +54,9 @@ LENSES: dict[str, tuple[int, Callable[..., Lens]]] = {
     "OPENCV_FISHEYE": (4, lambda *k: Lens("fisheye", radial=k)),
     "FULL_OPENCV": (
         8,
-        lambda k1, k2, p1, p2, k3, k4, k5, k6: Lens(radial=(k1, k2, k3), rational=(k4, k5, k6), tangential=(p1, p2)),
+        lambda k1, k2, p1, p2, k3, k4, k5, k6: Lens(
+            radial=(k1, k2, k3), rational=(k4, k5, k6), tangential=(p1, p2)
+        ),
     ),
     "FOV": (1, lambda omega: Lens("field of view", parameter=omega)),
     "SIMPLE_RADIAL_FISHEYE": (1, lambda k: Lens("fisheye", radial=(k,))),
@@ -95,27 +97,37 @@ def find_colmap(folder: Path) -> Path | None:
 
 
 def read_colmap(folder: Path) -> list[Shot]:
-    """One shot an image, in natural order of their names, which are the labels; COLMAP's numbers vary from run to run.
+    """One shot an image, in natural order of their names, which are the labels; COLMAP's numbers
+    vary from run to run.
 
     World and unit are the model's. Raises StgaError that names file, camera and image.
     """
     suffix = _suffix(folder)
     if suffix is None:
-        raise StgaError(f"{folder}: is no COLMAP model; expected cameras.bin and images.bin, or .txt")
+        raise StgaError(
+            f"{folder}: is no COLMAP model; expected cameras.bin and images.bin, or .txt"
+        )
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
     cameras = (_binary_cameras if suffix == ".bin" else _text_cameras)(cameras_file)
     images = sorted(
-        (_binary_images if suffix == ".bin" else _text_images)(images_file), key=lambda image: natural_order(image.name)
+        (_binary_images if suffix == ".bin" else _text_images)(images_file),
+        key=lambda image: natural_order(image.name),
     )
     return [_shot(image, cameras, cameras_file, images_file) for image in images]
 
 
 def _suffix(folder: Path) -> str | None:
-    complete = (s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file())
+    complete = (
+        s
+        for s in (".bin", ".txt")
+        if (folder / f"cameras{s}").is_file() and (folder / f"images{s}").is_file()
+    )
     return next(complete, None)
 
 
-def _shot(image: _Image, cameras: dict[int, _Intrinsics], cameras_file: Path, images_file: Path) -> Shot:
+def _shot(
+    image: _Image, cameras: dict[int, _Intrinsics], cameras_file: Path, images_file: Path
+) -> Shot:
     where = f"{images_file}: image {shorten(image.name)}"
     if image.camera not in cameras:
         raise StgaError(f"{where}: names camera {image.camera}, which {cameras_file} does not have")
@@ -124,18 +136,26 @@ def _shot(image: _Image, cameras: dict[int, _Intrinsics], cameras_file: Path, im
     rotation = _rotation(np.array(image.quaternion), where)
     with np.errstate(over="ignore", invalid="ignore"):  # `pinhole` refuses what is not finite
         position = -rotation.T @ np.array(image.translation)
-    return Shot(image.name, pinhole(intrinsics.size, focal, center, rotation, position, where), lens, where)
+    return Shot(
+        image.name, pinhole(intrinsics.size, focal, center, rotation, position, where), lens, where
+    )
 
 
-def _split(intrinsics: _Intrinsics, where: str) -> tuple[tuple[float, float], tuple[float, float], Lens]:
+def _split(
+    intrinsics: _Intrinsics, where: str
+) -> tuple[tuple[float, float], tuple[float, float], Lens]:
     """Focal lengths, principal point and lens of a model's parameters."""
     if intrinsics.model not in LENSES:
-        raise StgaError(f"{where}: model {shorten(intrinsics.model)} is not one of {', '.join(LENSES)}")
+        raise StgaError(
+            f"{where}: model {shorten(intrinsics.model)} is not one of {', '.join(LENSES)}"
+        )
     count, lens = LENSES[intrinsics.model]
     focals = 1 if intrinsics.model in SHARED_FOCAL else 2
     if len(intrinsics.values) != focals + 2 + count:
         found = len(intrinsics.values)
-        raise StgaError(f"{where}: expected {focals + 2 + count} parameters of {intrinsics.model}, not {found}")
+        raise StgaError(
+            f"{where}: expected {focals + 2 + count} parameters of {intrinsics.model}, not {found}"
+        )
     *focal, cx, cy = intrinsics.values[: focals + 2]
     return (focal[0], focal[-1]), (cx, cy), lens(*intrinsics.values[focals + 2 :])
 
@@ -152,7 +172,8 @@ def _rotation(quaternion: np.ndarray, where: str) -> np.ndarray:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """(number from 1, line) without comments; empty lines stay: images.txt has one for an image without points."""
+    """(number from 1, line) without comments; empty lines stay: images.txt has one for an image
+    without points."""
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.startswith("#"):
             yield number, line.strip()
@@ -166,7 +187,9 @@ def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
         if not words:
             continue
         if len(words) < 5:
-            raise StgaError(f"{where}: expected number, model, width, height and parameters of a camera")
+            raise StgaError(
+                f"{where}: expected number, model, width, height and parameters of a camera"
+            )
         identity, width, height = (_whole(word, where) for word in (words[0], *words[2:4]))
         cameras[identity] = _Intrinsics(words[1], (width, height), tuple(numbers(words[4:], where)))
     return cameras
@@ -180,7 +203,9 @@ def _text_images(path: Path) -> Iterator[_Image]:
         if not words:
             continue
         if len(words) < 10:
-            raise StgaError(f"{where}: expected number, quaternion, translation, camera and name of an image")
+            raise StgaError(
+                f"{where}: expected number, quaternion, translation, camera and name of an image"
+            )
         pose = numbers(words[1:8], where, 7)
         yield _Image(tuple(pose[:4]), tuple(pose[4:]), _whole(words[8], where), words[9])
         next(lines, None)
@@ -205,7 +230,9 @@ class _Cursor:
         try:
             values = struct.unpack_from("<" + layout, self.data, self.offset)
         except struct.error as error:
-            raise StgaError(f"{self.path}: ends within an entry; expected a COLMAP model") from error
+            raise StgaError(
+                f"{self.path}: ends within an entry; expected a COLMAP model"
+            ) from error
         self.offset += struct.calcsize("<" + layout)
         return values
 
@@ -233,7 +260,9 @@ def _binary_cameras(path: Path) -> dict[int, _Intrinsics]:
     for _ in range(cursor.count()):
         identity, model, width, height = (int(value) for value in cursor.unpack("IiQQ"))
         if not 0 <= model < len(MODEL_NAMES) or MODEL_NAMES[model] not in LENSES:
-            raise StgaError(f"{path}: camera {identity}: model {model} is not one of {', '.join(LENSES)}")
+            raise StgaError(
+                f"{path}: camera {identity}: model {model} is not one of {', '.join(LENSES)}"
+            )
         name = MODEL_NAMES[model]
         values = cursor.unpack(f"{(1 if name in SHARED_FOCAL else 2) + 2 + LENSES[name][0]}d")
         cameras[identity] = _Intrinsics(name, (width, height), values)

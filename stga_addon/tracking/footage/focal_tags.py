@@ -1,4 +1,5 @@
-"""Focal lengths that recordings state: EXIF of photos, metadata of the tracks of QuickTime and MP4 files."""
+"""Focal lengths that recordings state: EXIF of photos, metadata of the tracks of QuickTime and MP4
+files."""
 
 import re
 import struct
@@ -11,11 +12,20 @@ from PIL import Image
 from ...capture.images import FORMATS
 
 FULL_FRAME_DIAGONAL_MM = 43.27
-"""Of 36 x 24 mm; equivalent focal lengths have the same angle of view over the diagonal (CIPA DCG-001)."""
+"""Of 36 x 24 mm; equivalent focal lengths have the same angle of view over the diagonal (CIPA
+DCG-001)."""
 MIN_EQUIVALENT_MM, MAX_EQUIVALENT_MM = 5.0, 2000.0
-EXIF, EQUIVALENT, FOCAL, PER_UNIT, UNIT, WIDTH, HEIGHT = 0x8769, 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002, 0xA003
-"""Tags of EXIF 2.32: the directory, FocalLengthIn35mmFilm, FocalLength, FocalPlaneXResolution and its unit, and the
-size of the picture as taken."""
+EXIF, EQUIVALENT, FOCAL, PER_UNIT, UNIT, WIDTH, HEIGHT = (
+    0x8769,
+    0xA405,
+    0x920A,
+    0xA20E,
+    0xA210,
+    0xA002,
+    0xA003,
+)
+"""Tags of EXIF 2.32: the directory, FocalLengthIn35mmFilm, FocalLength, FocalPlaneXResolution and
+its unit, and the size of the picture as taken."""
 UNITS_MM = {2: 25.4, 3: 10.0}
 MAX_ASPECT_DIFFERENCE = 0.01
 """Relative; beyond it, a photo has been cropped, and its tags are those of the whole picture."""
@@ -80,7 +90,8 @@ def _movie(path: Path) -> bytes:
 
 
 def _boxes(data: bytes, start: int = 0) -> Iterator[tuple[bytes, int, int]]:
-    """(kind, first byte of the content, end) of the boxes that follow each other from `start` on."""
+    """(kind, first byte of the content, end) of the boxes that follow each other from `start`
+    on."""
     while start + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, start)
         if size < 8:
@@ -95,7 +106,8 @@ def _equivalent(data: bytes) -> float | None:
         if kind != b"meta":
             continue
         meta = data[first:end]
-        parts = {k: meta[f:e] for k, f, e in _boxes(meta, 0 if meta[4:8] == b"hdlr" else 4)}  # MP4's has a version
+        # MP4's has a version
+        parts = {k: meta[f:e] for k, f, e in _boxes(meta, 0 if meta[4:8] == b"hdlr" else 4)}
         keys = [parts.get(b"keys", b"")[f:e] for _, f, e in _boxes(parts.get(b"keys", b""), 8)]
         if EQUIVALENT_KEY in keys:
             number = struct.pack(">I", keys.index(EQUIVALENT_KEY) + 1)

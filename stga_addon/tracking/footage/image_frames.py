@@ -13,7 +13,8 @@ from ...errors import StgaError
 
 @dataclass(frozen=True)
 class ImageFrames:
-    """`views`: timestep -> the image as recorded, ascending; its camera says how large the image must be."""
+    """`views`: timestep -> the image as recorded, ascending; its camera says how large the image
+    must be."""
 
     views: Mapping[int, View]
 
@@ -22,7 +23,8 @@ class ImageFrames:
         return tuple(self.views)
 
     def require_sizes(self, name: str) -> None:
-        """Read the headers of all images. Raises StgaError for one of another size than camera `name` has."""
+        """Read the headers of all images. Raises StgaError for one of another size than camera
+        `name` has."""
         for timestep, view in self.views.items():
             size, camera = image_size(view.image), view.camera
             if size != (camera.width, camera.height):

@@ -12,12 +12,14 @@ MIN_RADIUS = 1e-9
 class Lens:
     """Distortion of normalized image points, applied in this order.
 
-    projection  how the angle θ off the axis becomes a radius: "perspective" (tan θ), "fisheye" (θ), "field of view"
-                (2 tan θ tan ω/2 → its arc tangent / ω) or "division" (r with r / (1 + k r²) = tan θ)
+    projection  how the angle θ off the axis becomes a radius: "perspective" (tan θ), "fisheye" (θ),
+                "field of view" (2 tan θ tan ω/2 → its arc tangent / ω) or "division" (r with r / (1
+                + k r²) = tan θ)
     parameter   ω (radians) of "field of view", k of "division"
     radial      k1, k2, … of 1 + k1 r² + k2 r⁴ + …, any number
     rational    the same for the denominator (k4 to k6 of OpenCV's rational model)
-    tangential  p1, p2 as OpenCV counts them: x += 2 p1 x y + p2 (r² + 2 x²), y += p1 (r² + 2 y²) + 2 p2 x y
+    tangential  p1, p2 as OpenCV counts them: x += 2 p1 x y + p2 (r² + 2 x²), y += p1 (r² + 2 y²) +
+                2 p2 x y
     prism       s1 to s4: x += s1 r² + s2 r⁴, y += s3 r² + s4 r⁴
     affine      b1, b2 as shares of the focal length: x += b1 x + b2 y
     """
@@ -38,7 +40,8 @@ class Lens:
         )
 
     def distort(self, points: np.ndarray) -> np.ndarray:
-        """Recorded points (…, 2) of ideal ones: both (x, y) / depth, x right, y down, not yet in pixels."""
+        """Recorded points (…, 2) of ideal ones: both (x, y) / depth, x right, y down, not yet in
+        pixels."""
         x, y = np.moveaxis(self._projected(np.asarray(points, np.float64)), -1, 0)
         square = x * x + y * y
         factor = _polynomial(self.radial, square) / _polynomial(self.rational, square)

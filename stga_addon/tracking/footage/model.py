@@ -1,4 +1,5 @@
-"""Footage: the cameras of a rig and their synchronized frames, undistorted and decoded on request."""
+"""Footage: the cameras of a rig and their synchronized frames, undistorted and decoded on
+request."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,8 @@ class Frames(Protocol):
         """Timesteps that have a frame, ascending."""
 
     def image(self, timestep: int) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB. Raises StgaError that names the file; KeyError for a timestep without a frame."""
+        """(H, W, 3) uint8 sRGB. Raises StgaError that names the file; KeyError for a timestep
+        without a frame."""
 
     def mask(self, timestep: int) -> np.ndarray | None:
         """(H, W) uint8, 255 inside; None where the frame has none. Raises as `image` does."""
@@ -34,7 +36,8 @@ class Frames(Protocol):
         """What the frames are read from: their image files, or the video."""
 
     def file(self, timestep: int) -> Path | None:
-        """The image file whose stored pixels are the frame; None in a video, and where they are turned or converted."""
+        """The image file whose stored pixels are the frame; None in a video, and where they are
+        turned or converted."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +72,11 @@ class FootageCamera:
     """A calibrated camera and its frames, as an ideal pinhole sees them.
 
     name       unique in the footage
-    camera     of the undistorted images, with OpenCV axes; its world has the scale and orientation of the calibration
+    camera     of the undistorted images, with OpenCV axes; its world has the scale and orientation
+               of the calibration
     frames     as recorded
-    undistortion  from the recorded frames to those of `camera`; None where the lens has no distortion
+    undistortion  from the recorded frames to those of `camera`; None where the lens has no
+                  distortion
     plate      image file of what the camera records without the person
     mattes     timestep -> mask file of the undistorted frame, which stands in for the recorded mask
     """
@@ -92,20 +97,25 @@ class FootageCamera:
         """The undistorted frame (H, W, 3) uint8 sRGB; transparent pixels are laid over white.
 
         Reading a video in order is fast; going back decodes again from the last key frame.
-        Raises StgaError that names the file; KeyError where the camera has no frame at the timestep.
+        Raises StgaError that names the file; KeyError where the camera has no frame at the
+        timestep.
         """
         image = self.frames.image(timestep)
         return image if self.undistortion is None else self.undistortion(image)
 
     def mask(self, timestep: int) -> np.ndarray | None:
-        """The undistorted foreground mask (H, W) uint8, 255 inside; None where there is none. Raises as `image`."""
+        """The undistorted foreground mask (H, W) uint8, 255 inside; None where there is none.
+        Raises as `image`."""
         if timestep in self.mattes:
-            return read_mask(View(timestep, 0, self.camera, self.name, Path(self.name), self.mattes[timestep]))
+            return read_mask(
+                View(timestep, 0, self.camera, self.name, Path(self.name), self.mattes[timestep])
+            )
         mask = self.frames.mask(timestep)
         return mask if mask is None or self.undistortion is None else self.undistortion(mask)
 
     def clean_plate(self) -> np.ndarray | None:
-        """The undistorted plate (H, W, 3) uint8 sRGB; None where there is none. Raises as `image`."""
+        """The undistorted plate (H, W, 3) uint8 sRGB; None where there is none. Raises as
+        `image`."""
         if self.plate is None:
             return None
         plate = read_image(View(0, 0, self.camera, self.name, self.plate))
@@ -125,10 +135,11 @@ class Footage:
     """What was filmed: cameras with unique names, in the order of the calibration.
 
     timesteps   all that any camera has a frame of, ascending
-    fps         frames per second of the videos, the average where it varies; None where not known, as for most images.
-                Timesteps are numbers of frames
-    focal       where focal lengths are from: "calibration"; of a single camera without one, "given" (in the request),
-                "file" (its EXIF or QuickTime's tags), "usual" (a phone's) or "solved" (by tracking)
+    fps         frames per second of the videos, the average where it varies; None where not known,
+                as for most images. Timesteps are numbers of frames
+    focal       where focal lengths are from: "calibration"; of a single camera without one, "given"
+                (in the request), "file" (its EXIF or QuickTime's tags), "usual" (a phone's) or
+                "solved" (by tracking)
     keeps_world  whether the calibration says that the capture is to keep its world
     warnings    one sentence each
     """
@@ -142,7 +153,8 @@ class Footage:
     warnings: tuple[str, ...] = ()
 
     def views(self) -> Iterator[tuple[int, FootageCamera]]:
-        """(timestep, camera) of every frame, camera by camera in order of time: the fast order for videos."""
+        """(timestep, camera) of every frame, camera by camera in order of time: the fast order for
+        videos."""
         for camera in self.cameras:
             for timestep in camera.timesteps:
                 yield timestep, camera

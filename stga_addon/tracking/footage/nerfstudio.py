@@ -10,7 +10,14 @@ from ...files import read_json
 from .lens import Lens
 from .shots import Shot
 
-PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+PERSPECTIVE_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+)
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -19,11 +26,14 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 def read_nerfstudio(path: Path) -> list[Shot]:
     """Entries of a transforms file; `file_path` is the label. Raises StgaError.
 
-    Their `cy` means what VHAP's does where frames have `timestep_index`, else what OpenCV's does (`read_transforms`).
+    Their `cy` means what VHAP's does where frames have `timestep_index`, else what OpenCV's does
+    (`read_transforms`).
     """
     values = read_json(path)
     entries = values.get("frames") if isinstance(values, dict) else None
-    entries = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+    entries = (
+        [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
+    )
     timed = any("timestep_index" in entry for entry in entries)
     frames = read_transforms(path, "vhap" if timed else "opencv")
     timed = timed or any("keyframe" in entry for entry in entries)
@@ -45,7 +55,8 @@ def _shot(folder: Path, frame: Frame, values: dict[str, Any], timed: bool) -> Sh
         image=view.image,
         timestep=view.timestep if timed else None,
         mask=view.mask or _mask(folder, values, frame.where),
-        camera_name=frame.camera_id or (f"{view.camera_index:02d}" if "camera_index" in values else None),
+        camera_name=frame.camera_id
+        or (f"{view.camera_index:02d}" if "camera_index" in values else None),
     )
 
 
@@ -57,7 +68,9 @@ def _mask(folder: Path, values: dict[str, Any], where: str) -> Path | None:
 
 def _lens(values: dict[str, Any], where: str) -> Lens:
     """The lens of a frame, whose fields come before those at the top level."""
-    model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    model = values.get("camera_model") or (
+        "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"
+    )
     if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
         known = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
         raise StgaError(f"{where}.camera_model: {shorten(model)} is not one of {known}")
@@ -73,6 +86,10 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
 
 def _coefficient(values: dict[str, Any], key: str, where: str) -> float:
     value = values.get(key) or 0.0
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_NUMBER:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not abs(value) <= MAX_NUMBER
+    ):
         raise StgaError(f"{where}.{key}: expected a finite number, not {shorten(value)}")
     return float(value)

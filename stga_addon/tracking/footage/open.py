@@ -51,24 +51,34 @@ def open_footage(
 
     path     folder with an image, a folder of images or a video for each camera; or one video
     cameras  calibration file or folder; None: the one in `path` (`find_calibration`)
-    focal    focal length in pixels of a single camera without a calibration; None: what its file says, else
-             `usual_focal`
-    mattes   folder of masks that stand in for the footage's own, named as its images; those of a video's frames by
-             camera and number, counted from 0, as in left/00012.png
+    focal    focal length in pixels of a single camera without a calibration; None: what its file
+             says, else `usual_focal`
+    mattes   folder of masks that stand in for the footage's own, named as its images; those of a
+             video's frames by camera and number, counted from 0, as in left/00012.png
     Cameras with a folder or video show sequences; where all have one image, it shows one timestep.
-    Raises StgaError in one sentence naming file, field and what was expected, also for a missing image.
+    Raises StgaError in one sentence naming file, field and what was expected, also for a missing
+    image.
     """
     sources, root = _sources(path)
     footage = _open(path, root, sources, cameras, frames, focal)
-    plated = tuple(replace(camera, plate=sources.plates.get(camera.name)) for camera in footage.cameras)
+    plated = tuple(
+        replace(camera, plate=sources.plates.get(camera.name)) for camera in footage.cameras
+    )
     footage = replace(footage, cameras=plated)
     return footage if mattes is None else with_masks(footage, sources, mattes)
 
 
 def _open(
-    path: Path, root: Path, sources: Sources, cameras: Path | None, frames: FrameRange, focal: float | None
+    path: Path,
+    root: Path,
+    sources: Sources,
+    cameras: Path | None,
+    frames: FrameRange,
+    focal: float | None,
 ) -> Footage:
-    calibration = cameras if cameras is not None else find_calibration(root) if isdir(path) else None
+    calibration = (
+        cameras if cameras is not None else find_calibration(root) if isdir(path) else None
+    )
     if calibration is None:
         return _single_camera(root, sources, frames, focal)
     if focal is not None:
@@ -79,14 +89,22 @@ def _open(
     return replace(found, keeps_world=all(shot.keeps_world for shot in shots), warnings=warnings)
 
 
-def _calibrated(root: Path, sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange) -> Footage:
+def _calibrated(
+    root: Path, sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange
+) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
     if (frames.offsets or frames.sync != "none") and not any(names):
-        raise StgaError(f"{calibration}: lists images, which offsets do not apply to; expected none")
+        raise StgaError(
+            f"{calibration}: lists images, which offsets do not apply to; expected none"
+        )
     if timed:
-        found = _listed_cameras([shot for shot in shots if frames.selects(shot.timestep or 0)], calibration)
-        return _footage(root, found, next((shot.fps for shot in shots if shot.fps is not None), None))
+        found = _listed_cameras(
+            [shot for shot in shots if frames.selects(shot.timestep or 0)], calibration
+        )
+        return _footage(
+            root, found, next((shot.fps for shot in shots if shot.fps is not None), None)
+        )
     if any(names):
         rig = _by_name(shots, names, root)
         sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
@@ -104,7 +122,10 @@ def _sources(path: Path) -> tuple[Sources, Path]:
 
 
 def _footage(
-    root: Path, cameras: tuple[FootageCamera, ...], fps: float | None = None, warnings: tuple[str, ...] = ()
+    root: Path,
+    cameras: tuple[FootageCamera, ...],
+    fps: float | None = None,
+    warnings: tuple[str, ...] = (),
 ) -> Footage:
     timesteps = {timestep for camera in cameras for timestep in camera.timesteps}
     return Footage(root, cameras, tuple(sorted(timesteps)), fps, warnings=warnings)
@@ -114,11 +135,14 @@ def _footage(
 
 
 def _by_name(shots: list[Shot], names: list[str | None], root: Path) -> dict[str, Shot]:
-    """Camera -> its shot. Raises StgaError for a camera without recording, and for two with the same."""
+    """Camera -> its shot. Raises StgaError for a camera without recording, and for two with the
+    same."""
     found: dict[str, Shot] = {}
     for shot, name in zip(shots, names, strict=True):
         if name is None:
-            raise StgaError(f"{shot.where}: {root} has no folder or video of this camera, though it has of others")
+            raise StgaError(
+                f"{shot.where}: {root} has no folder or video of this camera, though it has of others"
+            )
         if name in found:
             raise StgaError(
                 f"{shot.where}: and {found[name].where} are both of camera {name}; expected different names"
@@ -128,18 +152,31 @@ def _by_name(shots: list[Shot], names: list[str | None], root: Path) -> dict[str
 
 
 def _rig(
-    root: Path, sources: Sources, sequences: Mapping[str, Sequence], shots: Mapping[str, Shot], frames: FrameRange
+    root: Path,
+    sources: Sources,
+    sequences: Mapping[str, Sequence],
+    shots: Mapping[str, Shot],
+    frames: FrameRange,
 ) -> Footage:
     fps = frames_per_second(sequences)
-    videos = {name: sequence for name, sequence in sequences.items() if isinstance(sequence, video.Video)}
+    videos = {
+        name: sequence for name, sequence in sequences.items() if isinstance(sequence, video.Video)
+    }
     warnings = tuple(warning for each in videos.values() for warning in each.warnings)
     if frames.sync != "none":
         if len(videos) < max(2, len(sequences)) or fps is None:
-            raise StgaError(f"{root}: expected a video of each of several cameras, whose clocks --sync compares")
+            raise StgaError(
+                f"{root}: expected a video of each of several cameras, whose clocks --sync compares"
+            )
         found, sentences = clock_offsets(videos, fps, frames.sync)
-        frames, warnings = replace(frames, offsets={**found, **frames.offsets}), (*warnings, *sentences)
+        frames, warnings = (
+            replace(frames, offsets={**found, **frames.offsets}),
+            (*warnings, *sentences),
+        )
     recorded = synchronized(sequences, shots, sources, frames)
-    return _footage(root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps, warnings)
+    return _footage(
+        root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps, warnings
+    )
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
@@ -149,15 +186,21 @@ def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
     return FootageCamera(name, shot.camera if found is None else found.camera, frames, found)
 
 
-def _single_camera(root: Path, sources: Sources, frames: FrameRange, focal: float | None) -> Footage:
+def _single_camera(
+    root: Path, sources: Sources, frames: FrameRange, focal: float | None
+) -> Footage:
     """Footage of one camera without a calibration; its world is the camera's, y up."""
     names = sorted({*sources.videos, *sources.folders})
     if len(names) != 1:
         found = f"{len(names)} cameras" if names else "neither images nor videos"
-        raise StgaError(f"{root}: has {found} and no calibration; expected {EXPECTED}, or one camera")
+        raise StgaError(
+            f"{root}: has {found} and no calibration; expected {EXPECTED}, or one camera"
+        )
     sequence: Sequence = open_sequence(sequence_files(sources, names[0]))
     width, height = sequence_size(sequence)
-    pixels, known = (focal, "given") if focal is not None else _stated_focal(sequence, width, height)
+    pixels, known = (
+        (focal, "given") if focal is not None else _stated_focal(sequence, width, height)
+    )
     if pixels < 1:
         raise StgaError(f"Focal length: expected at least 1 pixel, not {pixels:g}")
     camera = camera_from_gl(np.eye(4), width, height, pixels, pixels, width / 2, height / 2)
@@ -186,7 +229,8 @@ def usual_focal(width: int, height: int) -> float:
 def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
     """Shots with their image, after which they are named, and which shows the only timestep.
 
-    Raises StgaError for two of the same pose: the images of a camera that stands still are a sequence.
+    Raises StgaError for two of the same pose: the images of a camera that stands still are a
+    sequence.
     """
     found, poses = [], dict[bytes, Shot]()
     for shot in shots:
@@ -224,7 +268,9 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
     for name, group in zip(names, groups.values(), strict=True):
         unique = name if names.count(name) == 1 else f"{name} at timestep {group[0].timestep}"
         if unique in (camera.name for camera in cameras):
-            raise StgaError(f"{group[0].where}: two cameras are named {unique}; expected different names")
+            raise StgaError(
+                f"{group[0].where}: two cameras are named {unique}; expected different names"
+            )
         cameras.append(_camera(unique, group[0], ImageFrames(_views(unique, group))))
     return tuple(cameras)
 

@@ -17,7 +17,8 @@ MAX_POSITION = 1e12
 
 
 def read_text(path: Path) -> str:
-    """The whole file, with or without a byte order mark. Raises StgaError as `read_bytes`, and where not UTF-8."""
+    """The whole file, with or without a byte order mark. Raises StgaError as `read_bytes`, and
+    where not UTF-8."""
     try:
         return read_bytes(path).decode("utf-8-sig")
     except ValueError as error:
@@ -25,7 +26,8 @@ def read_text(path: Path) -> str:
 
 
 def read_xml(path: Path) -> ElementTree.Element:
-    """The root element. Raises StgaError where it is malformed, or declares entities, which calibrations never do."""
+    """The root element. Raises StgaError where it is malformed, or declares entities, which
+    calibrations never do."""
     data = read_bytes(path)
     if b"<!DOCTYPE" in data:
         raise StgaError(f"{path}: declares a document type; expected a calibration")
@@ -36,14 +38,19 @@ def read_xml(path: Path) -> ElementTree.Element:
 
 
 def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[float]:
-    """Finite numbers. Raises StgaError, beginning with `where`, for other words or another count."""
+    """Finite numbers. Raises StgaError, beginning with `where`, for other words or another
+    count."""
     words = list(words)
     try:
         values = [float(word) for word in words]
     except ValueError:
         values = [math.nan]
     if not all(math.isfinite(value) for value in values) or count not in (None, len(values)):
-        expected = "finite numbers" if count is None else f"{count} finite number{'s' if count > 1 else ''}"
+        expected = (
+            "finite numbers"
+            if count is None
+            else f"{count} finite number{'s' if count > 1 else ''}"
+        )
         raise StgaError(f"{where}: expected {expected}, not {shorten(' '.join(words))}")
     return values
 
@@ -58,17 +65,22 @@ def pinhole(
 ) -> Camera:
     """Camera of a calibration.
 
-    size, focal, center: (x, y) in pixels, the center from the top-left corner. rotation (3, 3) from world to OpenCV's
-    camera axes; position (3,) of the camera in the calibration's world, whose unit is free.
-    Raises StgaError, beginning with `where`, for a size, focal length, principal point or pose that no camera has.
+    size, focal, center: (x, y) in pixels, the center from the top-left corner. rotation (3, 3) from
+    world to OpenCV's camera axes; position (3,) of the camera in the calibration's world, whose
+    unit is free. Raises StgaError, beginning with `where`, for a size, focal length, principal
+    point or pose that no camera has.
     """
     if not is_image_size(*size):
         raise StgaError(f"{where}: expected an image size in pixels, not {size[0]:g} x {size[1]:g}")
     if not all(1 <= value <= MAX_FOCAL_PIXELS for value in focal):
-        raise StgaError(f"{where}: expected a focal length of 1 to 1e7 pixels, not {focal[0]:g}, {focal[1]:g}")
+        raise StgaError(
+            f"{where}: expected a focal length of 1 to 1e7 pixels, not {focal[0]:g}, {focal[1]:g}"
+        )
     if not all(abs(value) <= MAX_FOCAL_PIXELS for value in center):  # also where it is not a number
         found = f"{center[0]:g}, {center[1]:g}"
-        raise StgaError(f"{where}: expected a principal point within {MAX_FOCAL_PIXELS:g} pixels, not {found}")
+        raise StgaError(
+            f"{where}: expected a principal point within {MAX_FOCAL_PIXELS:g} pixels, not {found}"
+        )
     if not (np.abs(position) <= MAX_POSITION).all():
         raise StgaError(f"{where}: expected a camera within {MAX_POSITION:g} units of the origin")
     bounded = np.abs(rotation).max() <= 1 + ROTATION_TOLERANCE

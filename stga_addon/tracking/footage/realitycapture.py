@@ -1,4 +1,5 @@
-"""Cameras of RealityCapture and RealityScan: the CSV of internal and external parameters, or an XMP file an image."""
+"""Cameras of RealityCapture and RealityScan: the CSV of internal and external parameters, or an XMP
+file an image."""
 
 import csv
 import io
@@ -20,7 +21,8 @@ NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 XMP_MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
 
 ImageSize = Callable[[str], tuple[int, int]]
-"""Label of a camera -> (width, height) of its images, which neither file holds. Raises StgaError."""
+"""Label of a camera -> (width, height) of its images, which neither file holds. Raises
+StgaError."""
 
 
 def is_realitycapture_csv(path: Path) -> bool:
@@ -33,14 +35,17 @@ def is_realitycapture_csv(path: Path) -> bool:
 def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
     """One shot a line, labelled with the image's name.
 
-    Columns: name, x, y, alt, heading, pitch, roll (degrees), f (35 mm film), and, where they are there, px, py (shares
-    of the longer side), k1 to k4, t1, t2. Raises StgaError that names file and line.
+    Columns: name, x, y, alt, heading, pitch, roll (degrees), f (35 mm film), and, where they are
+    there, px, py (shares of the longer side), k1 to k4, t1, t2. Raises StgaError that names file
+    and line.
     """
     rows = _csv_rows(path)
     columns = _columns(next(rows, (1, []))[1])
     missing = [name for name in REQUIRED_COLUMNS if name not in columns]
     if missing:
-        raise StgaError(f"{path}: has no column {', '.join(missing)}; expected internal and external camera parameters")
+        raise StgaError(
+            f"{path}: has no column {', '.join(missing)}; expected internal and external camera parameters"
+        )
     shots = []
     for number, line in rows:
         where = f"{path}: line {number}"
@@ -54,7 +59,9 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
     return shots
 
 
-def read_realitycapture_xmp(paths: Iterable[Path], image_size: ImageSize) -> tuple[list[Shot], list[str]]:
+def read_realitycapture_xmp(
+    paths: Iterable[Path], image_size: ImageSize
+) -> tuple[list[Shot], list[str]]:
     """One shot an XMP file with a pose, labelled with its name; and the names of those without.
 
     Raises StgaError that names file and field.
@@ -86,13 +93,16 @@ def _columns(names: Iterable[str]) -> list[str]:
 
 def _csv_shot(label: str, values: dict[str, float], size: tuple[int, int], where: str) -> Shot:
     heading, pitch, roll = (np.deg2rad(values[name]) for name in ("heading", "pitch", "roll"))
-    # With all angles zero, the camera looks down and north (y) is up in the image. Heading turns clockwise.
+    # With all angles zero, the camera looks down and north (y) is up in the image. Heading turns
+    # clockwise.
     to_world = _turn(2, -heading) @ _turn(0, pitch) @ _turn(1, roll)
     rotation = GL_TO_CV[:3, :3] @ to_world.T
     position = np.array([values[name] for name in ("x", "y", "alt")])
     coefficients = [values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "t1", "t2")]
     focal, center = values["f"] / FILM_WIDTH_MM, (values.get("px", 0.0), values.get("py", 0.0))
-    return _shot(label, size, (focal, focal), center, rotation, position, _lens(coefficients), where)
+    return _shot(
+        label, size, (focal, focal), center, rotation, position, _lens(coefficients), where
+    )
 
 
 def _turn(axis: int, angle: float) -> np.ndarray:
@@ -109,7 +119,9 @@ def _xmp_fields(path: Path) -> dict[str, str]:
     fields = {}
     for element in read_xml(path).iter():
         named = {**element.attrib, element.tag: element.text or ""}
-        fields.update({k.removeprefix(NAMESPACE): v for k, v in named.items() if k.startswith(NAMESPACE)})
+        fields.update(
+            {k.removeprefix(NAMESPACE): v for k, v in named.items() if k.startswith(NAMESPACE)}
+        )
     return fields
 
 
@@ -134,7 +146,9 @@ def _xmp_shot(path: Path, fields: dict[str, str], size: tuple[int, int]) -> Shot
     rotation = np.array(values("Rotation", "", 9)).reshape(3, 3)  # world to camera, OpenCV axes
     center = values("PrincipalPointU", "0")[0], values("PrincipalPointV", "0")[0]
     focals = focal, focal * values("AspectRatio", "1")[0]
-    return _shot(path.stem, size, focals, center, rotation, np.array(values("Position", "", 3)), lens, where)
+    return _shot(
+        path.stem, size, focals, center, rotation, np.array(values("Position", "", 3)), lens, where
+    )
 
 
 def _lens(coefficients: list[float], skew: float = 0.0) -> Lens:
@@ -156,5 +170,7 @@ def _shot(
     """focal, and center from the middle of the image, are shares of the image's longer side."""
     scale = max(size)
     principal = size[0] / 2 + center[0] * scale, size[1] / 2 + center[1] * scale
-    camera = pinhole(size, (focal[0] * scale, focal[1] * scale), principal, rotation, position, where)
+    camera = pinhole(
+        size, (focal[0] * scale, focal[1] * scale), principal, rotation, position, where
+    )
     return Shot(label, camera, lens, where)

@@ -16,10 +16,13 @@ from .video import Video, VideoFrames, read_video, video_size
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Which frames are used: `start`, `start` + `step`, … before `stop` (None: to the end), counted from 0.
+    """Which frames are used: `start`, `start` + `step`, … before `stop` (None: to the end), counted
+    from 0.
 
-    offsets  camera -> how many frames later its recording shows the same moment; 0 for those not named
-    sync     how offsets that are not given are found, "sound", "motion" or "auto" as in `clock_offsets`, or "none"
+    offsets  camera -> how many frames later its recording shows the same moment; 0 for those not
+             named
+    sync     how offsets that are not given are found, "sound", "motion" or "auto" as in
+             `clock_offsets`, or "none"
     """
 
     start: int = 0
@@ -31,7 +34,9 @@ class FrameRange:
     def __post_init__(self) -> None:
         if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):
             stop = "the end" if self.stop is None else self.stop
-            raise StgaError(f"Frames {self.start} to {stop} in steps of {self.step} are none; expected at least one")
+            raise StgaError(
+                f"Frames {self.start} to {stop} in steps of {self.step} are none; expected at least one"
+            )
 
     def selects(self, timestep: int) -> bool:
         before_stop = self.stop is None or timestep < self.stop
@@ -43,12 +48,14 @@ Sequence = Video | list[Path]
 
 
 def open_sequence(files: Path | list[Path]) -> Sequence:
-    """Index a video; images are taken as they are. Raises StgaError where the video cannot be read."""
+    """Index a video; images are taken as they are. Raises StgaError where the video cannot be
+    read."""
     return read_video(files) if isinstance(files, Path) else files
 
 
 def recorded_size(files: Path | list[Path]) -> tuple[int, int]:
-    """(width, height) of the first frame, without an index of the video. Raises StgaError as `open_sequence` does."""
+    """(width, height) of the first frame, without an index of the video. Raises StgaError as
+    `open_sequence` does."""
     return video_size(files) if isinstance(files, Path) else image_size(files[0])
 
 
@@ -58,8 +65,13 @@ def sequence_size(sequence: Sequence) -> tuple[int, int]:
 
 
 def frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
-    """Of the videos; None where none says a plausible one. Raises StgaError for videos of different rates."""
-    rates = {name: s.fps for name, s in sequences.items() if isinstance(s, Video) and 0 < s.fps < FPS_LIMIT}
+    """Of the videos; None where none says a plausible one. Raises StgaError for videos of different
+    rates."""
+    rates = {
+        name: s.fps
+        for name, s in sequences.items()
+        if isinstance(s, Video) and 0 < s.fps < FPS_LIMIT
+    }
     first = next(iter(rates), None)
     for name, rate in rates.items():
         if first is not None and abs(rate - rates[first]) > 0.01 * rates[first]:
@@ -71,12 +83,16 @@ def frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
 
 
 def synchronized(
-    sequences: Mapping[str, Sequence], shots: Mapping[str, Shot], sources: Sources, frames: FrameRange
+    sequences: Mapping[str, Sequence],
+    shots: Mapping[str, Shot],
+    sources: Sources,
+    frames: FrameRange,
 ) -> dict[str, Frames]:
-    """Frames of each camera; timestep t is frame t + offset of its recording. Timesteps of which a video whose rate
-    varies has no frame are left out.
+    """Frames of each camera; timestep t is frame t + offset of its recording. Timesteps of which a
+    video whose rate varies has no frame are left out.
 
-    Raises StgaError where a camera has fewer frames than another, lacks one in between, or is of another size.
+    Raises StgaError where a camera has fewer frames than another, lacks one in between, or is of
+    another size.
     """
     unknown = set(frames.offsets) - set(sequences)
     if unknown:
@@ -84,7 +100,10 @@ def synchronized(
     first, last = _common_range(sequences, frames)
     recorded = {name: _numbers(sequence) for name, sequence in sequences.items()}
     shared = set.intersection(
-        *({number - frames.offsets.get(name, 0) for number in own} for name, own in recorded.items())
+        *(
+            {number - frames.offsets.get(name, 0) for number in own}
+            for name, own in recorded.items()
+        )
     )
     timesteps = [t for t in sorted(shared) if first <= t < last and frames.selects(t)]
     if not timesteps:
@@ -109,11 +128,16 @@ def _common_range(sequences: Mapping[str, Sequence], frames: FrameRange) -> tupl
 
     Recordings of different length may start at different moments, so they need a `stop` or offsets.
     """
-    lengths = {name: s.timesteps[-1] + 1 if isinstance(s, Video) else len(s) for name, s in sequences.items()}
+    lengths = {
+        name: s.timesteps[-1] + 1 if isinstance(s, Video) else len(s)
+        for name, s in sequences.items()
+    }
     longest = max(lengths, key=lambda name: lengths[name])
     for name, length in lengths.items():
         if frames.stop is not None and length - frames.offsets.get(name, 0) < frames.stop:
-            raise StgaError(f"Camera {name} has {length} frames; expected all up to {frames.stop} and its offset")
+            raise StgaError(
+                f"Camera {name} has {length} frames; expected all up to {frames.stop} and its offset"
+            )
         if frames.stop is None and not frames.offsets and length != lengths[longest]:
             raise StgaError(
                 f"Camera {name} has {length} frames and camera {longest} {lengths[longest]}; expected recordings of "
@@ -123,7 +147,9 @@ def _common_range(sequences: Mapping[str, Sequence], frames: FrameRange) -> tupl
     return first, min(length - frames.offsets.get(name, 0) for name, length in lengths.items())
 
 
-def _require_same_gaps(sequences: Mapping[str, Sequence], frames: FrameRange, timesteps: list[int]) -> None:
+def _require_same_gaps(
+    sequences: Mapping[str, Sequence], frames: FrameRange, timesteps: list[int]
+) -> None:
     """Raise StgaError where the numbers in image names say that cameras lack different frames."""
     patterns: dict[str, list[int]] = {}
     for name, sequence in sequences.items():
@@ -148,7 +174,9 @@ def _frames(sequence: Sequence, numbers: dict[int, int], shot: Shot, sources: So
     if size != (camera.width, camera.height):
         path = sequence.path if isinstance(sequence, Video) else sequence[0]
         expected = f"{camera.width} x {camera.height}"
-        raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, but {shot.where} has {expected}")
+        raise StgaError(
+            f"{path}: has {size[0]} x {size[1]} pixels, but {shot.where} has {expected}"
+        )
     if isinstance(sequence, Video):
         return VideoFrames(sequence, numbers)
     views = {

@@ -20,7 +20,8 @@ MAX_FILES = 1_000_000
 
 @dataclass
 class Sources:
-    """Files of a footage folder, by path below it without suffix and without a leading "images/" and the like.
+    """Files of a footage folder, by path below it without suffix and without a leading "images/"
+    and the like.
 
     images   "cam01/0001" -> files
     folders  "cam01" -> its images, in natural order; "" for those that lie at the top
@@ -47,14 +48,17 @@ class Sources:
 
 
 def find_sources(root: Path) -> Sources:
-    """List the footage folder, four levels deep, without hidden folders. Raises StgaError for over a million files."""
+    """List the footage folder, four levels deep, without hidden folders. Raises StgaError for over
+    a million files."""
     sources, count = Sources(root), 0
     for folder, names, files in os.walk(root):
         depth = len(Path(folder).relative_to(root).parts)
         names[:] = sorted(name for name in names if not name.startswith(".") and depth < MAX_DEPTH)
         count += len(files)
         if count > MAX_FILES:
-            raise StgaError(f"{root}: holds more than {MAX_FILES} files; expected a folder of footage")
+            raise StgaError(
+                f"{root}: holds more than {MAX_FILES} files; expected a folder of footage"
+            )
         for name in sorted(files, key=natural_order):
             _enter(sources, Path(folder, name))
     return sources
@@ -81,8 +85,8 @@ def _enter(sources: Sources, path: Path) -> None:
 def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
     """For each label, the name of its camera's folder or video; None where it has neither.
 
-    The name is the label, with or without suffix and leading folders; or the folder of the image that the camera was
-    calibrated with, where no other camera's lies there.
+    The name is the label, with or without suffix and leading folders; or the folder of the image
+    that the camera was calibrated with, where no other camera's lies there.
     """
     labels = list(labels)
     parents = [_stem(label).rpartition("/")[0] for label in labels]
@@ -91,22 +95,30 @@ def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
         names = _tails(label)
         if parent and parents.count(parent) == 1:
             names += _tails(parent)
-        found.append(next((n for n in names if n in sources.videos or (n and n in sources.folders)), None))
+        found.append(
+            next((n for n in names if n in sources.videos or (n and n in sources.folders)), None)
+        )
     return found
 
 
 def still_image(sources: Sources, label: str, where: str) -> Path:
-    """The image of that name. Raises StgaError, beginning with `where`, where there is none, or more than one."""
+    """The image of that name. Raises StgaError, beginning with `where`, where there is none, or
+    more than one."""
     found = next((sources.images[name] for name in _tails(label) if name in sources.images), [])
     if not found:
-        raise StgaError(f"{where}: {sources.root} has no image, folder or video of the name {shorten(label)}")
+        raise StgaError(
+            f"{where}: {sources.root} has no image, folder or video of the name {shorten(label)}"
+        )
     if len(found) > 1:
-        raise StgaError(f"{where}: {found[0]} and {found[1]} are both named {shorten(label)}; expected one")
+        raise StgaError(
+            f"{where}: {found[0]} and {found[1]} are both named {shorten(label)}; expected one"
+        )
     return found[0]
 
 
 def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
-    """The video of a camera, or its images in order. Raises StgaError where there are both, or two videos."""
+    """The video of a camera, or its images in order. Raises StgaError where there are both, or two
+    videos."""
     videos, images = sources.videos.get(name, []), sources.folders.get(name, [])
     if len(videos) > 1 or (videos and images):
         other = videos[1] if len(videos) > 1 else images[0].parent
@@ -146,6 +158,7 @@ def _stem(label: str) -> str:
 
 
 def _tails(label: str) -> list[str]:
-    """The label without suffix, then without its first folder, its second, …; none deeper than footage is searched."""
+    """The label without suffix, then without its first folder, its second, …; none deeper than
+    footage is searched."""
     parts = [part for part in _stem(label).split("/") if part not in ("", ".")][-MAX_DEPTH - 1 :]
     return ["/".join(parts[start:]) for start in range(len(parts))]

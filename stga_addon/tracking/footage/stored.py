@@ -14,7 +14,8 @@ from .model import DerivedFrames, Footage, FootageCamera
 
 @dataclass(frozen=True)
 class StoredFrames(DerivedFrames):
-    """Frames as recorded; `views`: timestep -> the image file that a frame is kept in from its first use."""
+    """Frames as recorded; `views`: timestep -> the image file that a frame is kept in from its
+    first use."""
 
     views: Mapping[int, View]
 
@@ -35,7 +36,8 @@ class StoredFrames(DerivedFrames):
 
 
 def with_stored(footage: Footage, images: Mapping[str, Mapping[int, Path]]) -> Footage:
-    """The footage whose undistorted frames that are no files yet are kept in those of their camera: timestep -> PNG.
+    """The footage whose undistorted frames that are no files yet are kept in those of their camera:
+    timestep -> PNG.
 
     A file that exists is that of the frame. Lenses with distortion are left out.
     """
@@ -43,7 +45,10 @@ def with_stored(footage: Footage, images: Mapping[str, Mapping[int, Path]]) -> F
     def stored(camera: FootageCamera) -> FootageCamera:
         if camera.undistortion is not None or camera.file(camera.timesteps[0]) is not None:
             return camera
-        views = {t: View(t, 0, camera.camera, camera.name, images[camera.name][t]) for t in camera.timesteps}
+        views = {
+            t: View(t, 0, camera.camera, camera.name, images[camera.name][t])
+            for t in camera.timesteps
+        }
         return replace(camera, frames=StoredFrames(camera.frames, views))
 
     return replace(footage, cameras=tuple(map(stored, footage.cameras)))

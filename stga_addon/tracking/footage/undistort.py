@@ -11,10 +11,12 @@ from ...errors import StgaError
 from .lens import Lens
 
 ZOOM_RANGE = 0.5, 2.0
-"""Of the pinhole's focal length over the lens's: a fisheye's rim would otherwise leave few pixels for the middle."""
+"""Of the pinhole's focal length over the lens's: a fisheye's rim would otherwise leave few pixels
+for the middle."""
 ZOOM_STEPS = 30
 BORDER_POINTS = 33
-"""Points along a side of the image at which it is checked that nothing beyond the recorded image is shown."""
+"""Points along a side of the image at which it is checked that nothing beyond the recorded image is
+shown."""
 CACHED_MAPS = 32
 """Lenses whose maps are kept: 6 bytes a pixel each."""
 
@@ -38,24 +40,32 @@ class Undistortion:
 def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | None:
     """The undistortion of a camera's frames; None for an ideal lens.
 
-    The pinhole keeps size, pose, principal point and aspect; its focal length is the shortest with which every pixel
-    was recorded. Raises StgaError, beginning with `where`, without OpenCV, and for a lens that folds the image.
+    The pinhole keeps size, pose, principal point and aspect; its focal length is the shortest with
+    which every pixel was recorded. Raises StgaError, beginning with `where`, without OpenCV, and
+    for a lens that folds the image.
     """
     if lens.is_ideal:
         return None
     try:
         _opencv()
     except ImportError as error:
-        raise StgaError(f"{where}: its lens is distorted; undistorting needs opencv-python-headless") from error
+        raise StgaError(
+            f"{where}: its lens is distorted; undistorting needs opencv-python-headless"
+        ) from error
     zoom = _zoom(recorded, lens, where)
-    return Undistortion(recorded, lens, replace(recorded, fl_x=recorded.fl_x * zoom, fl_y=recorded.fl_y * zoom))
+    return Undistortion(
+        recorded, lens, replace(recorded, fl_x=recorded.fl_x * zoom, fl_y=recorded.fl_y * zoom)
+    )
 
 
 def _zoom(recorded: Camera, lens: Lens, where: str) -> float:
-    """The shortest focal length, as a factor, with which the border of the image shows recorded pixels only."""
+    """The shortest focal length, as a factor, with which the border of the image shows recorded
+    pixels only."""
     low, high = ZOOM_RANGE
     if not _is_inside(recorded, lens, high):
-        raise StgaError(f"{where}: the distortion of its lens folds the image; expected coefficients of this camera")
+        raise StgaError(
+            f"{where}: the distortion of its lens folds the image; expected coefficients of this camera"
+        )
     for _ in range(ZOOM_STEPS):
         middle = (low + high) / 2
         low, high = (low, middle) if _is_inside(recorded, lens, middle) else (middle, high)
@@ -63,7 +73,8 @@ def _zoom(recorded: Camera, lens: Lens, where: str) -> float:
 
 
 def _is_inside(recorded: Camera, lens: Lens, zoom: float) -> bool:
-    """Whether the pinhole's border lies in the recorded image, and the lens spreads all rays to it outward."""
+    """Whether the pinhole's border lies in the recorded image, and the lens spreads all rays to it
+    outward."""
     width, height = recorded.width, recorded.height
     along = np.linspace(0, 1, BORDER_POINTS)
     edge = np.concatenate([np.stack([along, side], axis=1) for side in (0 * along, 0 * along + 1)])
@@ -95,7 +106,9 @@ def _maps(
     x = (np.arange(width) + 0.5 - cx) / fl_x
     for row in range(height):
         y = np.full(width, (row + 0.5 - cy) / fl_y)
-        maps[row] = lens.distort(np.stack([x, y], axis=-1)) * recorded[2:4] + np.array(recorded[4:]) - 0.5
+        maps[row] = (
+            lens.distort(np.stack([x, y], axis=-1)) * recorded[2:4] + np.array(recorded[4:]) - 0.5
+        )
     coarse, fine = _opencv().convertMaps(maps, None, _opencv().CV_16SC2)
     return coarse, fine
 

@@ -29,9 +29,11 @@ DISPLAY_MATRIX_ONE = 1 << 16
 CHECKED_FRAMES = 8
 """Frames at the beginning of a video that are decoded to check the times of its packets."""
 MAX_FRAMES_AHEAD = 100
-"""Frames that are decoded to reach a later one; further ahead, the key frame before it is sought."""
+"""Frames that are decoded to reach a later one; further ahead, the key frame before it is
+sought."""
 SEEK_BACK_FRAMES = (0, 16, 64, 256)
-"""How far before a frame a seek is tried, one after the other, before all is decoded from the beginning."""
+"""How far before a frame a seek is tried, one after the other, before all is decoded from the
+beginning."""
 RATE_TOLERANCE = 0.01
 """Relative difference up to which a stated frame rate is that of the frames' times."""
 VARIABLE_RATE_FACTOR = 1.5
@@ -42,12 +44,14 @@ VARIABLE_RATE_FACTOR = 1.5
 class Video:
     """What a video holds.
 
-    times     presentation times of the frames that are shown, ascending, in the stream's time base; their numbers where
-              the file holds no reliable times
-    timesteps  of the frames, not descending: their numbers, but where the rate varies their times in units of 1 / fps
+    times     presentation times of the frames that are shown, ascending, in the stream's time base;
+              their numbers where the file holds no reliable times
+    timesteps  of the frames, not descending: their numbers, but where the rate varies their times
+               in units of 1 / fps
     fps       frames per second; without its gaps where it varies; 0 where unknown
     size      (width, height) as displayed
-    seekable  whether a frame is recognized by its time; False: frames are counted from the beginning
+    seekable  whether a frame is recognized by its time; False: frames are counted from the
+              beginning
     warnings  one sentence each
     """
 
@@ -63,7 +67,8 @@ class Video:
 def read_video(path: Path) -> Video:
     """Index a video. Raises StgaError where it cannot be read, or without PyAV.
 
-    Where the container says when packets are shown, only the first frames are decoded; otherwise, all are.
+    Where the container says when packets are shown, only the first frames are decoded; otherwise,
+    all are.
     """
     size, first = _first_frames(path)
     times: Sequence[int | None] | None = _packet_times(path)
@@ -72,7 +77,9 @@ def read_video(path: Path) -> Video:
         times, left_out = _decoded_times(path), 0
     with opened_video(path) as container:
         stream = container.streams.video[0]
-        seekable = _ascending(times) and (_is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream))
+        seekable = _ascending(times) and (
+            _is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream)
+        )
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
         time_base = float(stream.time_base)
     if not seekable:
@@ -81,7 +88,9 @@ def read_video(path: Path) -> Video:
     shown = tuple(time for time in times[left_out:] if time is not None)
     timesteps, fps, warnings = _timed(path, shown, time_base, rates)
     if left_out:
-        warnings += (f"{path}: its first {left_out} frames cannot be decoded; they are left out, and not counted",)
+        warnings += (
+            f"{path}: its first {left_out} frames cannot be decoded; they are left out, and not counted",
+        )
     return Video(path, shown, timesteps, fps, size, warnings=warnings)
 
 
@@ -91,7 +100,8 @@ def video_size(path: Path) -> tuple[int, int]:
 
 
 class VideoFrames:
-    """`numbers`: timestep -> number of the frame in the video, ascending. One decoder: not for two threads at once."""
+    """`numbers`: timestep -> number of the frame in the video, ascending. One decoder: not for two
+    threads at once."""
 
     def __init__(self, video: Video, numbers: Mapping[int, int]) -> None:
         self.video, self.numbers = video, numbers
@@ -115,7 +125,9 @@ class VideoFrames:
             pixels = _pixels(self._frame(number))
         except (av.FFmpegError, ValueError) as error:
             self.close()
-            raise StgaError(f"{self.source(timestep)}: cannot be decoded ({_reason(error)})") from error
+            raise StgaError(
+                f"{self.source(timestep)}: cannot be decoded ({_reason(error)})"
+            ) from error
         if timestep == self.timesteps[-1]:
             self.close()  # a decoder holds dozens of frames, and a rig has dozens of cameras
         return pixels
@@ -140,7 +152,8 @@ class VideoFrames:
         self._container, self._decoder, self._decoded = None, None, -1
 
     def _frame(self, number: int) -> Any:
-        """The frame, decoded on from the last one, from a key frame before it, or from the beginning.
+        """The frame, decoded on from the last one, from a key frame before it, or from the
+        beginning.
 
         Raises ValueError where the decoder gives no frame of that time.
         """
@@ -163,7 +176,9 @@ class VideoFrames:
         from av.error import FFmpegError
 
         seekable = self.video.seekable
-        if self._decoder is not None and 0 < number - self._decoded <= (MAX_FRAMES_AHEAD if seekable else number + 1):
+        if self._decoder is not None and 0 < number - self._decoded <= (
+            MAX_FRAMES_AHEAD if seekable else number + 1
+        ):
             yield self._decoder
         for back in SEEK_BACK_FRAMES if seekable else ():
             if number - back > 0:
@@ -184,7 +199,9 @@ class VideoFrames:
         if not self.video.seekable:
             return next(itertools.islice(self._decoder, number - self._decoded - 1, None), None)
         time = self.video.times[number]
-        frame = next((frame for frame in self._decoder if frame.pts is not None and frame.pts >= time), None)
+        frame = next(
+            (frame for frame in self._decoder if frame.pts is not None and frame.pts >= time), None
+        )
         return frame if frame is not None and frame.pts == time else None
 
     def _open(self) -> None:
@@ -194,7 +211,8 @@ class VideoFrames:
 
 
 def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
-    """Size (width, height) as displayed and times of the first frames in the order shown. Raises StgaError."""
+    """Size (width, height) as displayed and times of the first frames in the order shown. Raises
+    StgaError."""
     with opened_video(path) as container:
         frames = _decoded_frames(container)
         first = next(frames, None)
@@ -221,16 +239,24 @@ def opened_video(path: Path) -> Iterator[Any]:
 
 
 def _packet_times(path: Path) -> list[int] | None:
-    """When packets are shown, ascending; None where they do not say it, so that all frames must be decoded.
+    """When packets are shown, ascending; None where they do not say it, so that all frames must be
+    decoded.
 
     Packets that an edit list hides are decoded, but not shown.
     """
     with opened_video(path) as container:
         stream = container.streams.video[0]
-        timed = _is_of(container, TIMED_CONTAINERS) and stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
+        timed = (
+            _is_of(container, TIMED_CONTAINERS)
+            and stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
+        )
         if not (timed or _is_intra_only(stream)):
             return None
-        packets = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
+        packets = [
+            packet.pts
+            for packet in container.demux(stream)
+            if packet.size and not packet.is_discard
+        ]
     times = sorted(time for time in packets if time is not None)
     return times if len(times) == len(packets) and _ascending(times) else None
 
@@ -243,7 +269,8 @@ def _decoded_times(path: Path) -> Sequence[int | None]:
 
 
 def _decoded_frames(container: Any) -> Iterator[Any]:
-    """All frames from the beginning; a transport stream may begin with packets that cannot be decoded."""
+    """All frames from the beginning; a transport stream may begin with packets that cannot be
+    decoded."""
     from av.error import InvalidDataError
 
     stream, may_fail = container.streams.video[0], _is_of(container, ("mpegts",))
@@ -259,7 +286,8 @@ def _decoded_frames(container: Any) -> Iterator[Any]:
 
 
 def _from_key_frame(frames: Iterator[Any], time: int) -> Iterator[Any]:
-    """The frames from the first key frame on, because those shown before it may refer to frames before the seek.
+    """The frames from the first key frame on, because those shown before it may refer to frames
+    before the seek.
 
     No frames where the key frame is later than `time`.
     """
@@ -284,14 +312,17 @@ def _is_intra_only(stream: Any) -> bool:
 
 
 def _frame_rate(times: Sequence[int], time_base: float, rates: list[float]) -> float:
-    """The first of the stated rates that the frames' times agree with, else the average of the times.
+    """The first of the stated rates that the frames' times agree with, else the average of the
+    times.
 
     What a file states also counts frames that are hidden.
     """
     if len(times) < 2:
         return next(iter(rates), 0.0)
     measured = (len(times) - 1) / ((times[-1] - times[0]) * time_base)
-    return next((rate for rate in rates if abs(rate - measured) <= RATE_TOLERANCE * measured), measured)
+    return next(
+        (rate for rate in rates if abs(rate - measured) <= RATE_TOLERANCE * measured), measured
+    )
 
 
 def _timed(
@@ -329,11 +360,14 @@ def _pixels(frame: Any) -> np.ndarray:
 
 
 def _display_matrix(frame: Any) -> np.ndarray:
-    """(2, 2) whole numbers a video's header maps stored pixels with: row vector (x, y) times the matrix, y down."""
+    """(2, 2) whole numbers a video's header maps stored pixels with: row vector (x, y) times the
+    matrix, y down."""
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return np.eye(2, dtype=int)
-    turn = np.sign(np.round(np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2) / DISPLAY_MATRIX_ONE))
+    turn = np.sign(
+        np.round(np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2) / DISPLAY_MATRIX_ONE)
+    )
     whole = np.abs(turn).sum(0).tolist() == np.abs(turn).sum(1).tolist() == [1, 1]
     return turn.astype(int) if whole else np.eye(2, dtype=int)
 

@@ -12,7 +12,8 @@ from .samples import Samples
 FOLDS = 4
 MIN_SAMPLES_PER_TRIANGLE = 6
 CAMERA_FIT_ITERATIONS = 30
-"""Alternations between cameras and triangles; cameras on opposite sides share few triangles, so it converges slowly."""
+"""Alternations between cameras and triangles; cameras on opposite sides share few triangles, so it
+converges slowly."""
 CAMERA_PRIOR_SAMPLES = 5.0
 """Weight, in samples, of the prior that a camera is like the others."""
 TYPICAL_LEVEL = 100.0
@@ -20,8 +21,8 @@ TYPICAL_LEVEL = 100.0
 MIN_EXPOSURE_LEVELS = 1.5
 """Gain in levels of 255 from which differences between cameras, or in time, are corrected."""
 OFFSET_PENALTY = 0.05
-"""Favors gains over offsets: cameras differ in exposure and white balance more than in their black level, and where
-all colors are alike, nothing else separates the two."""
+"""Favors gains over offsets: cameras differ in exposure and white balance more than in their black
+level, and where all colors are alike, nothing else separates the two."""
 RELATIVE_CHANGE_BIAS_LEVELS = 32.0
 """Added to a color before its change is taken relative to it."""
 ROUNDING_LEVELS = 12**-0.5
@@ -32,14 +33,16 @@ RIDGE_WEIGHT = 1.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """Root mean square errors, in levels of 255, of colors that a model was not fitted to: without it and with it."""
+    """Root mean square errors, in levels of 255, of colors that a model was not fitted to: without
+    it and with it."""
 
     before: float
     after: float
 
     @property
     def gain(self) -> float:
-        """Root mean square, in levels of 255, of the error that the model removes; 0 where it adds error."""
+        """Root mean square, in levels of 255, of the error that the model removes; 0 where it adds
+        error."""
         return math.sqrt(max(0.0, self.before**2 - self.after**2))
 
     @property
@@ -55,7 +58,8 @@ class Evidence:
 
 
 def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
-    """Evidence from the errors (…) on the same samples without and with a model; zero without samples."""
+    """Evidence from the errors (…) on the same samples without and with a model; zero without
+    samples."""
     if not before.size:
         return Evidence(0.0, 0.0)
     return Evidence(float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2))))
@@ -63,8 +67,8 @@ def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
 
 @dataclass(frozen=True)
 class CameraColors:
-    """Cameras (C,), and per camera and channel the gain (C, 3) and offset (C, 3), in levels, of its images against
-    the mean of all cameras, for which they are 1 and 0."""
+    """Cameras (C,), and per camera and channel the gain (C, 3) and offset (C, 3), in levels, of its
+    images against the mean of all cameras, for which they are 1 and 0."""
 
     camera: np.ndarray
     gain: np.ndarray
@@ -77,12 +81,16 @@ class CameraColors:
 
 
 def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
-    """Gains and offsets from color (S, K, 3), NaN where not seen: least squares, cameras and triangles in turn."""
+    """Gains and offsets from color (S, K, 3), NaN where not seen: least squares, cameras and
+    triangles in turn."""
     camera, row = np.unique(samples.camera, return_inverse=True)
     fitted = CameraColors(camera, np.ones((len(camera), 3)), np.zeros((len(camera), 3)))
     for _ in range(CAMERA_FIT_ITERATIONS):
         mean = _mean(fitted.undo(color, samples.camera))
-        fits = [_line(np.broadcast_to(mean, color[row == c].shape), color[row == c]) for c in range(len(camera))]
+        fits = [
+            _line(np.broadcast_to(mean, color[row == c].shape), color[row == c])
+            for c in range(len(camera))
+        ]
         gain, offset = np.array([fit[0] for fit in fits]), np.array([fit[1] for fit in fits])
         gain /= gain.mean(0)
         fitted = CameraColors(camera, gain, offset - offset.mean(0))
@@ -105,7 +113,8 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def camera_evidence(samples: Samples, color: np.ndarray) -> Evidence:
-    """Whether cameras fitted to one half of the triangles make the images of the other half agree."""
+    """Whether cameras fitted to one half of the triangles make the images of the other half
+    agree."""
     half = np.arange(len(samples.faces)) % 2 == 0
     fitted = fit_cameras(samples, np.where(half[:, None], color, np.nan))
     other = color[:, ~half]
@@ -113,7 +122,8 @@ def camera_evidence(samples: Samples, color: np.ndarray) -> Evidence:
 
 
 def stable_colors(color: np.ndarray) -> np.ndarray:
-    """color (S, K, 3) of the half of the triangles with the least relative change of color, NaN for the others.
+    """color (S, K, 3) of the half of the triangles with the least relative change of color, NaN for
+    the others.
 
     Lids, lips and whatever the mesh does not follow change ten times as much as cameras differ.
     """
@@ -128,7 +138,8 @@ def stable_colors(color: np.ndarray) -> np.ndarray:
 
 
 def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
-    """Gains (S, 3) of the views against their camera's mean, from color (S, K, 3), NaN where not seen."""
+    """Gains (S, 3) of the views against their camera's mean, from color (S, K, 3), NaN where not
+    seen."""
     known, gain = ~np.isnan(color), np.ones((len(color), 3))
     prior = CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2
     _, row = np.unique(samples.camera, return_inverse=True)
@@ -141,8 +152,8 @@ def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
 
 
 def drift_evidence(samples: Samples, color: np.ndarray) -> Evidence:
-    """Whether gains fitted to one half of the triangles, at the timesteps before and after, make the images of the
-    other half agree: takes in no order, and expressions, do not drift."""
+    """Whether gains fitted to one half of the triangles, at the timesteps before and after, make
+    the images of the other half agree: takes in no order, and expressions, do not drift."""
     half = np.arange(len(samples.faces)) % 2 == 0
     gain = fit_drift(samples, np.where(half[:, None], color, np.nan))
     predicted = np.ones_like(gain)
@@ -150,7 +161,9 @@ def drift_evidence(samples: Samples, color: np.ndarray) -> Evidence:
         others = np.flatnonzero((samples.camera == camera) & (samples.timestep != timestep))
         others = others[np.argsort(samples.timestep[others])]
         if len(others):
-            predicted[row] = [np.interp(timestep, samples.timestep[others], column) for column in gain[others].T]
+            predicted[row] = [
+                np.interp(timestep, samples.timestep[others], column) for column in gain[others].T
+            ]
     other = color[:, ~half]
     return compare(_scatter(other), _scatter(other / predicted[:, None]))
 
@@ -166,17 +179,19 @@ Fold = tuple[np.ndarray, np.ndarray]
 
 
 def scattered_folds(group: np.ndarray) -> list[Fold]:
-    """FOLDS folds of the groups (S,), of which each takes every fourth: for groups without an order, as cameras are."""
+    """FOLDS folds of the groups (S,), of which each takes every fourth: for groups without an
+    order, as cameras are."""
     groups = np.unique(group)
     number = np.searchsorted(groups, group) % FOLDS
     return [(number == fold, number != fold) for fold in range(min(FOLDS, len(groups)))]
 
 
 def consecutive_folds(timestep: np.ndarray) -> list[Fold]:
-    """FOLDS folds of consecutive timesteps (S,); a model is not fitted to the timesteps directly beside them either.
+    """FOLDS folds of consecutive timesteps (S,); a model is not fitted to the timesteps directly
+    beside them either.
 
-    What changes slowly is alike in neighboring timesteps, so that they say nothing of unseen ones. A fold that leaves
-    nothing to fit is left out.
+    What changes slowly is alike in neighboring timesteps, so that they say nothing of unseen ones.
+    A fold that leaves nothing to fit is left out.
     """
     timesteps = np.unique(timestep)
     order = np.searchsorted(timesteps, timestep)
@@ -199,10 +214,10 @@ def linear_evidence(
 ) -> Evidence:
     """Whether each triangle's color follows its features linearly, by cross-validation.
 
-    color (S, K, 3), NaN where not seen; features (S, K, D); folds: views that are held out, and those that the model
-    is fitted to meanwhile; errors of more than `max_error` times the median are clipped to that; rest (K, D): features
-    of views that are held out are clipped to the range, with its margin, of those that the model was fitted to, as an
-    avatar's strain is.
+    color (S, K, 3), NaN where not seen; features (S, K, D); folds: views that are held out, and
+    those that the model is fitted to meanwhile; errors of more than `max_error` times the median
+    are clipped to that; rest (K, D): features of views that are held out are clipped to the range,
+    with its margin, of those that the model was fitted to, as an avatar's strain is.
     """
     before, after = [], []
     for held, fitted in folds:
@@ -216,12 +231,17 @@ def linear_evidence(
         before.append(error[known])
         after.append((error - predicted)[known])
     errors = np.abs(np.concatenate([[], *before])), np.abs(np.concatenate([[], *after]))
-    limit = max_error * float(np.median(errors[0])) if np.isfinite(max_error) and errors[0].size else np.inf
+    limit = (
+        max_error * float(np.median(errors[0]))
+        if np.isfinite(max_error) and errors[0].size
+        else np.inf
+    )
     return compare(np.minimum(errors[0], limit), np.minimum(errors[1], limit))
 
 
 def _ridge(color: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per triangle mean color (K, 3), mean features (K, D) and slopes (K, D, 3); NaN mean where there is no sample."""
+    """Per triangle mean color (K, 3), mean features (K, D) and slopes (K, D, 3); NaN mean where
+    there is no sample."""
     seen = ~np.isnan(color[..., :1])
     count = seen.sum(0)
     with np.errstate(invalid="ignore"):

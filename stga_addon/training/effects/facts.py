@@ -31,9 +31,11 @@ from .samples import Samples, take_samples
 MAX_TIMESTEPS = 64
 """Timesteps that are posed to measure motion, evenly spread."""
 MIN_WHITE_SHARE = 0.1
-"""Share of the pixels beside the mesh that a white background is: hair and shoulders leave more than that of it."""
+"""Share of the pixels beside the mesh that a white background is: hair and shoulders leave more
+than that of it."""
 MAX_VIEW_ERROR_RATIO = 4.0
-"""Errors above this multiple of the median come from lids, lips and teeth, not from the direction of view."""
+"""Errors above this multiple of the median come from lids, lips and teeth, not from the direction
+of view."""
 
 
 class CaptureFacts:
@@ -76,11 +78,15 @@ class CaptureFacts:
     @cached_property
     def drift(self) -> np.ndarray:
         """(S, 3) gains of the sampled views against their camera's mean."""
-        return fit_drift(self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera))
+        return fit_drift(
+            self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera)
+        )
 
     @cached_property
     def drifts(self) -> Evidence:
-        return drift_evidence(self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera))
+        return drift_evidence(
+            self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera)
+        )
 
     @cached_property
     def camera_difference(self) -> Evidence:
@@ -90,38 +96,53 @@ class CaptureFacts:
     def view_dependence(self) -> Evidence:
         """Errors are clipped, so that motion that the mesh does not follow counts little."""
         folds = scattered_folds(np.arange(len(self.samples.camera)))
-        return linear_evidence(self.matched_colors, self.samples.direction, folds, MAX_VIEW_ERROR_RATIO)
+        return linear_evidence(
+            self.matched_colors, self.samples.direction, folds, MAX_VIEW_ERROR_RATIO
+        )
 
     @cached_property
     def strain_dependence(self) -> dict[str, Evidence]:
-        """Of colors on their triangle's strain, within the range that a training on the other views would write."""
-        return self._strain_evidence(self.samples.strain, rest_strain(color_range(len(self.samples.faces))))
+        """Of colors on their triangle's strain, within the range that a training on the other views
+        would write."""
+        return self._strain_evidence(
+            self.samples.strain, rest_strain(color_range(len(self.samples.faces)))
+        )
 
     @cached_property
     def smoothed_strain_dependence(self) -> dict[str, Evidence]:
-        """Of colors on the strain around their triangle: what moves over it changes its color as well."""
+        """Of colors on the strain around their triangle: what moves over it changes its color as
+        well."""
         smoothed = self.samples.smoothed_strain
         return self._strain_evidence(smoothed, np.zeros_like(smoothed[0]))
 
     def _strain_evidence(self, strain: np.ndarray, rest: np.ndarray) -> dict[str, Evidence]:
-        """In "frames" that are left out, as unseen expressions, and in "cameras" that are, as other views of known
-        expressions; a single camera is not left out."""
+        """In "frames" that are left out, as unseen expressions, and in "cameras" that are, as other
+        views of known expressions; a single camera is not left out."""
         folds = {"frames": consecutive_folds(self.samples.timestep)}
         if self.cameras > 1:
             folds["cameras"] = scattered_folds(self.samples.camera)
-        return {kind: linear_evidence(self.matched_colors, strain, each, rest=rest) for kind, each in folds.items()}
+        return {
+            kind: linear_evidence(self.matched_colors, strain, each, rest=rest)
+            for kind, each in folds.items()
+        }
 
     @cached_property
     def pixel_range(self) -> float:
-        """Width of the widest pixel at the head over that of the narrowest, among the sampled views that show it."""
+        """Width of the widest pixel at the head over that of the narrowest, among the sampled views
+        that show it."""
         widths = self.samples.pixel_width[~np.isnan(self.samples.pixel_width)]
         return float(widths.max() / widths.min()) if len(widths) else 1.0
 
     def pixels_per_splat(self, percentile: float) -> float:
-        """Percentile over the visible triangles, at the trained image size; 0 where none is visible."""
+        """Percentile over the visible triangles, at the trained image size; 0 where none is
+        visible."""
         lattice = self.settings.lattice_order(len(self.capture.faces))
         pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
-        return float(np.percentile(pixels, percentile)) / ((lattice + 1) * (lattice + 2) / 2) if len(pixels) else 0.0
+        return (
+            float(np.percentile(pixels, percentile)) / ((lattice + 1) * (lattice + 2) / 2)
+            if len(pixels)
+            else 0.0
+        )
 
     @cached_property
     def uncovered(self) -> float:
@@ -145,14 +166,15 @@ class CaptureFacts:
 
     @cached_property
     def backdrop_spread(self) -> float | None:
-        """By how many of 255 levels what lies outside the masks differs within a sampled view and between them; None
-        where views have no mask or nothing lies outside."""
+        """By how many of 255 levels what lies outside the masks differs within a sampled view and
+        between them; None where views have no mask or nothing lies outside."""
         known = ~np.isnan(self.samples.background_spread)
         if self.unmasked or not known.any():
             return None
         backgrounds = self.samples.background[known]
         return max(
-            float(self.samples.background_spread[known].max()), float(abs(backgrounds - backgrounds.mean(0)).max())
+            float(self.samples.background_spread[known].max()),
+            float(abs(backgrounds - backgrounds.mean(0)).max()),
         )
 
     @cached_property
@@ -173,7 +195,8 @@ class CaptureFacts:
 
     @cached_property
     def sampled(self) -> Capture:
-        """The capture at the sampled timesteps only; meshes of a head with teeth are kept, for its lips."""
+        """The capture at the sampled timesteps only; meshes of a head with teeth are kept, for its
+        lips."""
         pose = self.capture.expression_mesh
         return replace(
             self.capture,
@@ -197,7 +220,11 @@ class CaptureFacts:
     def frames(self) -> list[FlameFrame]:
         """FLAME's parameters in the sampled timesteps; none for other captures."""
         sequence = self.capture.flame
-        return [] if sequence is None else [sequence.frame(timestep) for timestep in self.sampled_timesteps]
+        return (
+            []
+            if sequence is None
+            else [sequence.frame(timestep) for timestep in self.sampled_timesteps]
+        )
 
     def joint_angle(self, *joints: int) -> float:
         """Largest angle in degrees by which one of these FLAME joints turns."""
@@ -209,7 +236,9 @@ class CaptureFacts:
         assert self.capture.flame is not None
         upper, lower = lip_pairs(self.capture.flame.model)
         zero_pose = self.settings.selection.zero_pose
-        posed = (self.sampled.expression_mesh(timestep, zero_pose) for timestep in self.sampled_timesteps)
+        posed = (
+            self.sampled.expression_mesh(timestep, zero_pose) for timestep in self.sampled_timesteps
+        )
         meshes = [self.capture.neutral, *posed]
         gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]
         return 1000 * (max(gaps) - gaps[0])

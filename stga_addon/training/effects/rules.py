@@ -17,23 +17,23 @@ MIN_CAMERAS_FOR_VIEW_COLOR = 4
 MIN_VIEW_DEPENDENCE_LEVELS = 1.0
 """Gain in levels of 255 from which color depends on the direction of view."""
 MIN_STRAIN_GAIN_DB = 0.35
-"""Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow deformation: with
-less, trainings with and without differ by no more than their noise (docs/experiments.md)."""
+"""Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
+deformation: with less, trainings with and without differ by no more than their noise
+(docs/experiments.md)."""
 MIN_TIMESTEPS_FOR_STRAIN = 4
 """With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
 MIN_STRETCH = 1e-6
 """Share of a triangle's size; less is rounding."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
-"""Widest pixel at the head over the narrowest; above it, splats narrower than a pixel look different to each camera."""
+"""Widest pixel at the head over the narrowest; above it, splats narrower than a pixel look
+different to each camera."""
 FINE_SPLAT_PIXELS = 4.0
 """Median pixels per splat below which the screen-space low-pass filter changes how splats look."""
 MAX_BACKGROUND_SPREAD_LEVELS = 6.0
 """Root mean square deviation of a uniform background, in levels of 255."""
 BACKGROUND_TOLERANCE_LEVELS = 3.0
 """Largest difference, in levels of 255, between the background and the color in the settings."""
-MESH_AS_MASK = (
-    "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` makes masks)"
-)
+MESH_AS_MASK = "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` makes masks)"
 """What becomes of images without a mask."""
 MIN_UNCOVERED_SHARE = 0.003
 """Share of the foreground that the mesh does not cover, from which splats are added for it."""
@@ -69,7 +69,9 @@ def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
         return Verdict(False, "a single camera sees everything from one direction", fixed=True)
     if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
-        return Verdict(False, f"{facts.cameras} cameras are too few to tell how color depends on the view")
+        return Verdict(
+            False, f"{facts.cameras} cameras are too few to tell how color depends on the view"
+        )
     found = facts.view_dependence
     reason = f"colors depend on the view by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
     return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
@@ -80,7 +82,9 @@ def exposure(facts: CaptureFacts) -> Verdict:
         return Verdict(False, "a single image has no other to differ from", fixed=True)
     colors, samples = facts.camera_colors, facts.samples
     exposures = zip(colors.camera.tolist(), colors.gain, colors.offset, strict=True)
-    rows = tuple((float(camera), *gain.tolist(), *offset.tolist()) for camera, gain, offset in exposures)
+    rows = tuple(
+        (float(camera), *gain.tolist(), *offset.tolist()) for camera, gain, offset in exposures
+    )
     found = facts.camera_difference.gain
     reason = f"{facts.cameras} cameras show the same colors {found:.1f} of 255 levels apart"
     if facts.drifts.gain >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
@@ -91,7 +95,9 @@ def exposure(facts: CaptureFacts) -> Verdict:
             for camera, gain, timestep in drifting
         )
         found = max(found, facts.drifts.gain)
-        reason = f"a camera shows the same colors {facts.drifts.gain:.1f} of 255 levels apart over time"
+        reason = (
+            f"a camera shows the same colors {facts.drifts.gain:.1f} of 255 levels apart over time"
+        )
     return Verdict(found >= MIN_EXPOSURE_LEVELS, reason, changes={"exposure": rows})
 
 
@@ -110,30 +116,43 @@ def background(facts: CaptureFacts) -> Verdict:
     samples = facts.samples
     if facts.shows_backdrop:
         count, total = facts.unmasked, len(samples.white)
-        reason = (
-            f"{count} of {total} sampled images have no mask, and show more than white behind the head: {MESH_AS_MASK}"
-        )
+        reason = f"{count} of {total} sampled images have no mask, and show more than white behind the head: {MESH_AS_MASK}"
         return Verdict(True, reason, changes={"backdrop": "mesh"})
     spread = facts.backdrop_spread
     if spread is None:
-        return Verdict(False, "not every image has a mask or transparency that shows where the head ends", fixed=True)
+        return Verdict(
+            False,
+            "not every image has a mask or transparency that shows where the head ends",
+            fixed=True,
+        )
     color = samples.background[~np.isnan(samples.background_spread)].mean(0)
     if spread > MAX_BACKGROUND_SPREAD_LEVELS:
         reason = f"every image has a mask; what lies outside, which varies by {spread:.0f} of 255 levels, is replaced"
         return Verdict(True, reason, changes={"backdrop": "masked"})
-    named = bool(abs(color - 255 * np.array(facts.settings.background)).max() < BACKGROUND_TOLERANCE_LEVELS)
+    named = bool(
+        abs(color - 255 * np.array(facts.settings.background)).max() < BACKGROUND_TOLERANCE_LEVELS
+    )
     changes = {} if named else {"background": tuple((color / 255).round(4).tolist())}
     red, green, blue = color.round().astype(int).tolist()
     return Verdict(
-        True, f"every image has a mask, and one color behind the head ({red}, {green}, {blue})", changes=changes
+        True,
+        f"every image has a mask, and one color behind the head ({red}, {green}, {blue})",
+        changes=changes,
     )
 
 
 def hull_points(facts: CaptureFacts) -> Verdict:
     if facts.shows_backdrop:
-        return Verdict(False, "without masks, it is not known what beside the mesh belongs to the head", fixed=True)
+        return Verdict(
+            False,
+            "without masks, it is not known what beside the mesh belongs to the head",
+            fixed=True,
+        )
     if np.isnan(facts.uncovered):
-        return Verdict(facts.settings.hull_points, "without masks, it is not known how much lies beside the mesh")
+        return Verdict(
+            facts.settings.hull_points,
+            "without masks, it is not known how much lies beside the mesh",
+        )
     reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
     if facts.cameras == 1:
         reason += "; a single camera does not show how far away, so that it becomes a flat layer"
@@ -143,12 +162,16 @@ def hull_points(facts: CaptureFacts) -> Verdict:
 def depth_limits(facts: CaptureFacts) -> Verdict:
     if facts.cameras > 1:
         return Verdict(False, f"{facts.cameras} cameras show how far away a splat is")
-    return Verdict(True, "a single camera does not show how far in front of or behind the mesh a splat is")
+    return Verdict(
+        True, "a single camera does not show how far in front of or behind the mesh a splat is"
+    )
 
 
 def density(facts: CaptureFacts) -> Verdict:
     pixels = facts.pixels_per_splat(90)
-    return Verdict(pixels > MIN_PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat")
+    return Verdict(
+        pixels > MIN_PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat"
+    )
 
 
 def selection(facts: CaptureFacts) -> Verdict:
@@ -157,7 +180,9 @@ def selection(facts: CaptureFacts) -> Verdict:
         count, total = len(facts.sampled_timesteps), len(facts.capture.timesteps)
         reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
         return Verdict(False, reason, fixed=count == total)
-    reason = f"a frame moves {facts.selected_share:.0%} of the triangles by more than {threshold:g} mm"
+    reason = (
+        f"a frame moves {facts.selected_share:.0%} of the triangles by more than {threshold:g} mm"
+    )
     asked = facts.settings.strategy == "selective"
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
@@ -168,7 +193,9 @@ def strain_color(facts: CaptureFacts) -> Verdict:
 
 def strain_position(facts: CaptureFacts) -> Verdict:
     around = "deformation around a triangle"
-    return _undeformed(facts, "positions follow") or _dependent(around, facts.smoothed_strain_dependence)
+    return _undeformed(facts, "positions follow") or _dependent(
+        around, facts.smoothed_strain_dependence
+    )
 
 
 def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
@@ -176,26 +203,37 @@ def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
     if facts.strain < MIN_STRETCH:
         return Verdict(False, "the mesh has the same shape in every training frame", fixed=True)
     if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
-        return Verdict(False, f"{facts.timesteps} frames are too few to tell how {follows} deformation")
+        return Verdict(
+            False, f"{facts.timesteps} frames are too few to tell how {follows} deformation"
+        )
     return None
 
 
 def _dependent(what: str, left_out: Mapping[str, Evidence]) -> Verdict:
-    """On where what follows brings enough in the mean of frames and cameras that were left out: of what a head shows,
-    unseen expressions and unseen views count alike."""
+    """On where what follows brings enough in the mean of frames and cameras that were left out: of
+    what a head shows, unseen expressions and unseen views count alike."""
     gains = [found.decibels for found in left_out.values()]
-    figures = " and ".join(f"{found.decibels:+.2f} dB in left-out {kind}" for kind, found in left_out.items())
-    return Verdict(sum(gains) / len(gains) >= MIN_STRAIN_GAIN_DB, f"colors that follow {what} bring {figures}")
+    figures = " and ".join(
+        f"{found.decibels:+.2f} dB in left-out {kind}" for kind, found in left_out.items()
+    )
+    return Verdict(
+        sum(gains) / len(gains) >= MIN_STRAIN_GAIN_DB, f"colors that follow {what} bring {figures}"
+    )
 
 
 def relight(facts: CaptureFacts) -> Verdict:
-    return Verdict(True, "the lights of a scene that has any light the avatar; elsewhere colors stay as recorded")
+    return Verdict(
+        True,
+        "the lights of a scene that has any light the avatar; elsewhere colors stay as recorded",
+    )
 
 
 def world(facts: CaptureFacts) -> Verdict:
     spread = facts.backdrop_spread
     if spread is None:
-        return Verdict(False, "not every image has a mask that shows where the person ends", fixed=True)
+        return Verdict(
+            False, "not every image has a mask that shows where the person ends", fixed=True
+        )
     if spread <= MAX_BACKGROUND_SPREAD_LEVELS:
         return Verdict(False, "what lies behind the person is of one color", fixed=True)
     if facts.moving_cameras:
@@ -216,7 +254,10 @@ def torso(facts: CaptureFacts) -> Verdict | None:
         return None
     found = read_torso_motion(facts.capture.root)
     if found is None:
-        return Verdict(False, "the torso was not followed in the images, as `stga track` does where they have masks")
+        return Verdict(
+            False,
+            "the torso was not followed in the images, as `stga track` does where they have masks",
+        )
     return Verdict(found.motion != "head", found.description)
 
 
@@ -246,21 +287,37 @@ def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
     count = sum(frame.dynamic_offset is not None for frame in facts.frames)
     if not count:
         return Verdict(False, "no frame has any", fixed=True)
-    return Verdict(True, f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them", fixed=True)
+    return Verdict(
+        True,
+        f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them",
+        fixed=True,
+    )
 
 
 def tracking(facts: CaptureFacts) -> Verdict | None:
     if not facts.frames:
         return None
     if facts.device != "cpu":
-        return Verdict(False, f"FLAME's parameters are refined on the CPU only, not on {facts.device}", fixed=True)
+        return Verdict(
+            False,
+            f"FLAME's parameters are refined on the CPU only, not on {facts.device}",
+            fixed=True,
+        )
     if facts.timesteps == 1:
-        return Verdict(False, "the splats of a single frame follow its images without it", fixed=True)
+        return Verdict(
+            False, "the splats of a single frame follow its images without it", fixed=True
+        )
     if is_tracked(facts.capture.root):
-        return Verdict(True, "the capture is from `stga track`: splats see motion more sharply than landmarks do")
+        return Verdict(
+            True,
+            "the capture is from `stga track`: splats see motion more sharply than landmarks do",
+        )
     if np.isnan(facts.outside):
         return Verdict(False, "without masks, the mesh cannot be compared with the images")
-    return Verdict(facts.outside > MAX_OUTSIDE_SHARE, f"{facts.outside:.2%} of the mesh sticks out of the masks")
+    return Verdict(
+        facts.outside > MAX_OUTSIDE_SHARE,
+        f"{facts.outside:.2%} of the mesh sticks out of the masks",
+    )
 
 
 _RULES: tuple[Rule, ...] = (

@@ -17,7 +17,8 @@ MAX_EVALUATION_VIEWS = 16
 MIN_REGION_PIXELS = 50
 """A smaller region of a view is left out."""
 MATTE_BORDER_SHARE = 0.0075
-"""Width of the border of a head mask in which the matte is uncertain, as a share of the image's height."""
+"""Width of the border of a head mask in which the matte is uncertain, as a share of the image's
+height."""
 MIN_DEPTH_M = 0.01
 """Triangles nearer to the camera's plane, or behind it, are not drawn."""
 
@@ -27,10 +28,12 @@ class EvaluationView:
     """A view and the image that its rendering is compared with.
 
     target   (H, W, 3) uint8, read-only
-    regions  name -> (H, W) bool. "mask": the head mask, if the view has one; "moving": visible pixels of the triangles
-             that the default selection picks at the timestep, if there are any
+    regions  name -> (H, W) bool. "mask": the head mask, if the view has one; "moving": visible
+             pixels of the triangles that the default selection picks at the timestep, if there are
+             any
     interior (H, W) bool: the head mask without the matte's border; None without a mask
-    group    of views whose quality is reported apart as well, such as those of one take; empty for none
+    group    of views whose quality is reported apart as well, such as those of one take; empty for
+             none
     """
 
     view: View
@@ -41,16 +44,21 @@ class EvaluationView:
 
 
 def choose_evaluation_views(capture: Capture) -> Sequence[View]:
-    """The held-out views that are evaluated during training: at most MAX_EVALUATION_VIEWS, evenly spread."""
+    """The held-out views that are evaluated during training: at most MAX_EVALUATION_VIEWS, evenly
+    spread."""
     return evenly_spread(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
 
 
 def read_evaluation_view(
-    capture: Capture, view: View, background: tuple[float, float, float] = (1.0, 1.0, 1.0), backdrop: str = "plain"
+    capture: Capture,
+    view: View,
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    backdrop: str = "plain",
 ) -> EvaluationView:
     """Read a view's image and mask and find its regions.
 
-    background (0…1): behind transparent pixels; backdrop: see `TrainingSettings`, both as in training.
+    background (0…1): behind transparent pixels; backdrop: see `TrainingSettings`, both as in
+    training.
 
     "moving" is by the default selection whatever a run's settings are, so that runs are comparable.
     Raises StgaError if a file cannot be read.
@@ -64,7 +72,9 @@ def read_evaluation_view(
     interior = None
     if mask is not None:
         regions = {"mask": mask > 127, **regions}
-        inside = binary_erosion(mask > 127, iterations=max(1, round(MATTE_BORDER_SHARE * len(mask))))
+        inside = binary_erosion(
+            mask > 127, iterations=max(1, round(MATTE_BORDER_SHARE * len(mask)))
+        )
         interior = inside if inside.sum() >= MIN_REGION_PIXELS else None
     regions = {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
     return EvaluationView(view, target, regions, interior)
@@ -79,7 +89,8 @@ def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarra
     picture = Image.new("1", (view.camera.width, view.camera.height))
     draw = ImageDraw.Draw(picture)
     drawn = np.flatnonzero((depth[capture.faces] > MIN_DEPTH_M).all(1))
-    drawn = drawn[np.argsort(-center_depth[drawn], kind="stable")]  # painter's algorithm: far to near
+    # painter's algorithm: far to near
+    drawn = drawn[np.argsort(-center_depth[drawn], kind="stable")]
     polygons = corners[capture.faces[drawn]].reshape(-1, 6).tolist()
     for polygon, is_chosen in zip(polygons, faces[drawn].tolist(), strict=True):
         draw.polygon(polygon, fill=int(is_chosen))

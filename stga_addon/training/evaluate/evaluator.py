@@ -1,4 +1,5 @@
-"""Evaluations of a run while it trains: when they are due, what they find, which avatar is kept, and when to stop."""
+"""Evaluations of a run while it trains: when they are due, what they find, which avatar is kept,
+and when to stop."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -14,9 +15,11 @@ from .forecast import DETAIL, UNMATCHED, curve_of, describe_forecast, flat_since
 from .metrics import evaluate
 
 EVALUATIONS = 10
-"""Evaluations over a budget in iterations, at fixed shares of it so that the run is reproducible."""
+"""Evaluations over a budget in iterations, at fixed shares of it so that the run is
+reproducible."""
 EVALUATION_SHARE = 0.04
-"""Largest share of the training time that evaluations add to a budget in seconds, without the last one."""
+"""Largest share of the training time that evaluations add to a budget in seconds, without the last
+one."""
 MAX_EVALUATIONS = 40
 """Evaluations over a budget in seconds, even where they cost little."""
 RENDERING_COST = 0.5
@@ -25,7 +28,8 @@ RENDERING_COST = 0.5
 
 @dataclass(frozen=True)
 class Spent:
-    """How much a run has trained: share of its budget (may exceed 1), seconds without evaluations, iterations."""
+    """How much a run has trained: share of its budget (may exceed 1), seconds without evaluations,
+    iterations."""
 
     share: float
     seconds: float
@@ -33,13 +37,15 @@ class Spent:
 
     @property
     def left_s(self) -> float:
-        """Seconds of training until the budget is spent, at the speed so far; NaN before the first step."""
+        """Seconds of training until the budget is spent, at the speed so far; NaN before the first
+        step."""
         return max(0.0, self.seconds * (1 / self.share - 1)) if self.share > 0 else math.nan
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found: fields of a metrics line (`Quality.as_json`), and whether the avatar is to be kept."""
+    """What an evaluation found: fields of a metrics line (`Quality.as_json`), and whether the
+    avatar is to be kept."""
 
     quality: dict[str, float]
     is_kept: bool
@@ -49,9 +55,11 @@ class Evaluation:
 class Evaluator:
     """Evaluates a run's avatar on its evaluation views, and remembers what was found.
 
-    keeps_latest     a continuation keeps the latest avatar: the one before is in the folder that it continues
+    keeps_latest     a continuation keeps the latest avatar: the one before is in the folder that it
+                     continues
     lines            of the run's metrics.jsonl
-    exposure         `known_exposure` of the training cameras; None where their images are not corrected
+    exposure         `known_exposure` of the training cameras; None where their images are not
+                     corrected
     count            evaluations of the schedule that have been made
     best_difference  `Quality.detail_difference` of the avatar that is kept; ∞ before there is one
     forecast_text    what more training is expected to bring
@@ -83,24 +91,34 @@ class Evaluator:
         cost, last = RENDERING_COST * len(self.views) * spent.seconds / spent.iterations, 0.0
         if self.lines:
             cost, last = float(self.lines[-1]["evaluation_s"]), float(self.lines[-1]["seconds"])
-        return spent.seconds - last >= max(self.settings.seconds / MAX_EVALUATIONS, cost / EVALUATION_SHARE)
+        return spent.seconds - last >= max(
+            self.settings.seconds / MAX_EVALUATIONS, cost / EVALUATION_SHARE
+        )
 
     def is_finished(self, spent: Spent) -> bool:
-        """Whether the budget is spent, the target PSNR is reached, or a stop at a flat curve is due."""
+        """Whether the budget is spent, the target PSNR is reached, or a stop at a flat curve is
+        due."""
         target = self.settings.target_psnr
-        if spent.share >= 1 or (target is not None and any(psnr >= target for _, psnr in curve_of(self.lines))):
+        if spent.share >= 1 or (
+            target is not None and any(psnr >= target for _, psnr in curve_of(self.lines))
+        ):
             return True
         return self.settings.stop_when_flat and flat_since(self.lines) is not None
 
-    def evaluate(self, render: Callable[[View], np.ndarray], perceptual: bool = False) -> Evaluation:
+    def evaluate(
+        self, render: Callable[[View], np.ndarray], perceptual: bool = False
+    ) -> Evaluation:
         """Measure `render(view)` on the evaluation views; perceptual: with LPIPS."""
         if not self.views:
             return Evaluation({}, True)
         quality = evaluate(render, self.views, perceptual, self.exposure).as_json()
         return Evaluation(quality, self._is_kept(quality))
 
-    def record(self, evaluation: Evaluation, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
-        """Remember an evaluation; returns its metrics line, to which a forecast is added that can be checked later."""
+    def record(
+        self, evaluation: Evaluation, line: Mapping[str, Any], spent: Spent
+    ) -> dict[str, Any]:
+        """Remember an evaluation; returns its metrics line, to which a forecast is added that can
+        be checked later."""
         self.count = max(self.count, int(min(1.0, spent.share) * EVALUATIONS))
         if evaluation.is_kept:
             self.best_difference = evaluation.quality.get(DETAIL, self.best_difference)
@@ -108,15 +126,22 @@ class Evaluator:
         predicted = next_forecast(self.lines, spent.seconds, spent.left_s)
         if predicted is not None and "psnr" in line:
             self.lines[-1]["forecast"] = predicted.as_json()
-        self.forecast_text = describe_forecast(self.lines, spent.seconds, spent.left_s, self.settings.target_psnr)
+        self.forecast_text = describe_forecast(
+            self.lines, spent.seconds, spent.left_s, self.settings.target_psnr
+        )
         return self.lines[-1]
 
     def _is_kept(self, quality: Mapping[str, float]) -> bool:
-        """Whether this avatar is the sharpest so far, or reaches the target, which ends the run (`saved_line`).
+        """Whether this avatar is the sharpest so far, or reaches the target, which ends the run
+        (`saved_line`).
 
         Otherwise not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
         """
         difference, target = quality.get(DETAIL), self.settings.target_psnr
-        if self.keeps_latest or difference is None or (target is not None and quality["psnr"] >= target):
+        if (
+            self.keeps_latest
+            or difference is None
+            or (target is not None and quality["psnr"] >= target)
+        ):
             return True
         return difference <= self.best_difference

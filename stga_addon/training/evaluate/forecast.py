@@ -18,7 +18,8 @@ UNMATCHED = "psnr_unmatched"
 MIN_EVALUATIONS = 4
 """Evaluations that a forecast needs."""
 FITTED_SINCE_SHARE = 2 / 3
-"""The fit uses only evaluations since this share of the time: earlier ones belong to a steeper phase."""
+"""The fit uses only evaluations since this share of the time: earlier ones belong to a steeper
+phase."""
 FORECAST_CONFIDENCE = 0.8
 """Share of forecasts that should hold within their error."""
 PRIOR_RELATIVE_ERROR = 0.8
@@ -30,16 +31,17 @@ HORIZONS_S = (5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600)
 MIN_GAIN_DB = 0.02
 """Smaller gains count as none."""
 MIN_REMAINING_SHARE = 0.2
-"""A target is called reachable if at least this share of the total predicted gain lies beyond it; with less, reaching
-it would take more than 25 times the time trained."""
+"""A target is called reachable if at least this share of the total predicted gain lies beyond it;
+with less, reaching it would take more than 25 times the time trained."""
 MIN_TIME_FACTOR = 1.1
-"""Lower bound of the predicted time to a target, as a multiple of the time trained; applies where the fit already
-lies above the target but no evaluation does."""
+"""Lower bound of the predicted time to a target, as a multiple of the time trained; applies where
+the fit already lies above the target but no evaluation does."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """PSNR ± error in dB at `seconds` of training, `ahead` seconds after the forecast; `gain` is in dB from then."""
+    """PSNR ± error in dB at `seconds` of training, `ahead` seconds after the forecast; `gain` is in
+    dB from then."""
 
     seconds: float
     psnr: float
@@ -51,15 +53,18 @@ class Forecast:
         return {name: round(value, 4) for name, value in asdict(self).items()}
 
     def __str__(self) -> str:
-        return f"another {format_duration(self.ahead)}: about {self.gain:+.1f} dB (±{self.error:.1f})"
+        return (
+            f"another {format_duration(self.ahead)}: about {self.gain:+.1f} dB (±{self.error:.1f})"
+        )
 
 
 def forecast(curve: Curve, ahead: float) -> Forecast | None:
     """Predict the curve `ahead` seconds after its end; None if it is too short.
 
-    The model is PSNR = a − b/√t, fitted to the late evaluations by the median of pairwise slopes, which is robust to
-    outliers. To estimate the error, the same forecast is repeated from earlier evaluations and compared with what
-    followed; errors are relative to the predicted gain plus the scatter. PRIOR_RELATIVE_ERROR counts as one of them.
+    The model is PSNR = a − b/√t, fitted to the late evaluations by the median of pairwise slopes,
+    which is robust to outliers. To estimate the error, the same forecast is repeated from earlier
+    evaluations and compared with what followed; errors are relative to the predicted gain plus the
+    scatter. PRIOR_RELATIVE_ERROR counts as one of them.
     """
     if not _can_fit(curve):
         return None
@@ -77,7 +82,8 @@ def forecast(curve: Curve, ahead: float) -> Forecast | None:
 
 
 def forecast_horizon(elapsed: float, left: float) -> float | None:
-    """Longest of HORIZONS_S within the remaining budget `left` and half of `elapsed` (seconds); None if none fits."""
+    """Longest of HORIZONS_S within the remaining budget `left` and half of `elapsed` (seconds);
+    None if none fits."""
     fitting = [ahead for ahead in HORIZONS_S if ahead <= min(left, elapsed / 2)]
     return float(fitting[-1]) if fitting else None
 
@@ -85,7 +91,8 @@ def forecast_horizon(elapsed: float, left: float) -> float | None:
 def plateau_start(curve: Curve) -> float | None:
     """Time of the best evaluation if PSNR has stopped rising, else None.
 
-    It has stopped if at least MIN_EVALUATIONS in the last third of the time gained less than MIN_GAIN_DB.
+    It has stopped if at least MIN_EVALUATIONS in the last third of the time gained less than
+    MIN_GAIN_DB.
     """
     t, psnr = np.array(curve, np.float64).reshape(-1, 2).T
     late = np.flatnonzero(t > FITTED_SINCE_SHARE * t[-1:])
@@ -111,18 +118,21 @@ def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
 
 
 def is_exposure_fitted(lines: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether the PSNR of a metrics.jsonl is with the exposure of views fitted, of cameras that were not trained."""
+    """Whether the PSNR of a metrics.jsonl is with the exposure of views fitted, of cameras that
+    were not trained."""
     return any(UNMATCHED in line for line in lines)
 
 
 def saved_line(lines: Sequence[Mapping[str, Any]], target: float | None) -> Mapping[str, Any]:
-    """The evaluation of the saved avatar, of those with a PSNR: the last that reached the target, or the sharpest."""
+    """The evaluation of the saved avatar, of those with a PSNR: the last that reached the target,
+    or the sharpest."""
     reached = [line for line in lines if target is not None and line["psnr"] >= target]
     return reached[-1] if reached else min(lines, key=lambda line: line.get(DETAIL, np.inf))
 
 
 def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:
-    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times or values not finite."""
+    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times or
+    values not finite."""
     curve: list[tuple[float, float]] = []
     for line in lines:
         if key in line and np.isfinite(line[key]) and (not curve or line["seconds"] > curve[-1][0]):
@@ -131,8 +141,11 @@ def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tupl
 
 
 def detail_curve(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """(seconds, −20·log10 of the detail difference) of the evaluations: dB like PSNR, higher is sharper."""
-    return [(seconds, -20 * np.log10(value)) for seconds, value in curve_of(lines, DETAIL) if value > 0]
+    """(seconds, −20·log10 of the detail difference) of the evaluations: dB like PSNR, higher is
+    sharper."""
+    return [
+        (seconds, -20 * np.log10(value)) for seconds, value in curve_of(lines, DETAIL) if value > 0
+    ]
 
 
 def flat_since(lines: Sequence[Mapping[str, Any]]) -> float | None:
@@ -146,7 +159,8 @@ def flat_since(lines: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
-    """What `ahead` more seconds of training would bring, in PSNR and in the detail difference; empty if unknown."""
+    """What `ahead` more seconds of training would bring, in PSNR and in the detail difference;
+    empty if unknown."""
     predicted, detail = forecast(curve_of(lines), ahead), forecast(detail_curve(lines), ahead)
     if predicted is None:
         return ""
@@ -157,14 +171,19 @@ def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
     return f"{text}, detail difference {change:+.0f} % (±{error:.0f})"
 
 
-def next_forecast(lines: Sequence[Mapping[str, Any]], elapsed: float, left: float) -> Forecast | None:
+def next_forecast(
+    lines: Sequence[Mapping[str, Any]], elapsed: float, left: float
+) -> Forecast | None:
     """Forecast of PSNR over `forecast_horizon`; None where there is none."""
     ahead = forecast_horizon(elapsed, left)
     return None if ahead is None else forecast(curve_of(lines), ahead)
 
 
-def describe_forecast(lines: Sequence[Mapping[str, Any]], elapsed: float, left: float, target: float | None) -> str:
-    """What to expect of the remaining budget `left` (seconds) after `elapsed`, and whether a target PSNR is in reach.
+def describe_forecast(
+    lines: Sequence[Mapping[str, Any]], elapsed: float, left: float, target: float | None
+) -> str:
+    """What to expect of the remaining budget `left` (seconds) after `elapsed`, and whether a target
+    PSNR is in reach.
 
     Empty where nothing is known.
     """
@@ -198,7 +217,11 @@ def explain_missed_target(curve: Curve, target: float) -> str:
     remaining = 1 - (target - now) / gain  # share of the total gain that lies beyond the target
     if remaining < MIN_REMAINING_SHARE:
         unreachable = target > now + (1 + PRIOR_RELATIVE_ERROR) * gain
-        advice = "more time alone would not reach it" if unreachable else "only a much longer budget might reach it"
+        advice = (
+            "more time alone would not reach it"
+            if unreachable
+            else "only a much longer budget might reach it"
+        )
         return f"{missed}: the curve levels off at about {now + gain:.1f} dB; {advice}"
     factor = max(remaining**-2, MIN_TIME_FACTOR)
     return f"{missed}: extrapolating the curve, it would take about {format_duration((factor - 1) * t[-1])} more"
@@ -212,11 +235,14 @@ def _can_fit(curve: Curve) -> bool:
 
 
 def _fit(t: np.ndarray, psnr: np.ndarray, factor: float) -> tuple[float, float, float]:
-    """The model's PSNR at t[-1], its gain from there to factor·t[-1], and the scatter of the evaluations around it.
+    """The model's PSNR at t[-1], its gain from there to factor·t[-1], and the scatter of the
+    evaluations around it.
 
     The slope is the Theil–Sen estimator.
     """
-    late = np.arange(len(t)) >= min(np.searchsorted(t, FITTED_SINCE_SHARE * t[-1]), len(t) - MIN_EVALUATIONS)
+    late = np.arange(len(t)) >= min(
+        np.searchsorted(t, FITTED_SINCE_SHARE * t[-1]), len(t) - MIN_EVALUATIONS
+    )
     x, y = -np.sqrt(t[-1] / t[late]), psnr[late]
     first, second = np.triu_indices(len(x), 1)
     slope = float(np.median((y[second] - y[first]) / (x[second] - x[first])))

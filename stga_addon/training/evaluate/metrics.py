@@ -24,7 +24,8 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 PREWITT_SUM = 3
 """Sum of the positive weights of Prewitt's filter."""
 WINDOW_PX = 7
-"""Side of the window that detail is averaged over, so that a hair a pixel beside its place counts as a hair."""
+"""Side of the window that detail is averaged over, so that a hair a pixel beside its place counts
+as a hair."""
 NOISE_LEVEL = 0.02
 """Change of luma (0…1) from pixel to pixel below which detail counts little."""
 
@@ -33,12 +34,13 @@ NOISE_LEVEL = 0.02
 class Quality:
     """Means over views: PSNR in dB, SSIM, and LPIPS (AlexNet) or None if it was not measured.
 
-    regions  the same per region ("mask", "moving"), over the views that have the region; per group of views
-             ("take_1"), and per region of a group ("moving_take_1")
-    detail_difference  within the head mask, without the matte's border: what the avatar that a run keeps is chosen by;
-                       None for a region
+    regions  the same per region ("mask", "moving"), over the views that have the region; per group
+             of views ("take_1"), and per region of a group ("moving_take_1")
+    detail_difference  within the head mask, without the matte's border: what the avatar that a run
+                       keeps is chosen by; None for a region
     psnr_unmatched     PSNR without fitting the exposure of views; None where none was fitted
-    psnr_recorded      of the avatar in front of its world, against whole images as recorded; None where it has no world
+    psnr_recorded      of the avatar in front of its world, against whole images as recorded; None
+                       where it has no world
     """
 
     psnr: float
@@ -51,7 +53,11 @@ class Quality:
 
     def as_json(self) -> dict[str, float]:
         """Flat: "psnr", "ssim", "psnr_mask" and so on, without what was not measured."""
-        flat = {name: value for name, value in vars(self).items() if name != "regions" and value is not None}
+        flat = {
+            name: value
+            for name, value in vars(self).items()
+            if name != "regions" and value is not None
+        }
         for region, quality in self.regions.items():
             flat.update({f"{name}_{region}": value for name, value in quality.as_json().items()})
         return flat
@@ -65,8 +71,9 @@ def evaluate(
 ) -> Quality:
     """Mean quality of `render(view)` (3, H, W) float32, clipped to 0…1.
 
-    perceptual: whether to measure LPIPS; exposure: `known_exposure`, which renderings are given before; that of other
-    cameras is fitted (`match_exposure`). None: renderings are measured as they are.
+    perceptual: whether to measure LPIPS; exposure: `known_exposure`, which renderings are given
+    before; that of other cameras is fitted (`match_exposure`). None: renderings are measured as
+    they are.
     """
     scores: dict[str, list[tuple[float, float, float]]] = {"": []}
     differences, unmatched, fitted = [], [], False
@@ -85,7 +92,9 @@ def evaluate(
             found = _scores(image, target, perceptual, where)
             scores.setdefault(region, []).append(found)
             if evaluation_view.group:
-                scores.setdefault("_".join(filter(None, (region, evaluation_view.group))), []).append(found)
+                scores.setdefault(
+                    "_".join(filter(None, (region, evaluation_view.group))), []
+                ).append(found)
     means = {region: _mean(of_views) for region, of_views in scores.items()}
     whole = means.pop("")
     return replace(
@@ -97,26 +106,37 @@ def evaluate(
 
 
 def evaluate_avatar(
-    avatar: Avatar, capture: Capture, split: str, perceptual: bool = False, matched: bool | None = None
+    avatar: Avatar,
+    capture: Capture,
+    split: str,
+    perceptual: bool = False,
+    matched: bool | None = None,
 ) -> Quality:
     """Quality of an avatar on all views of a split; holds one view at a time in memory.
 
-    matched: whether to apply the exposure of each view, known or fitted; None: where the avatar was trained so.
+    matched: whether to apply the exposure of each view, known or fitted; None: where the avatar was
+    trained so.
     """
     rows, exposure = avatar.settings.get("exposure") or (), None
     backdrop = str(avatar.settings.get("backdrop", "plain"))
     if rows if matched is None else matched:
         exposure = known_exposure(rows, capture.views.get("train", ()))
     return evaluate(
-        lambda view: render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background),
-        (read_evaluation_view(capture, view, avatar.background, backdrop) for view in capture.views[split]),
+        lambda view: render_avatar(
+            avatar, capture.mesh(view.timestep), view.camera, avatar.background
+        ),
+        (
+            read_evaluation_view(capture, view, avatar.background, backdrop)
+            for view in capture.views[split]
+        ),
         perceptual,
         exposure,
     )
 
 
 def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -> float:
-    """Mean PSNR in dB of the avatar in front of its world, in all views of a split, against images as recorded.
+    """Mean PSNR in dB of the avatar in front of its world, in all views of a split, against images
+    as recorded.
 
     Renderings are given the exposure of their camera where the run knows one; none is fitted.
     """
@@ -132,7 +152,8 @@ def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -
 
 
 def psnr(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
-    """PSNR in dB of image (3, H, W) in 0…1 and target (H, W, 3) uint8, over the pixels `where` (H, W) if given."""
+    """PSNR in dB of image (3, H, W) in 0…1 and target (H, W, 3) uint8, over the pixels `where` (H,
+    W) if given."""
     error = (image - target.transpose(2, 0, 1).astype(np.float32) / 255) ** 2
     mean = float(error.mean() if where is None else error[:, where].mean())
     return float(-10 * np.log10(max(mean, 1e-12)))
@@ -148,16 +169,18 @@ def peak_memory_mb() -> float | None:
     import resource
 
     peak: int = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)  # bytes there, KiB elsewhere
+    # bytes there, KiB elsewhere
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 
 def _scores(
     image: np.ndarray, target: np.ndarray, perceptual: bool, where: np.ndarray | None = None
 ) -> tuple[float, float, float]:
-    """PSNR, SSIM and LPIPS (NaN if not measured) of the whole image or of the region `where` (H, W).
+    """PSNR, SSIM and LPIPS (NaN if not measured) of the whole image or of the region `where` (H,
+    W).
 
-    For a region's SSIM and LPIPS, pixels outside it are replaced by the target's, and SSIM is scaled to a mean over
-    the region.
+    For a region's SSIM and LPIPS, pixels outside it are replaced by the target's, and SSIM is
+    scaled to a mean over the region.
     """
     psnr_db = psnr(image, target, where)
     share = 1.0
@@ -181,11 +204,15 @@ def _lpips(image: np.ndarray, target: np.ndarray) -> float | None:
     return network.distance(image, target.transpose(2, 0, 1).astype(np.float32) / 255)
 
 
-def detail_difference(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
-    """Mean of |a − b| / (a + b + NOISE_LEVEL) over the pixels `where` (H, W) if given; 0 for equal images, below 1.
+def detail_difference(
+    image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None
+) -> float:
+    """Mean of |a − b| / (a + b + NOISE_LEVEL) over the pixels `where` (H, W) if given; 0 for equal
+    images, below 1.
 
-    image (3, H, W) float32 in 0…1, target (H, W, 3) uint8; a and b are their mean gradients of luma around a pixel.
-    It falls with LPIPS during training, also where PSNR falls, and needs no weights.
+    image (3, H, W) float32 in 0…1, target (H, W, 3) uint8; a and b are their mean gradients of luma
+    around a pixel. It falls with LPIPS during training, also where PSNR falls, and needs no
+    weights.
     """
     first = _local_gradient(np.tensordot(LUMA, image, 1))
     second = _local_gradient(target @ LUMA / np.float32(255))
@@ -195,4 +222,6 @@ def detail_difference(image: np.ndarray, target: np.ndarray, where: np.ndarray |
 
 def _local_gradient(luma: np.ndarray) -> np.ndarray:
     """Length of Prewitt's gradient of an image (H, W), averaged over a window."""
-    return np.asarray(uniform_filter(np.hypot(prewitt(luma, 0), prewitt(luma, 1)) / PREWITT_SUM, WINDOW_PX))
+    return np.asarray(
+        uniform_filter(np.hypot(prewitt(luma, 0), prewitt(luma, 1)) / PREWITT_SUM, WINDOW_PX)
+    )

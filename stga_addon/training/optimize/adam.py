@@ -12,7 +12,8 @@ BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
 
 
 def image_epsilon(share: float, camera: Camera) -> np.float32:
-    """Adam's ε for gradients of a mean over an image's values, as a share of the weight of one of them."""
+    """Adam's ε for gradients of a mean over an image's values, as a share of the weight of one of
+    them."""
     return np.float32(share / (3 * camera.width * camera.height))
 
 
@@ -26,7 +27,8 @@ def step(
     """Step the listed rows (M,) int32 of every parameter along its gradient.
 
     rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
-    ema_share  least share of the stepped row in its exponential moving average; with 1, the average is the row
+    ema_share  least share of the stepped row in its exponential moving average; with 1, the average
+               is the row
     epsilon    added to the root of the second moment; `image_epsilon` in training
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).

@@ -1,8 +1,10 @@
-"""Tracking by a finished avatar: pose and expression such that the avatar, its splats fixed, looks like the images.
+"""Tracking by a finished avatar: pose and expression such that the avatar, its splats fixed, looks
+like the images.
 
-Landmarks and dense tracking know a face in general; an avatar knows its person, with hair and teeth. The gradient is
-that of the training's own loss, passed from the splats to the head's parameters. L-BFGS follows it in coordinates in
-which the Gauss-Newton matrix of points of the surface is the identity, so that few renderings are enough.
+Landmarks and dense tracking know a face in general; an avatar knows its person, with hair and
+teeth. The gradient is that of the training's own loss, passed from the splats to the head's
+parameters. L-BFGS follows it in coordinates in which the Gauss-Newton matrix of points of the
+surface is the identity, so that few renderings are enough.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +20,14 @@ from ...capture.mesh_geometry import vertex_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import with_sequence
 from ...errors import StgaError
-from ...flame.forward import RIGID_SIZE, TRANSLATION_SIZE, FlameFrame, flame_forward, frame_of, parameters_gradient
+from ...flame.forward import (
+    RIGID_SIZE,
+    TRANSLATION_SIZE,
+    FlameFrame,
+    flame_forward,
+    frame_of,
+    parameters_gradient,
+)
 from ...flame.sequence import FlameSequence, sequence_mesh, with_identity
 from ...progress import Cancelled
 from ...tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
@@ -38,22 +47,24 @@ from .state import new_offset, new_state
 RENDERINGS = 6
 """Of each view of a timestep: more of them hardly lower the loss."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
-"""Cameras, spread over the rig, whose images are compared; images higher than this are shrunk to it."""
+"""Cameras, spread over the rig, whose images are compared; images higher than this are shrunk to
+it."""
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
 POINTS, MIN_COSINE, VISIBILITY_SIDE_PX = 6000, 0.15, 160
-"""Points of the surface; of the angle between normal and camera, below which one does not count; size of the depth
-image that hidden ones are found in."""
+"""Points of the surface; of the angle between normal and camera, below which one does not count;
+size of the depth image that hidden ones are found in."""
 EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
 FIRST_STEP = 0.01
-"""Length of the first step, as a share of the one down a loss as steep as the points say: it is steeper."""
+"""Length of the first step, as a share of the one down a loss as steep as the points say: it is
+steeper."""
 
 
 @dataclass(frozen=True)
 class AvatarTracking:
-    """Parameters (T, E + 18) of timesteps, and what was minimized, (T,), where they started and where they are: the
-    loss of their images, in the points' units, and the prior."""
+    """Parameters (T, E + 18) of timesteps, and what was minimized, (T,), where they started and
+    where they are: the loss of their images, in the points' units, and the prior."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
@@ -62,7 +73,8 @@ class AvatarTracking:
 
 
 class RefinedTracking:
-    """The motion of a head that its avatar tracks while it is trained: meshes in place of the capture's.
+    """The motion of a head that its avatar tracks while it is trained: meshes in place of the
+    capture's.
 
     tracked     (T, P) the capture's parameters
     parameters  (T, P) those of now
@@ -70,15 +82,20 @@ class RefinedTracking:
     """
 
     def __init__(self, capture: Capture, convention: str) -> None:
-        """Raises StgaError where the capture has no parameters, or for an embedding convention without gradients."""
+        """Raises StgaError where the capture has no parameters, or for an embedding convention
+        without gradients."""
         if convention != "stga":
-            raise StgaError(f"--effect tracking=on: needs the embedding convention 'stga', got '{convention}'")
+            raise StgaError(
+                f"--effect tracking=on: needs the embedding convention 'stga', got '{convention}'"
+            )
         if capture.flame is None:
             raise StgaError(
                 f"{capture.root}: is not tracked with FLAME, so --effect tracking=on cannot refine its parameters"
             )
         self.sequence = capture.flame
-        self.tracked = np.stack([self.sequence.frame(timestep).parameters for timestep in self.sequence.timesteps])
+        self.tracked = np.stack(
+            [self.sequence.frame(timestep).parameters for timestep in self.sequence.timesteps]
+        )
         self.parameters, self.rounds = self.tracked.copy(), 0
         self._row = {timestep: row for row, timestep in enumerate(self.sequence.timesteps)}
         self._source = lru_cache(CACHED_TIMESTEPS)(self.sequence.frame)
@@ -99,8 +116,11 @@ class RefinedTracking:
         return with_sequence(capture, replace(self.sequence, frame=self.frame))
 
     def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> None:
-        """Give some timesteps what was found: those in between that were left out change as their neighbors do."""
-        rows, at = ([self._row[timestep] for timestep in own] for own in (timesteps, found.timesteps))
+        """Give some timesteps what was found: those in between that were left out change as their
+        neighbors do."""
+        rows, at = (
+            [self._row[timestep] for timestep in own] for own in (timesteps, found.timesteps)
+        )
         change = found.parameters - self.parameters[at]
         between = [np.interp(rows, at, column) for column in change.T]
         self.parameters = self.parameters.copy()
@@ -117,9 +137,10 @@ def track_by_avatar(
 ) -> AvatarTracking:
     """Refine the parameters of a tracked capture of the avatar's person, from where they are.
 
-    settings: with which the avatar was trained, whose background and exposures the images have. timesteps: None: all;
-    as many of them, evenly spread, as `seconds` allow. report: how many are done; returns whether to stop.
-    Raises StgaError where the capture has no parameters or is of another head, and Cancelled.
+    settings: with which the avatar was trained, whose background and exposures the images have.
+    timesteps: None: all; as many of them, evenly spread, as `seconds` allow. report: how many are
+    done; returns whether to stop. Raises StgaError where the capture has no parameters or is of
+    another head, and Cancelled.
     """
     tracker, found = _Tracker(avatar, settings, capture), []
     chosen, begin = list(capture.timesteps if timesteps is None else timesteps), perf_counter()
@@ -169,18 +190,25 @@ class _Tracker:
         self._posed_points = PosedPoints(person, self._points)
         self._posed = _Posed(sequence)
         state = new_state(avatar.splats)
-        state.driven_offsets = {name: new_offset(own) for name, own in avatar.driven_offsets.items()}
+        state.driven_offsets = {
+            name: new_offset(own) for name, own in avatar.driven_offsets.items()
+        }
         limits = avatar.strain_range
-        self._frames = FrameStore(capture, settings.convention, settings.follows_strain, self._posed, limits)
+        self._frames = FrameStore(
+            capture, settings.convention, settings.follows_strain, self._posed, limits
+        )
         self._backend = CpuBackend(settings, self._frames, state)
 
     def solve(self, timestep: int) -> tuple[np.ndarray, float, float]:
-        """Parameters (E + 18,), and what was minimized before and after; as tracked where no view shows it."""
+        """Parameters (E + 18,), and what was minimized before and after; as tracked where no view
+        shows it."""
         from scipy.linalg import solve_triangular
         from scipy.optimize import minimize
 
         tracked = self._sequence.frame(timestep).parameters
-        shots = [self._read(view) for view in evenly_spread(self._views.get(timestep, []), MAX_VIEWS)]
+        shots = [
+            self._read(view) for view in evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
+        ]
         if not shots:
             return tracked, 0.0, 0.0
         precision = self._precision()
@@ -204,7 +232,11 @@ class _Tracker:
 
         options = {"maxfun": RENDERINGS, "maxiter": RENDERINGS}
         best = minimize(scaled, start, jac=True, method="L-BFGS-B", options=options)
-        return tracked + solve_triangular(root, scale * best.x, lower=True, trans=1), before, float(best.fun)
+        return (
+            tracked + solve_triangular(root, scale * best.x, lower=True, trans=1),
+            before,
+            float(best.fun),
+        )
 
     def _read(self, view: View) -> tuple[View, np.ndarray]:
         background = [round(255 * part) for part in self._settings.background]
@@ -226,7 +258,9 @@ class _Tracker:
         absent = np.repeat(~np.array(self._head.joints), 3)
         precision = sigma**-2.0
         rigid = slice(count, count + len(absent))
-        precision[rigid] = np.where(absent, parameter_precision(self._head)[rigid], precision[rigid])
+        precision[rigid] = np.where(
+            absent, parameter_precision(self._head)[rigid], precision[rigid]
+        )
         return precision
 
     def _excess(self, values: np.ndarray) -> np.ndarray:
@@ -247,17 +281,25 @@ class _Tracker:
         background = np.array(self._settings.background, np.float32)
         for view, image in shots:
             weight = POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255)
-            loss, gradient = self._backend.mesh_gradient(view, image, background, sh_degree(self._settings, 1.0))
+            loss, gradient = self._backend.mesh_gradient(
+                view, image, background, sh_degree(self._settings, 1.0)
+            )
             total += weight * loss
             by_vertex += weight * gradient
         offset = self._sequence.frame(timestep).dynamic_offset
         return total, parameters_gradient(self._head.model, frame_of(values, offset), by_vertex)
 
-    def _gauss_newton(self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
-        """(E + 18, E + 18): how much parameters change what the images show at points of the surface."""
+    def _gauss_newton(
+        self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]
+    ) -> np.ndarray:
+        """(E + 18, E + 18): how much parameters change what the images show at points of the
+        surface."""
         self._posed.values = values
         mesh, faces = self._posed.mesh(timestep), self._capture.faces
-        at, normals = self._points.on(mesh, faces), self._points.on(vertex_normals(mesh, faces), faces)
+        at, normals = (
+            self._points.on(mesh, faces),
+            self._points.on(vertex_normals(mesh, faces), faces),
+        )
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         curvature = np.zeros((len(at), 3, 3))
         for view, image in shots:
@@ -266,7 +308,11 @@ class _Tracker:
             pixels, depth = level.camera.project(at)
             small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
             cosine = facing(camera, at, normals)
-            seen = (cosine > MIN_COSINE) & in_sight(small, mesh, faces, at) & inside(level.camera, pixels, depth)
+            seen = (
+                (cosine > MIN_COSINE)
+                & in_sight(small, mesh, faces, at)
+                & inside(level.camera, pixels, depth)
+            )
             slopes = np.stack(sampled(list(level.gradient), pixels), -1)  # (N, 3 channels, 2)
             moved = slopes @ projection_derivative(level.camera, at) / NOISE_LEVELS
             weight = POINT_SHARE * (cosine * seen)[:, None] * CHANNEL_WEIGHTS

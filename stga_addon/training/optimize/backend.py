@@ -15,7 +15,8 @@ class Batch:
     """Input of one iteration: one view.
 
     target      (H, W, 3) uint8 over the settings' background
-    mask        (H, W) uint8 coverage if the target's background is to be replaced by `background`, else None
+    mask        (H, W) uint8 coverage if the target's background is to be replaced by `background`,
+                else None
     background  (3,) float32 behind the splats
     sh_degree   degree of spherical harmonics in use
     selected    (F,) bool triangles whose splats are trained; None trains all
@@ -45,7 +46,9 @@ class Backend(Protocol):
         """How many splats there are."""
 
     def step(self, batch: Batch) -> float | None:
-        """Forward, backward and optimizer step. Returns the latest image loss that has become available, if any."""
+        """Forward, backward and optimizer step. Returns the latest image loss that has become
+        available, if any."""
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over background (3,)."""
+        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over
+        background (3,)."""

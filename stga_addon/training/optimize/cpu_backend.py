@@ -7,8 +7,19 @@ from ...avatar.offsets import offset_of
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
-from ...raster.cpu.rasterize import BufferPool, RenderOutput, frames_in_camera, render_backward, render_forward
+from ...raster.cpu.optimizer import (
+    add_screen_gradients,
+    distance_limit,
+    opacity_weight,
+    scale_limit,
+)
+from ...raster.cpu.rasterize import (
+    BufferPool,
+    RenderOutput,
+    frames_in_camera,
+    render_backward,
+    render_forward,
+)
 from ...raster.cpu.threads import threads
 from ..settings import TrainingSettings
 from . import adam, driven_offsets
@@ -19,7 +30,8 @@ from .state import TrainState
 
 
 class CpuBackend:
-    """Trains in host memory: `state` is the trained arrays themselves, and every loss is returned at once."""
+    """Trains in host memory: `state` is the trained arrays themselves, and every loss is returned
+    at once."""
 
     def __init__(self, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> None:
         self.state = state
@@ -31,11 +43,14 @@ class CpuBackend:
         return len(self.state)
 
     def step(self, batch: Batch) -> float | None:
-        """Forward, backward and optimizer step; returns the image loss of a global iteration, None for a local one."""
+        """Forward, backward and optimizer step; returns the image loss of a global iteration, None
+        for a local one."""
         state = self.state
         focus = None if batch.selected is None else batch.selected.take(state.face)
         target = self._target(batch)
-        rows, screen, loss = self._backward(batch.view, target, batch.background, batch.sh_degree, focus)
+        rows, screen, loss = self._backward(
+            batch.view, target, batch.background, batch.sh_degree, focus
+        )
         epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
         self._step_offsets(batch, rows, epsilon)
         self._add_limit_gradients(rows)
@@ -57,13 +72,20 @@ class CpuBackend:
         captured = np.array(self._settings.background, np.float32)
         change_background(batch.target, batch.mask, 255 * captured, 255 * batch.background, target)
         read_only = target.view()
-        read_only.setflags(write=False)  # like the loader's arrays: Numba compiles for one type only
+        # like the loader's arrays: Numba compiles for one type only
+        read_only.setflags(write=False)
         return read_only
 
     def _backward(
-        self, view: View, target: np.ndarray, background: np.ndarray, sh_degree: int, focus: np.ndarray | None
+        self,
+        view: View,
+        target: np.ndarray,
+        background: np.ndarray,
+        sh_degree: int,
+        focus: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
-        """Fill the gradients of the trained rows; returns those rows, the screen gradients (N,) and the loss."""
+        """Fill the gradients of the trained rows; returns those rows, the screen gradients (N,) and
+        the loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
         state, frames = self.state, self._moved_frames(view.timestep)
         rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
@@ -82,7 +104,8 @@ class CpuBackend:
         return rows, screen, loss if focus is None else None
 
     def _moved_frames(self, timestep: int, averaged: bool = False) -> FaceFrames:
-        """The timestep's frames, moved by the driven offsets; averaged: by their moving averages."""
+        """The timestep's frames, moved by the driven offsets; averaged: by their moving
+        averages."""
         offsets = self.state.driven_offsets.items()
         coefficients = {name: state.average if averaged else state.value for name, state in offsets}
         return self._frames.moved(timestep, coefficients)
@@ -100,7 +123,8 @@ class CpuBackend:
     def mesh_gradient(
         self, view: View, target: np.ndarray, background: np.ndarray, sh_degree: int
     ) -> tuple[float, np.ndarray]:
-        """The image loss of a view, and its gradient (V, 3) with respect to the timestep's mesh; nothing is stepped."""
+        """The image loss of a view, and its gradient (V, 3) with respect to the timestep's mesh;
+        nothing is stepped."""
         rows, _, loss = self._backward(view, target, background, sh_degree, None)
         assert loss is not None
         store, state = self._frames, self.state
@@ -109,7 +133,9 @@ class CpuBackend:
             shift = offset_of(offset.value, store.signals(view.timestep)(name))
             splats = splats._replace(xyz=splats.xyz + shift[face])
         by_frame = frame_gradient(splats, face, state.gradients, rows, frames)
-        return loss, frame_backward(store.mesh(view.timestep), store.capture.faces, frames, *by_frame)
+        return loss, frame_backward(
+            store.mesh(view.timestep), store.capture.faces, frames, *by_frame
+        )
 
     def _step_offsets(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:
         """Step the driven offsets, before the limits' gradients are added."""
@@ -120,15 +146,20 @@ class CpuBackend:
         )  # fmt: skip
 
     def _add_limit_gradients(self, rows: np.ndarray) -> None:
-        """Add the gradients that keep splats near what they cover, and unbound ones out of the air."""
+        """Add the gradients that keep splats near what they cover, and unbound ones out of the
+        air."""
         settings, state = self._settings, self.state
         face, unbound = state.face, state.unbound
         if settings.scale_weight:
             gradient, log_scale = state.gradients.log_scale, state.parameters.log_scale
-            scale_limit(rows, log_scale, face, unbound, self._scale_limits, settings.scale_weight, gradient)
+            scale_limit(
+                rows, log_scale, face, unbound, self._scale_limits, settings.scale_weight, gradient
+            )
         if settings.unseen_opacity_weight and self.state.has_unseen:
             weight = settings.unseen_opacity_weight / len(state)
-            opacity_weight(rows, state.parameters.opacity, state.unseen_share, weight, state.gradients.opacity)
+            opacity_weight(
+                rows, state.parameters.opacity, state.unseen_share, weight, state.gradients.opacity
+            )
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._frames.units
             weight, gradient = settings.distance_weight, state.gradients.xyz
@@ -136,16 +167,22 @@ class CpuBackend:
 
 
 def frame_gradient(
-    splats: Parameters, face: np.ndarray, gradients: Parameters, rows: np.ndarray, frames: FaceFrames
+    splats: Parameters,
+    face: np.ndarray,
+    gradients: Parameters,
+    rows: np.ndarray,
+    frames: FaceFrames,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients of the face frames from those of their splats `rows` (M,), as `frame_backward` takes them.
+    """Gradients of the face frames from those of their splats `rows` (M,), as `frame_backward`
+    takes them.
 
-    Returns those of translation (F, 3), rotation (F, 3) and scale (F,). A frame translates, rotates and scales all its
-    splats alike, so each is a sum over its splats.
+    Returns those of translation (F, 3), rotation (F, 3) and scale (F,). A frame translates, rotates
+    and scales all its splats alike, so each is a sum over its splats.
     """
     (x, y, z), (fx, fy, fz) = splats.xyz[rows].T, gradients.xyz[rows].T
     (q0, q1, q2, q3), (v0, v1, v2, v3) = splats.rotation[rows].T, gradients.rotation[rows].T
-    rotation = (  # of position (cross product), plus of orientation (half of the quaternion's gradient)
+    # of position (cross product), plus of orientation (half of the quaternion's gradient)
+    rotation = (
         y * fz - z * fy + (q0 * v1 - q1 * v0 + q2 * v3 - q3 * v2) / 2,
         z * fx - x * fz + (q0 * v2 - q2 * v0 + q3 * v1 - q1 * v3) / 2,
         x * fy - y * fx + (q0 * v3 - q3 * v0 + q1 * v2 - q2 * v1) / 2,

@@ -1,4 +1,5 @@
-"""Density control and stray resets: splitting, pruning and moving splats between steps (STGA, training)."""
+"""Density control and stray resets: splitting, pruning and moving splats between steps (STGA,
+training)."""
 
 from dataclasses import replace
 
@@ -25,10 +26,11 @@ def control_density(
 ) -> TrainState:
     """Split the splats with the largest mean screen gradient and prune those of low opacity.
 
-    budget: how many splats may be added; max_share: largest share of the splats that is split; region (F,) bool: the
-    triangles whose splats may change, None for all. Every triangle with bound splats keeps one. Children inherit
-    triangle, binding and unseen share, lie within the parent's Gaussian in local units, and keep Adam's second moment
-    and step count, without which their first steps would all be as long as the rate.
+    budget: how many splats may be added; max_share: largest share of the splats that is split;
+    region (F,) bool: the triangles whose splats may change, None for all. Every triangle with bound
+    splats keeps one. Children inherit triangle, binding and unseen share, lie within the parent's
+    Gaussian in local units, and keep Adam's second moment and step count, without which their first
+    steps would all be as long as the rate.
     """
     gradient = state.screen_gradient / np.maximum(state.gradient_count, 1)
     within = np.ones(len(state), bool) if region is None else region[state.face]
@@ -53,12 +55,15 @@ def control_density(
 
 
 def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
-    """Move bound splats farther than `limit` from their triangle's origin back to `share` of it; returns how many.
+    """Move bound splats farther than `limit` from their triangle's origin back to `share` of it;
+    returns how many.
 
-    limit (F,) in local units, infinite where none is moved. Works in place. (STGA, training, which moves them onto the
-    origin: share = 0.) Adam's first moment of the position is reset. The second moment is kept: with it at zero and
-    the step count of the row, which all its parameters share, in the thousands, the bias correction would make the
-    next step 3.2 times as long as the learning rate (0.1 / √0.001).
+    limit (F,) in local units, infinite where none is moved. Works in place. (STGA, training, which
+    moves them onto the
+    origin: share = 0.) Adam's first moment of the position is reset. The second moment is kept:
+    with it at zero and the step count of the row, which all its parameters share, in the thousands,
+    the bias correction would make the next step 3.2 times as long as the learning rate (0.1 /
+    √0.001).
     """
     distance = np.linalg.norm(state.parameters.xyz, axis=1)
     allowed = limit[state.face]
@@ -96,8 +101,8 @@ def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
 
 
 def prunable(state: TrainState, unwanted: np.ndarray) -> np.ndarray:
-    """(N,) bool: the unwanted splats (N,) bool but for a bound one of each triangle that would have none left: the most
-    opaque one."""
+    """(N,) bool: the unwanted splats (N,) bool but for a bound one of each triangle that would have
+    none left: the most opaque one."""
     face, bound = state.face, np.flatnonzero(~state.unbound)
     order = bound[np.lexsort((-state.parameters.opacity[bound], unwanted[bound], face[bound]))]
     first = np.ones(len(order), bool)

@@ -20,10 +20,11 @@ def step(
     ema_share: float,
     epsilon: np.float32,
 ) -> None:
-    """Adam step of the triangles face (N,) of the listed splats rows (M,), whose positions have xyz_gradient (N, 3).
+    """Adam step of the triangles face (N,) of the listed splats rows (M,), whose positions have
+    xyz_gradient (N, 3).
 
-    signal: name of an offset -> (F, S); position_rate: the splats'; ema_share, epsilon: as in `adam_rows`. A triangle
-    moves all its splats alike, so its gradient is their sum.
+    signal: name of an offset -> (F, S); position_rate: the splats'; ema_share, epsilon: as in
+    `adam_rows`. A triangle moves all its splats alike, so its gradient is their sum.
     """
     for name, state in states.items():
         count = len(state.steps)

@@ -1,4 +1,5 @@
-"""Cache of meshes and face frames by timestep, and the limits on size and position in their units (STGA, training)."""
+"""Cache of meshes and face frames by timestep, and the limits on size and position in their units
+(STGA, training)."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -37,9 +38,12 @@ class _Timestep:
 class FrameStore:
     """Meshes (V, 3) and face frames by timestep, float64; the latest CACHED_TIMESTEPS are kept.
 
-    strain    `strain_basis` of the neutral mesh, None if neither colors nor positions depend on strain
-    tracking  meshes of its timesteps come from here instead of the capture, None if no tracking is refined
-    units     (F,) float32: per triangle the length that limits are multiples of, in the convention's local units
+    strain    `strain_basis` of the neutral mesh, None if neither colors nor positions depend on
+              strain
+    tracking  meshes of its timesteps come from here instead of the capture, None if no tracking is
+              refined
+    units     (F,) float32: per triangle the length that limits are multiples of, in the
+              convention's local units
     """
 
     def __init__(
@@ -56,20 +60,29 @@ class FrameStore:
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
         self.units = np.ones(len(capture.faces), np.float32)
         if convention != "gaussian_avatars":
-            self.units = np.asarray(np.sqrt(2 * face_areas(capture.neutral, capture.faces)), np.float32)
+            self.units = np.asarray(
+                np.sqrt(2 * face_areas(capture.neutral, capture.faces)), np.float32
+            )
         self._cached: dict[int, _Timestep] = {}
 
     def scale_limits(self, settings: TrainingSettings) -> np.ndarray:
-        """Largest scale (2, F) float32 of bound and of unbound splats by triangle, in the convention's local units."""
+        """Largest scale (2, F) float32 of bound and of unbound splats by triangle, in the
+        convention's local units."""
         neutral = self.capture.neutral
         frames = face_frames(neutral, self.capture.faces, neutral, self.convention)
-        unbound = settings.unbound_scale_limit * voxel_size(neutral) / np.maximum(frames.scale, MIN_DIVISOR)
+        unbound = (
+            settings.unbound_scale_limit
+            * voxel_size(neutral)
+            / np.maximum(frames.scale, MIN_DIVISOR)
+        )
         return np.asarray(np.stack([settings.scale_limit * self.units, unbound]), np.float32)
 
     def of(self, timestep: int) -> FaceFrames:
         entry, capture = self._latest(timestep), self.capture
         if entry.frames is None:
-            entry.frames = face_frames(entry.mesh, capture.faces, capture.neutral, self.convention, self.strain)
+            entry.frames = face_frames(
+                entry.mesh, capture.faces, capture.neutral, self.convention, self.strain
+            )
         return entry.frames
 
     def signals(self, timestep: int) -> Callable[[str], np.ndarray]:
@@ -93,7 +106,8 @@ class FrameStore:
         return self._latest(timestep).mesh
 
     def add(self, timestep: int, mesh: np.ndarray) -> None:
-        """Use `mesh`, already read from the capture, if the timestep is not cached; refined timesteps ignore it."""
+        """Use `mesh`, already read from the capture, if the timestep is not cached; refined
+        timesteps ignore it."""
         if not self._refines(timestep):
             self._latest(timestep, mesh)
 

@@ -40,7 +40,8 @@ TABLES = ("gradients", "first", "second", "average")
 
 @dataclass
 class _Queued:
-    """An iteration on its way, whose batch is kept in case that it has to be repeated; loss: of a global one."""
+    """An iteration on its way, whose batch is kept in case that it has to be repeated; loss: of a
+    global one."""
 
     batch: Batch
     readback: Readback
@@ -49,21 +50,32 @@ class _Queued:
 
 
 class GpuBackend:
-    """Trains asynchronously: `step` records an iteration, submits it at once and returns without waiting for it.
+    """Trains asynchronously: `step` records an iteration, submits it at once and returns without
+    waiting for it.
 
-    How many (tile, splat) pairs there are only the device knows. Where they exceed the buffers, it changes nothing from
-    there on; the host learns it when it reads that iteration's loss, makes room, and queues what was left out again.
+    How many (tile, splat) pairs there are only the device knows. Where they exceed the buffers, it
+    changes nothing from there on; the host learns it when it reads that iteration's loss, makes
+    room, and queues what was left out again.
     """
 
-    def __init__(self, device: Device, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> None:
+    def __init__(
+        self, device: Device, settings: TrainingSettings, frames: FrameStore, state: TrainState
+    ) -> None:
         capture = frames.capture
         self._settings, self._frames, self.device = settings, frames, device
         self._rasterizer = Rasterizer(device)
         self._embedding = Embedding(
-            device, capture.neutral, capture.faces, frames.convention, frames.strain, state.driven_offsets
+            device,
+            capture.neutral,
+            capture.faces,
+            frames.convention,
+            frames.strain,
+            state.driven_offsets,
         )
         self._triangles = len(capture.faces)
-        self._limits = np.column_stack([*frames.scale_limits(settings), settings.distance_limit * frames.units])
+        self._limits = np.column_stack(
+            [*frames.scale_limits(settings), settings.distance_limit * frames.units]
+        )
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)
@@ -83,7 +95,10 @@ class GpuBackend:
             name: Parameters(*split_rows(read(buffer(name, 0), (count, stride)), coefficients))
             for name in ("splats", *TABLES)
         }
-        history, traits = read(self._tables.history, (count, 3), np.uint32), read(self._tables.traits, (count, 2))
+        history, traits = (
+            read(self._tables.history, (count, 3), np.uint32),
+            read(self._tables.traits, (count, 2)),
+        )
         sums = history.view(np.float32)
         return TrainState(
             parameters=tables["splats"],
@@ -120,16 +135,22 @@ class GpuBackend:
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
         self._splats = upload_splats(self.device, state.parameters, state.face)
-        splats_of = upload("splats by triangle", optimizer.splats_by_triangle(state.face, self._triangles))
+        splats_of = upload(
+            "splats by triangle", optimizer.splats_by_triangle(state.face, self._triangles)
+        )
         self._offsets = {
             name: OffsetTables._make(
-                [*(upload(f"{name} {part}", each) for part, each in vars(offset).items()), splats_of]
+                [
+                    *(upload(f"{name} {part}", each) for part, each in vars(offset).items()),
+                    splats_of,
+                ]
             )
             for name, offset in state.driven_offsets.items()
         }
 
     def step(self, batch: Batch) -> float | None:
-        """Queue one step; returns the loss of the iteration before the last if it was a global one."""
+        """Queue one step; returns the loss of the iteration before the last if it was a global
+        one."""
         loss = None
         if len(self._pending) == QUEUED_ITERATIONS:
             self._finish(0)
@@ -141,7 +162,8 @@ class GpuBackend:
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' moving average after all queued iterations: a new (3, H, W) float32 image."""
+        """The view with the splats' moving average after all queued iterations: a new (3, H, W)
+        float32 image."""
         self._finish_all()
         average = replace(self._splats, rows=self._tables.average)
         moved = {name: tables.average for name, tables in self._offsets.items()}
@@ -149,7 +171,9 @@ class GpuBackend:
             with self.device.record() as work:
                 rendering = self._render(work, average, moved, view, background, sh_degree)
             if self._rasterizer.pairs_fit():
-                return self.device.read(rendering["image"], (3, view.camera.height, view.camera.width))
+                return self.device.read(
+                    rendering["image"], (3, view.camera.height, view.camera.width)
+                )
 
     def _finish_all(self) -> None:
         """Wait until all queued iterations are done."""
@@ -157,7 +181,8 @@ class GpuBackend:
             self._finish(n)
 
     def _finish(self, n: int) -> None:
-        """Wait for the n-th queued iteration, and repeat it and those behind it if its pairs did not fit."""
+        """Wait for the n-th queued iteration, and repeat it and those behind it if its pairs did
+        not fit."""
         pending = list(self._pending)
         queued = pending[n]
         while not queued.done:
@@ -181,14 +206,24 @@ class GpuBackend:
         with self.device.record() as work:
             splats, camera = self._splats, batch.view.camera
             moved = {name: tables.coefficients for name, tables in self._offsets.items()}
-            rendering = self._render(work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected)
+            rendering = self._render(
+                work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected
+            )
             v_image, loss = image_loss(
                 work, camera.width, camera.height, view=rendering["view"], image=rendering["image"],
                 touched=rendering["touched"], whole=whole,
             )  # fmt: skip
-            screen = self._rasterizer.backward(work, rendering, splats, camera, v_image, self._gradients)
-            given = {"view": rendering["view"], "wanted": rendering["wanted"], "gradients": self._gradients}
-            optimizer.step_offsets(work, self._triangles, self._offsets, self._embedding.signals, **given)
+            screen = self._rasterizer.backward(
+                work, rendering, splats, camera, v_image, self._gradients
+            )
+            given = {
+                "view": rendering["view"],
+                "wanted": rendering["wanted"],
+                "gradients": self._gradients,
+            }
+            optimizer.step_offsets(
+                work, self._triangles, self._offsets, self._embedding.signals, **given
+            )
             limited = bool(self._settings.scale_weight or self._settings.distance_weight)
             given |= {"splats": splats.rows, "face": splats.face, "screen": screen}
             optimizer.optimize(work, splats.count, splats.stride, limited, self._tables, **given)
@@ -199,7 +234,8 @@ class GpuBackend:
         self, work: Recording, splats: SplatTable, offsets: Mapping[str, Any], view: View, background: np.ndarray,
         sh_degree: int, selected: np.ndarray | None = None,
     ) -> Tables:  # fmt: skip
-        """Record a view of the splats, moved by driven offsets with these coefficients (F, S, 3) on the device.
+        """Record a view of the splats, moved by driven offsets with these coefficients (F, S, 3) on
+        the device.
 
         Only the tiles around the splats on the selected triangles, if any are given.
         """
@@ -223,14 +259,22 @@ class GpuBackend:
     def _upload_step(self, batch: Batch) -> None:
         settings = self._settings
         epsilon = float(image_epsilon(settings.adam_epsilon, batch.view.camera))
-        weights = settings.scale_weight, settings.distance_weight, settings.unseen_opacity_weight / max(len(self), 1)
+        weights = (
+            settings.scale_weight,
+            settings.distance_weight,
+            settings.unseen_opacity_weight / max(len(self), 1),
+        )
         optimizer.upload_step(
             self.device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
             statistics=batch.accumulate, triangles=self._triangles,
         )  # fmt: skip
 
     def _read_offset(self, name: str) -> OffsetState:
-        read, tables, shape = self.device.read, self._offsets[name], (self._triangles, OFFSETS[name].signals, 3)
+        read, tables, shape = (
+            self.device.read,
+            self._offsets[name],
+            (self._triangles, OFFSETS[name].signals, 3),
+        )
         return OffsetState(
             value=read(tables.coefficients, shape),
             first=read(tables.first, shape),

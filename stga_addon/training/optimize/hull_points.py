@@ -1,4 +1,5 @@
-"""Hull points: splats for what the mesh does not cover (hair, shoulders, clothes); a flat layer for a single camera."""
+"""Hull points: splats for what the mesh does not cover (hair, shoulders, clothes); a flat layer for
+a single camera."""
 
 from collections.abc import Sequence
 
@@ -20,7 +21,8 @@ from ...tracking.torso_motion import TorsoPoints, read_torso_points
 VOXEL_SIZE_M = 0.004
 """Distance between hull points, on a mesh of a head's size."""
 MIN_VOXEL_SIZE_SHARE = 1 / 200
-"""Lower bound of the voxel size, as a share of the mesh's diagonal, so that a mesh in millimeters fits into memory."""
+"""Lower bound of the voxel size, as a share of the mesh's diagonal, so that a mesh in millimeters
+fits into memory."""
 MIN_MESH_DISTANCE_M = 0.006
 """Points nearer to the mesh are covered by the mesh's own splats."""
 GRID_MARGIN_SHARE = 0.25
@@ -30,17 +32,19 @@ BLOCK_VOXELS = 5
 MIN_VISIBLE_SHARE = 0.25
 """Share of the views in whose image a voxel must lie; it must be foreground in all of these."""
 MIN_EXPOSED_SHARE = 0.125
-"""Share of the views in which a voxel must be visible beside the mesh. Otherwise, volumes behind the head that no view
-contradicts would become floaters in other views."""
+"""Share of the views in which a voxel must be visible beside the mesh. Otherwise, volumes behind
+the head that no view contradicts would become floaters in other views."""
 SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
 FEW_CAMERAS = 4
-"""Up to which the visual hull of a torso bulges by centimeters, so that the points of `TorsoPoints` are better."""
+"""Up to which the visual hull of a torso bulges by centimeters, so that the points of `TorsoPoints`
+are better."""
 CONTINUED_SHARE, CONTINUED_OPACITY = 0.4, 3.0
-"""How far a torso is continued beyond the image of a single camera, as a share of the image's width; and the logit of
-these splats' opacity, which may never be trained."""
+"""How far a torso is continued beyond the image of a single camera, as a share of the image's
+width; and the logit of these splats' opacity, which may never be trained."""
 SEEN_COPIES, SEEN_SPREAD = 3, 0.5
-"""Splats for each of these points, and the standard deviation of their distance from it, in voxels."""
+"""Splats for each of these points, and the standard deviation of their distance from it, in
+voxels."""
 
 
 def hull_points(
@@ -48,10 +52,11 @@ def hull_points(
 ) -> Splats:
     """Unbound splats on the surface of the visual hull of one timestep, outside the mesh.
 
-    views: all of one timestep. The hull is carved on a grid of VOXEL_SIZE_M (coarser on a larger mesh) from the masks
-    or, without masks, from pixels that differ from white. Each splat is embedded in the nearest triangle and follows
-    it; torso: below the base of FLAME's neck, in the nearest one of the torso, and of few cameras where `stga track`
-    has seen it instead of on the hull.
+    views: all of one timestep. The hull is carved on a grid of VOXEL_SIZE_M (coarser on a larger
+    mesh) from the masks or, without masks, from pixels that differ from white. Each splat is
+    embedded in the nearest triangle and follows it; torso: below the base of FLAME's neck, in the
+    nearest one of the torso, and of few cameras where `stga track` has seen it instead of on the
+    hull.
     """
     mesh = capture.mesh(views[0].timestep)
     voxel = voxel_size(mesh)
@@ -89,13 +94,17 @@ def _joined(*parts: Splats) -> Splats:
     return joined(parts)
 
 
-def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, torso: bool = False) -> Splats:
-    """Unbound splats for what a single camera shows beside the mesh: one layer at the depth of the mesh's outline.
+def flat_points(
+    capture: Capture, view: View, convention: str, sh_degree: int, torso: bool = False
+) -> Splats:
+    """Unbound splats for what a single camera shows beside the mesh: one layer at the depth of the
+    mesh's outline.
 
-    A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of its pixel, as deep
-    as the part of the mesh that is nearest in the image, follows the same triangle as a hull point there, and has its
-    size and distance. torso: what the image cuts off below the neck is continued beyond it, as its border looks, for
-    other timesteps that show more; where none does, it stays so.
+    A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of
+    its pixel, as deep as the part of the mesh that is nearest in the image, follows the same
+    triangle as a hull point there, and has its size and distance. torso: what the image cuts off
+    below the neck is continued beyond it, as its border looks, for other timesteps that show more;
+    where none does, it stays so.
     """
     mesh, camera = capture.mesh(view.timestep), view.camera
     voxel = voxel_size(mesh)
@@ -109,7 +118,10 @@ def flat_points(capture: Capture, view: View, convention: str, sh_degree: int, t
         np.arange(step / 2 - beyond, camera.width + beyond, step),
         indexing="ij",
     )
-    pixel = np.clip(rows.astype(int), 0, camera.height - 1), np.clip(columns.astype(int), 0, camera.width - 1)
+    pixel = (
+        np.clip(rows.astype(int), 0, camera.height - 1),
+        np.clip(columns.astype(int), 0, camera.width - 1),
+    )
     beside = (_foreground(view) & ~_silhouette(mesh, capture.faces, camera))[pixel]
     centers = np.stack([columns[beside], rows[beside]], axis=1)
     if not len(centers):
@@ -134,15 +146,21 @@ def voxel_size(mesh: np.ndarray) -> float:
     return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
 
 
-def _nearest_triangle(points: np.ndarray, mesh: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) to the mesh and nearest triangle (N,), approximated by samples of every triangle."""
+def _nearest_triangle(
+    points: np.ndarray, mesh: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (N,) to the mesh and nearest triangle (N,), approximated by samples of every
+    triangle."""
     samples = _mesh_samples(mesh, faces)
     distance, nearest = cKDTree(samples).query(points)
     return distance, nearest // (len(samples) // len(faces))
 
 
-def _carried(capture: Capture, timestep: int, points: np.ndarray, nearest: np.ndarray) -> np.ndarray:
-    """Triangle (N,) of each point: for those below the base of the neck, the nearest of the torso instead of all."""
+def _carried(
+    capture: Capture, timestep: int, points: np.ndarray, nearest: np.ndarray
+) -> np.ndarray:
+    """Triangle (N,) of each point: for those below the base of the neck, the nearest of the torso
+    instead of all."""
     if capture.flame is None:
         return nearest
     torso = np.flatnonzero(torso_faces(capture.flame.model))
@@ -157,17 +175,23 @@ def _carried(capture: Capture, timestep: int, points: np.ndarray, nearest: np.nd
 
 def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Points (F · S, 3) of a lattice on every triangle, triangle by triangle."""
-    return np.asarray(np.einsum("pc,fci->fpi", lattice_weights(4, inset=0.02), mesh[faces]).reshape(-1, 3))
+    return np.asarray(
+        np.einsum("pc,fci->fpi", lattice_weights(4, inset=0.02), mesh[faces]).reshape(-1, 3)
+    )
 
 
-def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float) -> np.ndarray:
+def _hull_surface(
+    mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float
+) -> np.ndarray:
     """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh."""
     low, high = mesh.min(0), mesh.max(0)
     margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
     foreground = [_foreground(view) for view in views]
     within = _carved_by_blocks(axes, voxel, [view.camera for view in views], foreground)
-    points = np.stack([axis[rows] for axis, rows in zip(axes, np.nonzero(within), strict=True)], axis=1)
+    points = np.stack(
+        [axis[rows] for axis, rows in zip(axes, np.nonzero(within), strict=True)], axis=1
+    )
     inside = np.ones(len(points), bool)
     visible, exposed = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for view, mask in zip(views, foreground, strict=True):
@@ -185,10 +209,13 @@ def _hull_surface(mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], vo
 
 
 def _carved_by_blocks(
-    axes: Sequence[np.ndarray], voxel: float, cameras: Sequence[Camera], foreground: Sequence[np.ndarray]
+    axes: Sequence[np.ndarray],
+    voxel: float,
+    cameras: Sequence[Camera],
+    foreground: Sequence[np.ndarray],
 ) -> np.ndarray:
-    """(X, Y, Z) bool: the grid without the blocks whose bounding sphere lies in the background of an image, or outside
-    of too many images."""
+    """(X, Y, Z) bool: the grid without the blocks whose bounding sphere lies in the background of
+    an image, or outside of too many images."""
     centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
     points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
     radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
@@ -196,10 +223,13 @@ def _carved_by_blocks(
     for camera, mask in zip(cameras, foreground, strict=True):
         pixels, depth = camera.project(points)
         before = depth - radius > MIN_DEPTH_M
-        # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z − radius)).
+        # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z −
+        # radius)).
         focal = [camera.fl_x, camera.fl_y]
         slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
-        reach = np.ceil((slope * focal).max(1) * radius / np.maximum(depth - radius, MIN_DEPTH_M)) + 1
+        reach = (
+            np.ceil((slope * focal).max(1) * radius / np.maximum(depth - radius, MIN_DEPTH_M)) + 1
+        )
         beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
         outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
         # Beyond an image, what is background is not known.
@@ -238,7 +268,8 @@ def in_image(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel columns (N,) and rows (N,) of world points (N, 3), and (N,) bool whether they lie in the image."""
+    """Pixel columns (N,) and rows (N,) of world points (N, 3), and (N,) bool whether they lie in
+    the image."""
     pixels, depth = camera.project(points)
     x, y = np.floor(pixels).T
     seen = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

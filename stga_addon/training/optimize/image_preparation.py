@@ -1,5 +1,5 @@
-"""What is done to the captured images before they are trained on or compared with: the backdrop is taken away, and
-exposure and white balance of the training cameras are corrected."""
+"""What is done to the captured images before they are trained on or compared with: the backdrop is
+taken away, and exposure and white balance of the training cameras are corrected."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -15,12 +15,19 @@ Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
 
 
 def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparation | None:
-    """Takes away the settings' `backdrop`, then inverts their `exposure`; None where neither changes anything."""
-    correct, backdrop, background = exposure_correction(settings), settings.backdrop, settings.background
+    """Takes away the settings' `backdrop`, then inverts their `exposure`; None where neither
+    changes anything."""
+    correct, backdrop, background = (
+        exposure_correction(settings),
+        settings.backdrop,
+        settings.background,
+    )
     if correct is None and backdrop == "plain":
         return None
 
-    def prepare(view: View, image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    def prepare(
+        view: View, image: np.ndarray, mask: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         image, mask = without_backdrop(capture, view, image, mask, backdrop, background)
         return (image if correct is None else correct(view, image, mask)), mask
 
@@ -28,17 +35,23 @@ def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparati
 
 
 def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
-    """Exposure of the cameras in `TrainingSettings.exposure`, where it drifts interpolated between timesteps."""
+    """Exposure of the cameras in `TrainingSettings.exposure`, where it drifts interpolated between
+    timesteps."""
     listed: dict[int, list[Sequence[float]]] = {}
     for row in rows:
         listed.setdefault(int(row[0]), []).append(row[1:])
-    curves = {camera: np.array(sorted(((*row, 0.0)[6], *row[:6]) for row in own)).T for camera, own in listed.items()}
+    curves = {
+        camera: np.array(sorted(((*row, 0.0)[6], *row[:6]) for row in own)).T
+        for camera, own in listed.items()
+    }
 
     def exposure(view: View) -> np.ndarray | None:
         if view.camera_index not in curves:
             return None
         timesteps, *columns = curves[view.camera_index]
-        return np.array([np.interp(view.timestep, timesteps, column) for column in columns]).reshape(2, 3)
+        return np.array(
+            [np.interp(view.timestep, timesteps, column) for column in columns]
+        ).reshape(2, 3)
 
     return exposure
 
@@ -46,8 +59,8 @@ def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
 def exposure_correction(settings: TrainingSettings) -> Correction | None:
     """The correction that inverts the settings' `exposure`; None if there is none.
 
-    It applies to the foreground only, because the background is constant whatever the camera. Images of cameras that
-    the settings do not list stay unchanged.
+    It applies to the foreground only, because the background is constant whatever the camera.
+    Images of cameras that the settings do not list stay unchanged.
     """
     if not settings.exposure:
         return None

@@ -15,10 +15,12 @@ BAND_TILES = 4
 
 
 def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray:
-    """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one thread's work.
+    """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one
+    thread's work.
 
-    bands: how many, over the whole width: what lies beyond the left and right edge of narrower ones would cost more
-    than what lies above and below. By default, so many that the threads are done soonest.
+    bands: how many, over the whole width: what lies beyond the left and right edge of narrower ones
+    would cost more than what lies above and below. By default, so many that the threads are done
+    soonest.
     """
     tops = _edges(height, bands or _bands(height, threads()))
     return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
@@ -26,7 +28,8 @@ def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray
 
 @cache
 def _bands(height: int, count: int) -> int:
-    """How many bands cost the busiest of `count` threads the fewest rows, if there are more pieces than threads."""
+    """How many bands cost the busiest of `count` threads the fewest rows, if there are more pieces
+    than threads."""
 
     def rows_of_a_thread(bands: int) -> int:
         return -(-3 * bands // count) * (-(-height // bands) + 2 * LOSS_REACH_PX)
@@ -39,20 +42,28 @@ def _edges(side: int, count: int) -> list[int]:
 
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool, the largest first.
+    """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool,
+    the largest first.
 
-    Groups of more than BAND_TILES rows are cut into bands, which are narrower and more evenly distributed to threads.
+    Groups of more than BAND_TILES rows are cut into bands, which are narrower and more evenly
+    distributed to threads.
     """
     return np.minimum(box_groups(tiles, BAND_TILES) * TILE, [width, height, width, height])
 
 
 def image_gradient(
-    image: np.ndarray, target: np.ndarray, rectangles: np.ndarray, ssim_weight: float, out: np.ndarray
+    image: np.ndarray,
+    target: np.ndarray,
+    rectangles: np.ndarray,
+    ssim_weight: float,
+    out: np.ndarray,
 ) -> tuple[float, float]:
-    """Write the gradient of (1 − w)·L1 + w·(1 − SSIM) with respect to the image into `out`, within the rectangles.
+    """Write the gradient of (1 − w)·L1 + w·(1 − SSIM) with respect to the image into `out`, within
+    the rectangles.
 
-    image, out (3, H, W) float32; target (H, W, 3) uint8. The loss is the mean over the whole image whatever the
-    rectangles are. Returns L1 and SSIM, which are the image's only if the rectangles tile it.
+    image, out (3, H, W) float32; target (H, W, 3) uint8. The loss is the mean over the whole image
+    whatever the rectangles are. Returns L1 and SSIM, which are the image's only if the rectangles
+    tile it.
     """
     sums = np.zeros((2, 3, sum(y1 - y0 for _, y0, _, y1 in rectangles.tolist())))
     share = 1.0 / image.size

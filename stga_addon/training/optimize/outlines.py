@@ -1,5 +1,5 @@
-"""Outlines of masks, outside of which splats are pruned: a needle beside the hair, which a few images call for and many
-others push back, would survive the training."""
+"""Outlines of masks, outside of which splats are pruned: a needle beside the hair, which a few
+images call for and many others push back, would survive the training."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,8 @@ MAX_OUTSIDE_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Outline:
-    """What a training view's mask leaves clear, with a margin, (H, W) bool; camera: of that size."""
+    """What a training view's mask leaves clear, with a margin, (H, W) bool; camera: of that
+    size."""
 
     timestep: int
     camera: Camera
@@ -34,7 +35,8 @@ class Outline:
 
 
 def read_outlines(capture: Capture, seed: int) -> list[Outline]:
-    """Of MAX_OUTLINES training views drawn by `seed`, those with a mask. Raises StgaError as `read_mask` does."""
+    """Of MAX_OUTLINES training views drawn by `seed`, those with a mask. Raises StgaError as
+    `read_mask` does."""
     views, outlines = capture.views["train"], []
     for n in np.random.default_rng(seed).permutation(len(views))[:MAX_OUTLINES]:
         view, mask = views[n], read_mask(views[n])
@@ -43,7 +45,9 @@ def read_outlines(capture: Capture, seed: int) -> list[Outline]:
         camera = view.camera.scaled(min(1.0, MAX_OUTLINE_HEIGHT_PX / view.camera.height))
         margin = max(1, round(TOLERANCE_SHARE * camera.height))
         covered = area_mean(mask, camera.height, camera.width) > 127
-        outlines.append(Outline(view.timestep, camera, ~binary_dilation(covered, iterations=margin)))
+        outlines.append(
+            Outline(view.timestep, camera, ~binary_dilation(covered, iterations=margin))
+        )
     return outlines
 
 
@@ -55,8 +59,8 @@ def prune_outside(
 ) -> TrainState:
     """Prune the splats whose center lies outside of most of the outlines in whose image it lies.
 
-    frames: timestep -> the frames of the triangles; region (F,) bool: the triangles whose splats may change, None for
-    all. Every triangle with bound splats keeps one.
+    frames: timestep -> the frames of the triangles; region (F,) bool: the triangles whose splats
+    may change, None for all. Every triangle with bound splats keeps one.
     """
     seen, outside = np.zeros((2, len(state)), np.int32)
     for outline in outlines:

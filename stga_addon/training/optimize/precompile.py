@@ -12,7 +12,12 @@ from ...capture.camera import Camera
 from ...raster.cpu import USES_BUNDLED_KERNELS
 from ...raster.cpu.image_loss import change_background
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import add_screen_gradients, distance_limit, opacity_weight, scale_limit
+from ...raster.cpu.optimizer import (
+    add_screen_gradients,
+    distance_limit,
+    opacity_weight,
+    scale_limit,
+)
 from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
 from ...raster.cpu.threads import start_threads
@@ -28,11 +33,14 @@ CAMERA = Camera(16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
 
 
 def precompile_kernels(device: str = "cpu") -> None:
-    """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate, and the GPU's.
+    """Compile what training on a device of `choose_device` runs: the CPU's kernels, which evaluate,
+    and the GPU's.
 
-    Each of the former runs once on two splats, with the argument types of real training. If the cache is empty, a
-    second process compiles rendering at the same time (`raster.cpu.precompile`). While a process compiles
-    ahead (`jobs.preparation`), this one waits for it, unless it has kernels that are bundled (`raster.cpu.bundled`).
+    Each of the former runs once on two splats, with the argument types of real training. If the
+    cache is empty, a second process compiles rendering at the same time (`raster.cpu.precompile`).
+    While a process compiles
+    ahead (`jobs.preparation`), this one waits for it, unless it has kernels that are bundled
+    (`raster.cpu.bundled`).
     """
     if not USES_BUNDLED_KERNELS:
         _await_preparation()
@@ -86,13 +94,16 @@ def _render() -> None:
     seen, face = frames_in_camera(WORLD, CAMERA), state.face
     rendering = render_forward(state.parameters, face, seen, 3, focus=np.ones(2, bool))
     gradients = state.gradients
-    render_backward(rendering, state.parameters, face, seen, np.zeros_like(rendering.image), gradients)
+    render_backward(
+        rendering, state.parameters, face, seen, np.zeros_like(rendering.image), gradients
+    )
 
 
 def _optimize() -> None:
     """Loss and Adam."""
     image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
-    target.setflags(write=False)  # like the loader's arrays: read-only arrays are a type of their own
+    # like the loader's arrays: read-only arrays are a type of their own
+    target.setflags(write=False)
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
     rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
     state, rows = _pair(), np.arange(2, dtype=np.int32)
@@ -111,7 +122,9 @@ def _limit() -> None:
     target, mask = np.zeros((16, 16, 3), np.uint8), np.zeros((16, 16), np.uint8)
     target.setflags(write=False)
     mask.setflags(write=False)
-    change_background(target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), np.empty_like(target))
+    change_background(
+        target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), np.empty_like(target)
+    )
     rows = np.arange(2, dtype=np.int32)
     face, unbound = state.face, state.unbound
     # Smaller than the splats: without an excess, its gradient is not computed.

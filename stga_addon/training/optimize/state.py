@@ -1,4 +1,5 @@
-"""State of the splats in training: parameters, optimizer moments and statistics for density control."""
+"""State of the splats in training: parameters, optimizer moments and statistics for density
+control."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -16,10 +17,11 @@ from ...raster.cpu.optimizer import AdamTables
 
 @dataclass
 class OffsetState:
-    """Coefficients of a driven offset (`Avatar.driven_offsets`) of a mesh's F triangles in training.
+    """Coefficients of a driven offset (`Avatar.driven_offsets`) of a mesh's F triangles in
+    training.
 
-    value, first, second, average  (F, S, 3) float32 coefficients, Adam's two moments, and the exponential moving
-                                   average from which the avatar is made
+    value, first, second, average  (F, S, 3) float32 coefficients, Adam's two moments, and the
+                                   exponential moving average from which the avatar is made
     steps                          (F,) int32 Adam steps of each triangle
     """
 
@@ -41,13 +43,16 @@ def new_offset(coefficients: np.ndarray) -> OffsetState:
 class TrainState:
     """N splats in training: arrays with N rows each.
 
-    parameters, gradients, first, second  values, latest gradients and Adam's two moments, shaped as in `Splats`
-    average  exponential moving average of the parameters over their steps, from which the avatar is made
+    parameters, gradients, first, second  values, latest gradients and Adam's two moments, shaped as
+                                          in `Splats`
+    average  exponential moving average of the parameters over their steps, from which the avatar is
+             made
     steps    (N,) int32 Adam steps per row
     face, unbound    (N,) int32 and (N,) bool, as in `Splats`
-    unseen_share     (N,) float32 share of the cameras that did not see an unbound splat where training put it or its
-                     parent; 0 for bound splats
-    screen_gradient  (N,) float32 sum of screen-space gradient lengths since the latest density control
+    unseen_share     (N,) float32 share of the cameras that did not see an unbound splat where
+                     training put it or its parent; 0 for bound splats
+    screen_gradient  (N,) float32 sum of screen-space gradient lengths since the latest density
+                     control
     gradient_count   (N,) float32 number of summands
     driven_offsets   by name, of the mesh's triangles, not of the splats
     """
@@ -70,7 +75,8 @@ class TrainState:
 
     @cached_property
     def tables(self) -> dict[str, AdamTables]:
-        """Parameter -> its values, gradient, moments and average as views (N, D), and room for learning rates (D,)."""
+        """Parameter -> its values, gradient, moments and average as views (N, D), and room for
+        learning rates (D,)."""
         kept = self.parameters, self.gradients, self.first, self.second, self.average
         found = {}
         for name, arrays in zip(self.parameters._fields, zip(*kept, strict=True), strict=True):
@@ -113,7 +119,9 @@ def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainSt
         steps=np.zeros(n, np.int32),
         face=splats.face.astype(np.int32),
         unbound=splats.unbound.astype(bool),
-        unseen_share=np.zeros(n, np.float32) if unseen_share is None else unseen_share.astype(np.float32),
+        unseen_share=np.zeros(n, np.float32)
+        if unseen_share is None
+        else unseen_share.astype(np.float32),
         screen_gradient=np.zeros(n, np.float32),
         gradient_count=np.zeros(n, np.float32),
     )
@@ -125,9 +133,12 @@ def keep_rows(state: TrainState, keep: np.ndarray) -> TrainState:
 
 
 def with_added(state: TrainState, names: Collection[str]) -> TrainState:
-    """The state with these arrays of ADDED; they and their moments are zero where there were none."""
+    """The state with these arrays of ADDED; they and their moments are zero where there were
+    none."""
     zeros = {name: np.zeros((len(state), ADDED[name], 3), np.float32) for name in names}
-    zeros = {name: array for name, array in zeros.items() if not getattr(state.parameters, name).shape[1]}
+    zeros = {
+        name: array for name, array in zeros.items() if not getattr(state.parameters, name).shape[1]
+    }
 
     def added(arrays: Parameters) -> Parameters:
         return arrays._replace(**{name: array.copy() for name, array in zeros.items()})
@@ -143,8 +154,12 @@ def with_added(state: TrainState, names: Collection[str]) -> TrainState:
 
 
 def with_offsets(state: TrainState, names: Collection[str], triangles: int) -> TrainState:
-    """The state with these driven offsets of so many triangles too; those that it lacked begin by zero."""
-    zeros = {name: new_offset(np.zeros((triangles, OFFSETS[name].signals, 3), np.float32)) for name in names}
+    """The state with these driven offsets of so many triangles too; those that it lacked begin by
+    zero."""
+    zeros = {
+        name: new_offset(np.zeros((triangles, OFFSETS[name].signals, 3), np.float32))
+        for name in names
+    }
     return replace(state, driven_offsets={**zeros, **state.driven_offsets})
 
 
@@ -154,7 +169,8 @@ def join(state: TrainState, other: TrainState) -> TrainState:
 
 
 def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
-    """Every array of the splats under a flat name such as "first/xyz"; the inverse of `state_of`."""
+    """Every array of the splats under a flat name such as "first/xyz"; the inverse of
+    `state_of`."""
     flat = {}
     for f in _splat_fields():
         value = getattr(state, f.name)
@@ -172,7 +188,9 @@ def state_of(arrays: Mapping[str, np.ndarray]) -> TrainState:
         if f.name in arrays:
             values[f.name] = arrays[f.name]
         else:
-            values[f.name] = Parameters(*(arrays[f"{f.name}/{name}"] for name in Parameters._fields))
+            values[f.name] = Parameters(
+                *(arrays[f"{f.name}/{name}"] for name in Parameters._fields)
+            )
     return TrainState(**values)
 
 

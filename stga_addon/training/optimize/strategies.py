@@ -15,9 +15,11 @@ from .state import TrainState
 from .unseen_sides import UnseenSides
 
 EXTEND_LOCAL_SHARE = 0.5
-"""Share of an extension's budget that trains what the new takes need, before all splats are trained."""
+"""Share of an extension's budget that trains what the new takes need, before all splats are
+trained."""
 MAX_REGION_SPLIT_SHARE = 0.1
-"""Largest share of a region's splats that one round of density control splits: a refinement has few rounds."""
+"""Largest share of a region's splats that one round of density control splits: a refinement has few
+rounds."""
 
 OUTLINE_INTERVAL, SIDE_INTERVAL = 200, 100
 """Iterations between turns of `OutlineControl` and `SideReset`."""
@@ -32,10 +34,13 @@ class Strategy(Protocol):
     @property
     def region(self) -> np.ndarray | None: ...
 
-    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
+    def triangles(
+        self, iteration: int, visit: int, timestep: int, progress: float
+    ) -> np.ndarray | None:
         """(F,) bool triangles whose splats are trained; None trains all splats.
 
-        iteration, visit  count iterations and visits of frames (consecutive views of one timestep) from 0
+        iteration, visit  count iterations and visits of frames (consecutive views of one timestep)
+                          from 0
         progress          share of the budget spent
         """
 
@@ -51,7 +56,8 @@ class GlobalStrategy:
 
 @dataclass
 class SelectiveStrategy:
-    """Alternates local iterations, which train a frame's selected triangles, with global ones (STGA, training).
+    """Alternates local iterations, which train a frame's selected triangles, with global ones
+    (STGA, training).
 
     selection  timestep -> (F,) bool triangles; a frame that selects none is trained globally
     """
@@ -60,7 +66,9 @@ class SelectiveStrategy:
     selection: Mapping[int, np.ndarray]
     region = None
 
-    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
+    def triangles(
+        self, iteration: int, visit: int, timestep: int, progress: float
+    ) -> np.ndarray | None:
         settings, selected = self.settings, self.selection.get(timestep)
         count = iteration if settings.global_unit == "iteration" else visit
         is_global = count % (settings.global_interval + 1) == settings.global_interval
@@ -83,26 +91,34 @@ class RefineStrategy:
 class ExtendStrategy:
     """Trains what new takes need, in views of all takes, and then all splats.
 
-    Not in turn: where some splats are frozen in the new views only, the others make up for them there, and drift.
+    Not in turn: where some splats are frozen in the new views only, the others make up for them
+    there, and drift.
 
     region  (F,) bool: what moves in the new takes, or looks different there
     """
 
     region: np.ndarray
 
-    def triangles(self, iteration: int, visit: int, timestep: int, progress: float) -> np.ndarray | None:
+    def triangles(
+        self, iteration: int, visit: int, timestep: int, progress: float
+    ) -> np.ndarray | None:
         return self.region if progress < EXTEND_LOCAL_SHARE and self.region.any() else None
 
 
 def make_strategy(settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> Strategy:
-    """The strategy that the settings name; "gaussian-avatars" differs from "global" in its settings only.
+    """The strategy that the settings name; "gaussian-avatars" differs from "global" in its settings
+    only.
 
     selection: timestep -> (F,) bool; "refine" and "extend" train the union.
     """
     if settings.strategy in CONTINUATIONS:
         union = np.any(list(selection.values()), axis=0)
         return RefineStrategy(union) if settings.strategy == "refine" else ExtendStrategy(union)
-    return SelectiveStrategy(settings, selection) if settings.strategy == "selective" else GlobalStrategy()
+    return (
+        SelectiveStrategy(settings, selection)
+        if settings.strategy == "selective"
+        else GlobalStrategy()
+    )
 
 
 class PostStep(Protocol):
@@ -117,7 +133,8 @@ class PostStep(Protocol):
 
 @dataclass(frozen=True)
 class StrayReset:
-    """Moves splats back that left their triangle's neighborhood; `unit` (F,) is what the limit is a multiple of.
+    """Moves splats back that left their triangle's neighborhood; `unit` (F,) is what the limit is a
+    multiple of.
 
     region  (F,) bool: only splats on these triangles are moved; None for all
     """
@@ -156,7 +173,11 @@ class DensityControl:
         budget = round(self.initial_count * (1 + self.settings.growth)) - len(state)
         share = MAX_SPLIT_SHARE if self.region is None else MAX_REGION_SPLIT_SHARE
         return control_density(
-            state, budget, np.random.default_rng([self.settings.seed, iteration]), share, self.region
+            state,
+            budget,
+            np.random.default_rng([self.settings.seed, iteration]),
+            share,
+            self.region,
         )
 
 

@@ -17,7 +17,14 @@ from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .outlines import Outline, read_outlines
 from .state import TrainState, new_state, with_offsets
-from .strategies import DensityControl, OutlineControl, PostStep, SideReset, StrayReset, make_strategy
+from .strategies import (
+    DensityControl,
+    OutlineControl,
+    PostStep,
+    SideReset,
+    StrayReset,
+    make_strategy,
+)
 from .unseen_sides import UnseenSides, unseen_sides
 
 
@@ -25,7 +32,8 @@ class Trainer:
     """Trains a capture's splats step by step, on one backend, by one strategy.
 
     iteration      steps made so far
-    visit          visits of frames so far, minus one: consecutive views of one timestep are one visit
+    visit          visits of frames so far, minus one: consecutive views of one timestep are one
+                   visit
     initial_count  splats at the start of the run, which density control counts from
     """
 
@@ -38,14 +46,17 @@ class Trainer:
         device: str = "cpu",
         strain_range: np.ndarray | None = None,
     ) -> None:
-        """selection: timestep -> (F,) bool triangles, for the selective strategy; device: one of `choose_device`.
+        """selection: timestep -> (F,) bool triangles, for the selective strategy; device: one of
+        `choose_device`.
 
         strain_range (F, 2, 3): within which colors and positions follow strain; None: COLOR_RANGE.
         """
         self.capture, self.settings = capture, settings
         self.strategy = make_strategy(settings, selection)
         self.tracking = RefinedTracking(capture, settings.convention) if settings.tracking else None
-        self.frames = FrameStore(capture, settings.convention, settings.follows_strain, self.tracking, strain_range)
+        self.frames = FrameStore(
+            capture, settings.convention, settings.follows_strain, self.tracking, strain_range
+        )
         self.iteration, self.visit = 0, -1
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)
@@ -62,7 +73,8 @@ class Trainer:
 
     @property
     def state(self) -> TrainState:
-        """The splats and their optimizer. A GPU backend copies them, so do not read it in every iteration."""
+        """The splats and their optimizer. A GPU backend copies them, so do not read it in every
+        iteration."""
         return self._backend.state
 
     @state.setter
@@ -76,7 +88,8 @@ class Trainer:
         last_timestep: int | None,
         initial_count: int,
     ) -> None:
-        """Restore, beside the state given at construction, everything that the next step depends on."""
+        """Restore, beside the state given at construction, everything that the next step depends
+        on."""
         self.iteration, self.visit = iteration, visit
         self.last_timestep, self.initial_count = last_timestep, initial_count
 
@@ -95,8 +108,8 @@ class Trainer:
         mask      (H, W) uint8 coverage, with which the background may be randomized
         mesh      (V, 3) the capture's mesh of the view's timestep, if it has been read already
 
-        Returns the image loss of a global iteration; None for a local one, which renders only part of the image. A GPU
-        backend returns losses two iterations late.
+        Returns the image loss of a global iteration; None for a local one, which renders only part
+        of the image. A GPU backend returns losses two iterations late.
         """
         settings = self.settings
         self.visit += view.timestep != self.last_timestep
@@ -107,7 +120,9 @@ class Trainer:
         if not settings.random_background:
             mask = None
         if mask is not None:
-            background = np.random.default_rng([settings.seed, self.iteration]).random(3, np.float32)
+            background = np.random.default_rng([settings.seed, self.iteration]).random(
+                3, np.float32
+            )
         selected = self.strategy.triangles(self.iteration, self.visit, view.timestep, progress)
         loss = self._backend.step(
             Batch(
@@ -126,7 +141,8 @@ class Trainer:
         return loss
 
     def render(self, view: View, progress: float = 1.0) -> np.ndarray:
-        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over the background."""
+        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over
+        the background."""
         return self._backend.render(view, self._background, sh_degree(self.settings, progress))
 
     @cached_property
@@ -145,7 +161,9 @@ class Trainer:
         steps: tuple[PostStep, ...] = (
             StrayReset(self.settings, self.frames.units, self.strategy.region),
             DensityControl(self.settings, self.initial_count, self.strategy.region),
-            OutlineControl(self.settings, self.frames, lambda: self._outlines, self.strategy.region),
+            OutlineControl(
+                self.settings, self.frames, lambda: self._outlines, self.strategy.region
+            ),
             SideReset(lambda: self._sides, self._has_one_camera and self.strategy.region is None),
         )
         due = [step for step in steps if step.is_due(self.iteration, progress)]
@@ -156,12 +174,17 @@ class Trainer:
             self.state = state
 
 
-def make_backend(device: str, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> Backend:
-    """The backend of a device of `choose_device`. Raises StgaError if the device does not support the settings."""
+def make_backend(
+    device: str, settings: TrainingSettings, frames: FrameStore, state: TrainState
+) -> Backend:
+    """The backend of a device of `choose_device`. Raises StgaError if the device does not support
+    the settings."""
     if device == "cpu":
         return CpuBackend(settings, frames, state)
     if settings.tracking:
-        raise StgaError(f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}")
+        raise StgaError(
+            f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}"
+        )
     from ...raster.gpu.device import Device  # needs wgpu, which training on the CPU does without
     from ...raster.gpu.frames import SIGNALS
     from .gpu_backend import GpuBackend

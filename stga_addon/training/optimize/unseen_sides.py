@@ -18,23 +18,27 @@ from .state import TrainState
 VIEWS = 48
 """Training views that are looked at, spread over all."""
 MIN_COSINE, SOURCE_COSINE = -0.1, 0.5
-"""Of the angle between a triangle and a camera: below the first, it faces away so far that not even its hair stands in
-the outline; below the second, others do not take its color, which a matte's edge may be in."""
+"""Of the angle between a triangle and a camera: below the first, it faces away so far that not even
+its hair stands in the outline; below the second, others do not take its color, which a matte's edge
+may be in."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 OUTSIDE_CAMERAS, OUTSIDE_DISTANCE = 18, 4.0
-"""Cameras around the neutral head that tell its outside from its inside; their distance, in its radius."""
+"""Cameras around the neutral head that tell its outside from its inside; their distance, in its
+radius."""
 
 
 @dataclass(frozen=True)
 class UnseenSides:
-    """Triangles (F,) bool of the head's outside that no view shows, and the color (F, 3) from 0 to 1 that they keep."""
+    """Triangles (F,) bool of the head's outside that no view shows, and the color (F, 3) from 0 to
+    1 that they keep."""
 
     triangles: np.ndarray
     color: np.ndarray
 
     def restore(self, state: TrainState) -> TrainState:
-        """Give bound splats on these triangles their color, the same from everywhere and in every expression."""
+        """Give bound splats on these triangles their color, the same from everywhere and in every
+        expression."""
         rows = self.triangles[state.face] & ~state.unbound
         flat = (self.color[state.face[rows]] - 0.5) / SH_C0
         for kept in (state.parameters, state.average, state.first, state.second):
@@ -44,7 +48,8 @@ class UnseenSides:
 
 
 def unseen_sides(capture: Capture) -> UnseenSides:
-    """Colors of mirror images, as far as these are shown, else of the nearest connected triangles that are."""
+    """Colors of mirror images, as far as these are shown, else of the nearest connected triangles
+    that are."""
     views = evenly_spread(capture.views["train"], VIEWS)
     cosine, outside = _largest_cosine(capture, views), _outside(capture)
     color, shown = mean_colors(capture, views)
@@ -65,7 +70,8 @@ def unseen_sides(capture: Capture) -> UnseenSides:
 
 
 def _largest_cosine(capture: Capture, views: list[View]) -> np.ndarray:
-    """(F,) of the angle between each triangle and the camera that it faces most, whether it is in sight or not."""
+    """(F,) of the angle between each triangle and the camera that it faces most, whether it is in
+    sight or not."""
     found = np.full(len(capture.faces), -1.0)
     for view in views:
         a, b, c = np.asarray(capture.mesh(view.timestep))[capture.faces].swapaxes(0, 1)

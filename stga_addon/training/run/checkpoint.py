@@ -22,7 +22,9 @@ VERSION = 3
 TRACKING, IDENTITY = "tracking/parameters", "identity"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
-OTHER_RUN = "belongs to another run than run.json beside it; remove it, or train into another folder"
+OTHER_RUN = (
+    "belongs to another run than run.json beside it; remove it, or train into another folder"
+)
 
 
 @dataclass
@@ -58,7 +60,8 @@ def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity:
 
 
 def read_selection(folder: Path, faces: int, identity: str | None = None) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh, or has not this `identity`."""
+    """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh, or has not this
+    `identity`."""
     path = folder / SELECTION
     arrays = read_npz(path)
     stored = arrays.pop(IDENTITY, None)
@@ -66,15 +69,26 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
         raise StgaError(f"{path}: {OTHER_RUN}")
     selection = {}
     for name, mask in arrays.items():
-        if not re.fullmatch(r"\d{1,18}", name, re.ASCII) or mask.dtype != bool or mask.shape != (faces,):
-            raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep")
+        if (
+            not re.fullmatch(r"\d{1,18}", name, re.ASCII)
+            or mask.dtype != bool
+            or mask.shape != (faces,)
+        ):
+            raise StgaError(
+                f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep"
+            )
         selection[int(name)] = mask
     return selection
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they are read."""
-    arrays = {k: array for k, array in arrays_of(checkpoint.state).items() if not k.startswith("gradients/")}
+    """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they
+    are read."""
+    arrays = {
+        k: array
+        for k, array in arrays_of(checkpoint.state).items()
+        if not k.startswith("gradients/")
+    }
     for effect, offset in checkpoint.state.driven_offsets.items():
         arrays.update({f"{effect}/{name}": array for name, array in vars(offset).items()})
     if checkpoint.tracking is not None:
@@ -97,8 +111,12 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             timesteps, parameters = tracking.shape
             check_array(path, TRACKING, tracking, "float64", (timesteps, parameters))
         elif _taken(arrays, "tracking/"):
-            raise StgaError(f"{path}: refines the tracking as version 0.2.0 did; train into another folder")
-        offsets = {name: offset for name in OFFSETS if (offset := _offset(path, arrays, name)) is not None}
+            raise StgaError(
+                f"{path}: refines the tracking as version 0.2.0 did; train into another folder"
+            )
+        offsets = {
+            name: offset for name in OFFSETS if (offset := _offset(path, arrays, name)) is not None
+        }
         if any(array.ndim == 0 for array in arrays.values()):
             raise StgaError(f"{path}: an array has no rows")
         for name in [n for n in arrays if n.startswith("first/")]:
@@ -116,7 +134,8 @@ def _packed(text: str) -> np.ndarray:
 
 
 def _meta(packed: np.ndarray) -> dict[str, Any]:
-    """Everything of a checkpoint that is no array. Raises ValueError for what training cannot continue with."""
+    """Everything of a checkpoint that is no array. Raises ValueError for what training cannot
+    continue with."""
     meta = json.loads(packed.tobytes())
     if not isinstance(meta, dict):
         raise ValueError("meta is no object")
@@ -124,15 +143,23 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
     lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0, "rounds": 0}
     for name, low in lowest.items():
         if type(meta.get(name)) is not int or not low <= meta[name] < MAX_COUNT:
-            raise ValueError(f"{name} is {shorten(meta.get(name))}, expected a whole number from {low} up")
+            raise ValueError(
+                f"{name} is {shorten(meta.get(name))}, expected a whole number from {low} up"
+            )
     last, losses = meta.get("last_timestep"), meta.get("losses")
     if last is not None and (type(last) is not int or not 0 <= last < MAX_COUNT):
         raise ValueError(f"last_timestep is {shorten(last)}, expected a timestep")
     if not _is_number(meta.get("elapsed_s")) or not 0 <= meta["elapsed_s"] < math.inf:
-        raise ValueError(f"elapsed_s is {shorten(meta.get('elapsed_s'))}, expected seconds from 0 up")
+        raise ValueError(
+            f"elapsed_s is {shorten(meta.get('elapsed_s'))}, expected seconds from 0 up"
+        )
     if not _is_number(meta.get("best_difference")) or math.isnan(meta["best_difference"]):
-        raise ValueError(f"best_difference is {shorten(meta.get('best_difference'))}, expected a number")
-    if not isinstance(losses, list) or not all(_is_number(loss) and not math.isnan(loss) for loss in losses):
+        raise ValueError(
+            f"best_difference is {shorten(meta.get('best_difference'))}, expected a number"
+        )
+    if not isinstance(losses, list) or not all(
+        _is_number(loss) and not math.isnan(loss) for loss in losses
+    ):
         raise ValueError("losses is no list of numbers")
     if not isinstance(meta.get("identity"), str):
         raise ValueError("identity is no text")
@@ -144,21 +171,30 @@ def _is_number(value: Any) -> bool:
 
 
 def _check_state(path: Path, state: TrainState) -> None:
-    """Kernels trust shapes and types, so a checkpoint's are checked. Raises StgaError naming the array."""
+    """Kernels trust shapes and types, so a checkpoint's are checked. Raises StgaError naming the
+    array."""
     n, tails = len(state), {}
     for field, kind in ARRAYS.items():
         size = getattr(state.parameters, field).shape[1] if kind.sizes else 0
         if kind.sizes and size not in kind.sizes:
-            raise StgaError(f"{path}: parameters/{field} has {size} coefficients, expected one of {kind.sizes}")
+            raise StgaError(
+                f"{path}: parameters/{field} has {size} coefficients, expected one of {kind.sizes}"
+            )
         tails[field] = kind.shape_at(size)
     whole = {"steps": "int32", "face": "int32", "unbound": "bool"}
     for name, array in arrays_of(state).items():
-        check_array(path, name, array, whole.get(name, "float32"), (n, *tails.get(name.rpartition("/")[2], ())))
+        check_array(
+            path,
+            name,
+            array,
+            whole.get(name, "float32"),
+            (n, *tails.get(name.rpartition("/")[2], ())),
+        )
 
 
 def _offset(path: Path, arrays: dict[str, np.ndarray], name: str) -> OffsetState | None:
-    """A driven offset, taken out of a checkpoint's arrays; None where there is none. Raises StgaError naming an array
-    that is wrong."""
+    """A driven offset, taken out of a checkpoint's arrays; None where there is none. Raises
+    StgaError naming an array that is wrong."""
     taken = _taken(arrays, f"{name}/")
     if not taken:
         return None
@@ -166,10 +202,17 @@ def _offset(path: Path, arrays: dict[str, np.ndarray], name: str) -> OffsetState
     triangles = found.steps.shape[:1]
     for part, array in taken.items():
         tail = () if part == "steps" else (OFFSETS[name].signals, 3)
-        check_array(path, f"{name}/{part}", array, "float32" if tail else "int32", (*triangles, *tail))
+        check_array(
+            path, f"{name}/{part}", array, "float32" if tail else "int32", (*triangles, *tail)
+        )
     return found
 
 
 def _taken(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin with the prefix, under the rest of their names; removed from `arrays`."""
-    return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
+    """The arrays whose names begin with the prefix, under the rest of their names; removed from
+    `arrays`."""
+    return {
+        name.removeprefix(prefix): arrays.pop(name)
+        for name in list(arrays)
+        if name.startswith(prefix)
+    }

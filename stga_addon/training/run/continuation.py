@@ -1,5 +1,6 @@
-"""Continuing a finished run in another folder: refining a region of its avatar, or extending it by further takes;
-and the order of the views that this trains, those asked for and, now and then, a few of all others."""
+"""Continuing a finished run in another folder: refining a region of its avatar, or extending it by
+further takes; and the order of the views that this trains, those asked for and, now and then, a few
+of all others."""
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
@@ -44,11 +45,13 @@ START_SHARE = 0.5
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
 MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
-"""How much larger the residual of a triangle must be in new takes than in old ones to call for training."""
+"""How much larger the residual of a triangle must be in new takes than in old ones to call for
+training."""
 COMPARED_VIEWS = 36
 """Views of the old takes, and of the new ones, in which residuals are compared."""
 MIN_UNLIKE_RATIO, MIN_UNLIKE_RESIDUAL = 3.0, 0.05
-"""How much larger than the median of its take, and how large, the residual of a view is that shows something else."""
+"""How much larger than the median of its take, and how large, the residual of a view is that shows
+something else."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 
@@ -56,19 +59,28 @@ MIN_GROUP_VIEWS = 4
 def select_for_takes(
     continuation: Continuation, capture: Capture, settings: TrainingSettings, starts: Sequence[int]
 ) -> tuple[dict[int, np.ndarray], list[View]]:
-    """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old takes; and the
-    views among those compared that do not look like the head at all, as where images of two cameras were exchanged.
+    """timestep of the new takes -> (F,) bool: what moves in it, or looks different than in the old
+    takes; and the views among those compared that do not look like the head at all, as where images
+    of two cameras were exchanged.
 
     starts: first timesteps of the new takes, ascending.
-    A triangle looks different where the avatar's residual in a few views of the new takes is larger than in a few of
-    the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
+    A triangle looks different where the avatar's residual in a few views of the new takes is larger
+    than in a few of the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
     """
     views = capture.views["train"]
-    avatar, prepare = read_avatar(continuation.parent / AVATAR), image_preparation(capture, settings)
-    parts = [[view for view in views if continuation.includes(view.timestep) is new] for new in (False, True)]
+    avatar, prepare = (
+        read_avatar(continuation.parent / AVATAR),
+        image_preparation(capture, settings),
+    )
+    parts = [
+        [view for view in views if continuation.includes(view.timestep) is new]
+        for new in (False, True)
+    ]
     old_views, new_views = (replayed_views(capture, part, COMPARED_VIEWS) for part in parts)
     old = triangle_residuals(avatar, capture, old_views, prepare, RESIDUAL_SCALE)
-    by_view = [triangle_residuals(avatar, capture, [view], prepare, RESIDUAL_SCALE) for view in new_views]
+    by_view = [
+        triangle_residuals(avatar, capture, [view], prepare, RESIDUAL_SCALE) for view in new_views
+    ]
     new = reduce(add, by_view)
     known, now = np.nan_to_num(old.mean()), np.nan_to_num(new.mean())
     differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
@@ -78,7 +90,9 @@ def select_for_takes(
     return selection, _unlike_views(new_views, by_view, starts)
 
 
-def _unlike_views(views: Sequence[View], residuals: Sequence[Residuals], starts: Sequence[int]) -> list[View]:
+def _unlike_views(
+    views: Sequence[View], residuals: Sequence[Residuals], starts: Sequence[int]
+) -> list[View]:
     """The views whose residual stands out in their take."""
     errors = np.array([each.error.sum() / max(each.weight.sum(), 1.0) for each in residuals])
     takes = np.array([bisect_right(starts, view.timestep) for view in views])
@@ -87,26 +101,35 @@ def _unlike_views(views: Sequence[View], residuals: Sequence[Residuals], starts:
     return [view for view, stands_out in zip(views, unlike, strict=True) if stands_out]
 
 
-def starting_state(continuation: Continuation, settings: TrainingSettings, triangles: int) -> TrainState:
+def starting_state(
+    continuation: Continuation, settings: TrainingSettings, triangles: int
+) -> TrainState:
     """The parent's avatar as a state of training on a mesh of so many triangles.
 
-    Where the settings have colors or positions follow strain and the avatar's do not, they begin by zero.
-    The optimizer continues where the parent's checkpoint is of that very avatar; otherwise its moments are zero.
-    Raises StgaError where the avatar is not the one that the continuation was made for, or `require_color_range` does.
+    Where the settings have colors or positions follow strain and the avatar's do not, they begin by
+    zero. The optimizer continues where the parent's checkpoint is of that very avatar; otherwise
+    its moments are zero. Raises StgaError where the avatar is not the one that the continuation was
+    made for, or `require_color_range` does.
     """
     folder = continuation.parent
     if file_digest(folder / AVATAR) != continuation.avatar:
-        raise StgaError(f"{folder / AVATAR}: has changed since this continuation was started from it")
+        raise StgaError(
+            f"{folder / AVATAR}: has changed since this continuation was started from it"
+        )
     avatar = read_avatar(folder / AVATAR)
     require_color_range(folder / AVATAR, avatar)
     state = new_state(avatar.splats)
-    state.driven_offsets = {name: new_offset(values) for name, values in avatar.driven_offsets.items()}
+    state.driven_offsets = {
+        name: new_offset(values) for name, values in avatar.driven_offsets.items()
+    }
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
         if _is_of(kept, avatar):
             parameters = Parameters(*(array.copy() for array in kept.average))
             zero = np.zeros(len(kept), np.float32)
-            state = replace(kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.copy())
+            state = replace(
+                kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.copy()
+            )
             for offset in kept.driven_offsets.values():
                 offset.value = offset.average.copy()
     state = with_added(state, settings.added)
@@ -118,7 +141,8 @@ def _is_of(state: TrainState, avatar: Avatar) -> bool:
     offsets = {name: offset.average for name, offset in state.driven_offsets.items()}
     pairs = [(vars(avatar.splats), vars(state.averaged())), (avatar.driven_offsets, offsets)]
     return all(
-        ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
+        ours.keys() == theirs.keys()
+        and all(np.array_equal(ours[name], theirs[name]) for name in ours)
         for ours, theirs in pairs
     )
 
@@ -140,10 +164,11 @@ def continued_settings(
     iterations: int | None,
     seed: int,
 ) -> TrainingSettings:
-    """The settings of a run for its continuation by one of CONTINUATIONS. Raises StgaError for a value not allowed.
+    """The settings of a run for its continuation by one of CONTINUATIONS. Raises StgaError for a
+    value not allowed.
 
-    What effects add to splats begins with the first rate of the run in an extension: other expressions strain triangles
-    in directions that the old takes never showed.
+    What effects add to splats begins with the first rate of the run in an extension: other
+    expressions strain triangles in directions that the old takes never showed.
     """
     rates = late_rates(settings.rates, START_SHARE)
     if strategy == "extend":
@@ -171,8 +196,11 @@ def continued_settings(
     return continued
 
 
-def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | None) -> list[EvaluationView]:
-    """Evaluation views of a run that continues another, in groups: by take, or frames that are refined and others.
+def continued_evaluation_views(
+    run: Run, capture: Capture, region: np.ndarray | None
+) -> list[EvaluationView]:
+    """Evaluation views of a run that continues another, in groups: by take, or frames that are
+    refined and others.
 
     region (F,) bool: its visible pixels become the views' region "region"; None for an extension.
     """
@@ -183,7 +211,9 @@ def continued_evaluation_views(run: Run, capture: Capture, region: np.ndarray | 
     for name, members in groups.items():
         group = name if len(groups) > 1 else ""
         for view in evenly_spread(members, limit):
-            found = read_evaluation_view(capture, view, run.settings.background, run.settings.backdrop)
+            found = read_evaluation_view(
+                capture, view, run.settings.background, run.settings.backdrop
+            )
             found = replace(found, group=group)
             pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
             if pixels.sum() >= MIN_REGION_PIXELS:
@@ -202,17 +232,21 @@ def _group(run: Run, timestep: int) -> str:
 # Order of views
 
 REPLAY_SHARE = 1 / 3
-"""Share of a refinement's iterations that train views outside the continuation's frames, where there are any."""
+"""Share of a refinement's iterations that train views outside the continuation's frames, where
+there are any."""
 EXTEND_REPLAY_SHARE = 0.4
 """Share of an extension's iterations that train views of the old takes."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
 REPLAY_VIEWS = 120
-"""Views that are replayed at most; the cameras take turns from timestep to timestep. Fewer would be overfitted."""
+"""Views that are replayed at most; the cameras take turns from timestep to timestep. Fewer would be
+overfitted."""
 MAX_CANDIDATES = 200
-"""Timesteps among which the replayed ones are chosen, evenly spread: long takes are not read as a whole."""
+"""Timesteps among which the replayed ones are chosen, evenly spread: long takes are not read as a
+whole."""
 MIN_REGION_SHARE = 0.3
-"""A view refines a region if it sees at least this share of what the view that sees most of it sees."""
+"""A view refines a region if it sees at least this share of what the view that sees most of it
+sees."""
 
 
 def continued_order(
@@ -222,13 +256,16 @@ def continued_order(
     seed: int,
     start: int = 0,
 ) -> Iterator[View]:
-    """Endless order of views from position `start` on: of the continuation's frames and, now and then, of others.
+    """Endless order of views from position `start` on: of the continuation's frames and, now and
+    then, of others.
 
     region (F,) bool: what is refined, by views that see much of it. None for an extension.
     """
     views = capture.views["train"]
     asked = [view for view in views if continuation.includes(view.timestep)]
-    others = replayed_views(capture, [view for view in views if not continuation.includes(view.timestep)])
+    others = replayed_views(
+        capture, [view for view in views if not continuation.includes(view.timestep)]
+    )
     if region is not None:
         asked, others = (views_of_region(capture, members, region) for members in (asked, others))
     share = (EXTEND_REPLAY_SHARE if region is None else REPLAY_SHARE) if others else 0.0
@@ -241,8 +278,11 @@ def continued_order(
         position += 1
 
 
-def replayed_views(capture: Capture, views: Sequence[View], limit: int = REPLAY_VIEWS) -> list[View]:
-    """At most `limit` of the views: some cameras each of the timesteps whose expressions differ most."""
+def replayed_views(
+    capture: Capture, views: Sequence[View], limit: int = REPLAY_VIEWS
+) -> list[View]:
+    """At most `limit` of the views: some cameras each of the timesteps whose expressions differ
+    most."""
     by_timestep: dict[int, list[View]] = {}
     for view in views:
         by_timestep.setdefault(view.timestep, []).append(view)
@@ -255,12 +295,17 @@ def replayed_views(capture: Capture, views: Sequence[View], limit: int = REPLAY_
     return kept
 
 
-def distinct_timesteps(capture: Capture, timesteps: Sequence[int], count: int = REPLAY_TIMESTEPS) -> list[int]:
-    """At most `count` timesteps: the most neutral one, then always the one farthest from all chosen so far."""
+def distinct_timesteps(
+    capture: Capture, timesteps: Sequence[int], count: int = REPLAY_TIMESTEPS
+) -> list[int]:
+    """At most `count` timesteps: the most neutral one, then always the one farthest from all chosen
+    so far."""
     if len(timesteps) <= count:
         return list(timesteps)
     candidates = evenly_spread(timesteps, MAX_CANDIDATES)
-    meshes = np.stack([capture.expression_mesh(timestep, "head").astype(np.float32) for timestep in candidates])
+    meshes = np.stack(
+        [capture.expression_mesh(timestep, "head").astype(np.float32) for timestep in candidates]
+    )
     chosen = [int(np.argmin(_distance(meshes, capture.neutral)))]
     nearest = _distance(meshes, meshes[chosen[0]])
     while len(chosen) < min(count, len(candidates)):
@@ -275,9 +320,14 @@ def _distance(meshes: np.ndarray, mesh: np.ndarray) -> np.ndarray:
 
 
 def views_of_region(capture: Capture, views: Sequence[View], region: np.ndarray) -> list[View]:
-    """The views in which the region (F,) bool is seen large: turned to the camera, whatever may cover it."""
+    """The views in which the region (F,) bool is seen large: turned to the camera, whatever may
+    cover it."""
     seen = np.array([_facing_area(capture, view, region) for view in views])
-    return [view for view, area in zip(views, seen, strict=True) if area >= MIN_REGION_SHARE * seen.max() > 0]
+    return [
+        view
+        for view, area in zip(views, seen, strict=True)
+        if area >= MIN_REGION_SHARE * seen.max() > 0
+    ]
 
 
 def is_faced(capture: Capture, views: Sequence[View], region: np.ndarray) -> bool:
@@ -292,6 +342,7 @@ def _facing_area(capture: Capture, view: View, region: np.ndarray) -> float:
     triangles = capture.faces[region]
     a, b, c = (corners[triangles[:, n]] for n in range(3))
     doubled = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    # Counter-clockwise seen from outside, and so clockwise in pixels, whose y points down: a negative area.
+    # Counter-clockwise seen from outside, and so clockwise in pixels, whose y points down: a
+    # negative area.
     facing = (doubled < 0) & (depth[triangles] > 0).all(1)
     return float(-doubled[facing].sum() / 2)

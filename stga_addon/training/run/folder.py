@@ -1,14 +1,18 @@
-"""Folder of a training run: its run.json, lock and smaller files, and the capture that it was trained on.
+"""Folder of a training run: its run.json, lock and smaller files, and the capture that it was
+trained on.
 
 run.json        what is trained, with which settings
 selection.npz   timestep -> selected triangles
 checkpoint.npz  the whole state of training
-avatar.npz      the sharpest avatar so far, by the evaluation views; without them, or continuing a run, the latest
-strain_range.npz  strain that colors and positions follow; only where they do, and the tracking is not refined
+avatar.npz      the sharpest avatar so far, by the evaluation views; without them, or continuing a
+                run, the latest
+strain_range.npz  strain that colors and positions follow; only where they do, and the tracking is
+                  not refined
 tracking.npz    refined FLAME parameters, those that avatar.npz was trained with
 metrics.jsonl   one line per evaluation
 residuals.npz   of a finished run: error of the avatar on each triangle
-world.ply       what stands still behind the person, in world space; only where the effect `world` is on
+world.ply       what stands still behind the person, in world space; only where the effect `world`
+                is on
 """
 
 import re
@@ -42,7 +46,8 @@ WORLD_FILE, TRACKING, RESIDUALS = "world.ply", "tracking.npz", "residuals.npz"
 
 @dataclass(frozen=True)
 class Take:
-    """A capture that joined a run after its first one; `start` is added to its timesteps (`join_takes`)."""
+    """A capture that joined a run after its first one; `start` is added to its timesteps
+    (`join_takes`)."""
 
     capture: Path
     start: int
@@ -66,7 +71,9 @@ class Continuation:
     def check(self) -> None:
         """Raise StgaError where there is no timestep from first to last."""
         if self.first > self.last:
-            raise StgaError(f"continuation: its last timestep {self.last} is before its first, {self.first}")
+            raise StgaError(
+                f"continuation: its last timestep {self.last} is before its first, {self.first}"
+            )
 
     def includes(self, timestep: int) -> bool:
         return self.first <= timestep <= self.last
@@ -81,7 +88,8 @@ class Run:
     effect_plan      what was decided about effects
     device           one of `choose_device` that trains
     identity         None before training begins
-    takes            further captures of the same head, whose timesteps follow those of `capture` (`join_takes`)
+    takes            further captures of the same head, whose timesteps follow those of `capture`
+                     (`join_takes`)
     continuation     how the run continues another one; None: it began with new splats
     """
 
@@ -115,9 +123,13 @@ def read_run(folder: Path) -> Run:
     version = values.pop("version", None)
     if version not in (OLDEST_VERSION, VERSION):
         reads = f"{OLDEST_VERSION} and {VERSION}"
-        raise StgaError(f"{path}: has run format version {shorten(version)}, this add-on reads {reads}")
+        raise StgaError(
+            f"{path}: has run format version {shorten(version)}, this add-on reads {reads}"
+        )
     if version == OLDEST_VERSION and isinstance(values.get("settings"), dict):
-        values["settings"].update({name: getattr(TrainingSettings, name) for name in LATER_SETTINGS})
+        values["settings"].update(
+            {name: getattr(TrainingSettings, name) for name in LATER_SETTINGS}
+        )
     try:
         run: Run = from_json(Run, values)
     except StgaError as error:
@@ -149,7 +161,9 @@ def locked(folder: Path) -> Iterator[None]:
             folder.mkdir(parents=True, exist_ok=True)
             lock.enter_context(hold_lock(path))
         except BlockingIOError as error:
-            raise StgaError(f"{folder}: another run is working in this folder (process {lock_owner(path)})") from error
+            raise StgaError(
+                f"{folder}: another run is working in this folder (process {lock_owner(path)})"
+            ) from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         remove_leftovers(folder)
@@ -172,16 +186,22 @@ class OpenedRun:
 
 
 def open_run(
-    folder: Path, capture: Path | None = None, flame: Path | None = None, principal_point: str | None = None
+    folder: Path,
+    capture: Path | None = None,
+    flame: Path | None = None,
+    principal_point: str | None = None,
 ) -> OpenedRun:
     """Open the run in `folder`; the other arguments stand in for what it was trained with.
 
     A capture or a FLAME model may have moved, but not changed; tracked meshes may be refined.
-    Raises StgaError in one sentence where the folder holds no run or anything differs from what it was trained with.
+    Raises StgaError in one sentence where the folder holds no run or anything differs from what it
+    was trained with.
     """
     run = read_run(folder)
     if principal_point not in (None, run.principal_point):
-        raise StgaError(f"{folder}: was trained with principal point '{run.principal_point}', not '{principal_point}'")
+        raise StgaError(
+            f"{folder}: was trained with principal point '{run.principal_point}', not '{principal_point}'"
+        )
     flame = run.flame if flame is None else flame.resolve()
     first = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
     run = replace(run, capture=first.root, flame=flame)
@@ -194,7 +214,8 @@ def open_run(
 
 
 def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
-    """The capture of a run, with the FLAME parameters that the run refined. Errors as of `open_run`."""
+    """The capture of a run, with the FLAME parameters that the run refined. Errors as of
+    `open_run`."""
     if not folder.is_dir():
         raise StgaError(f"{folder}: is not a folder; expected that of a run")
     return with_refined_tracking(open_run(folder, capture, flame).capture, folder)
@@ -205,14 +226,17 @@ def _open_take(folder: Path, run: Run, take: Take) -> Capture:
     capture = open_capture(take.capture, run.flame, run.principal_point)
     changed = difference(take.identity, identity_of(capture, run.principal_point, run.settings))
     if changed is not None:
-        raise StgaError(f"{folder}: was extended with {take.capture} ({take.identity.summary}), but it now {changed}")
+        raise StgaError(
+            f"{folder}: was extended with {take.capture} ({take.identity.summary}), but it now {changed}"
+        )
     return capture
 
 
 def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
     """The identity of `run` on `capture`, as the folder's files carry it.
 
-    Raises StgaError where the folder holds a run that was begun with another one; the sentence names both sides.
+    Raises StgaError where the folder holds a run that was begun with another one; the sentence
+    names both sides.
     """
     given = identity_of(capture, run.principal_point, run.settings)
     if not has_run(folder):
@@ -234,11 +258,14 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
         where = "it now" if capture.root == stored.capture else f"{capture.root} ({given.summary})"
         wanted = f"{stored.capture} ({trained.summary}), but {where} {changed}"
         raise StgaError(f"{folder}: was trained on {wanted}; train into another folder")
-    raise StgaError(f"{folder}: was begun with other settings; restore them in run.json, or train into another folder")
+    raise StgaError(
+        f"{folder}: was begun with other settings; restore them in run.json, or train into another folder"
+    )
 
 
 def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
-    """The device to continue a run on, and why: its own, unless `requested` names another (`choose_device`).
+    """The device to continue a run on, and why: its own, unless `requested` names another
+    (`choose_device`).
 
     A run of a GPU that this machine lacks continues on the first one.
     Raises StgaError where that device does not work or cannot train this run.
@@ -253,7 +280,9 @@ def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
             f"this run was trained on {trained_on}: {error}; give --device cpu to continue on the CPU"
         ) from error
     if run.settings.tracking and device != "cpu":
-        raise StgaError(f"--device {requested}: this run refines the tracking, which works on the CPU only")
+        raise StgaError(
+            f"--device {requested}: this run refines the tracking, which works on the CPU only"
+        )
     return device, reason
 
 
@@ -268,7 +297,9 @@ def _has(device: str) -> bool:
 # Smaller files
 
 
-def write_tracking(folder: Path, sequence: FlameSequence, refined: np.ndarray, tracked: np.ndarray) -> None:
+def write_tracking(
+    folder: Path, sequence: FlameSequence, refined: np.ndarray, tracked: np.ndarray
+) -> None:
     """Write refined and tracked `FlameFrame.parameters` (T, P) of the timesteps of a sequence."""
     frame = frame_of(refined.T)
     arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
@@ -280,17 +311,20 @@ def write_tracking(folder: Path, sequence: FlameSequence, refined: np.ndarray, t
 
 
 def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
-    """The capture with the parameters that the run in `folder` refined; unchanged if it refined none.
+    """The capture with the parameters that the run in `folder` refined; unchanged if it refined
+    none.
 
-    A timestep is replaced only if the capture's tracked parameters are those that the run started from, so that
-    another capture stays unchanged. Raises StgaError if the run's file is damaged.
+    A timestep is replaced only if the capture's tracked parameters are those that the run started
+    from, so that another capture stays unchanged. Raises StgaError if the run's file is damaged.
     """
     path, sequence = folder / TRACKING, capture.flame
     if sequence is None or not path.exists():
         return capture
     motion, tracked = read_motion(path, sequence.model), read_npz(path).get("tracked", np.zeros(0))
     if len(tracked) != len(motion.timesteps):
-        raise StgaError(f"{path}: tracked has shape {tracked.shape}, expected {len(motion.timesteps)} timesteps first")
+        raise StgaError(
+            f"{path}: tracked has shape {tracked.shape}, expected {len(motion.timesteps)} timesteps first"
+        )
     before = dict(zip(motion.timesteps, tracked, strict=True))
 
     def frame(timestep: int) -> FlameFrame:
@@ -303,12 +337,14 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
 
 
 def write_residuals(folder: Path, mean: np.ndarray) -> None:
-    """Write mean (F,): mean absolute error (0…1) of what each triangle's splats show, NaN where that is unknown."""
+    """Write mean (F,): mean absolute error (0…1) of what each triangle's splats show, NaN where
+    that is unknown."""
     write_npz(folder / RESIDUALS, {"residual": mean.astype(np.float32)}, compressed=True)
 
 
 def read_residuals(folder: Path, faces: int) -> np.ndarray:
-    """(F,) float32 as written. Raises StgaError where there is no such file, or it is of another mesh."""
+    """(F,) float32 as written. Raises StgaError where there is no such file, or it is of another
+    mesh."""
     path = folder / RESIDUALS
     residual = read_npz(path).get("residual")
     if residual is None or residual.dtype != np.float32 or residual.shape != (faces,):

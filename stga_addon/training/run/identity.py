@@ -1,4 +1,5 @@
-"""Identity of a training run: digests of the capture, the FLAME model and the settings that it was trained with."""
+"""Identity of a training run: digests of the capture, the FLAME model and the settings that it was
+trained with."""
 
 import hashlib
 import json
@@ -15,8 +16,9 @@ from ...schema import to_json
 from ..settings import TrainingSettings
 
 QUANTUM = 1e-6 * 0.5**0.5
-"""Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines compute other last
-bits. It is irrational, so that neither decimals nor binary fractions lie at the edge between two multiples."""
+"""Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines
+compute other last bits. It is irrational, so that neither decimals nor binary fractions lie at the
+edge between two multiples."""
 LATER_SETTINGS = ("torso",)
 """Settings that runs of format version 4 do not have; they were trained as with the defaults."""
 
@@ -50,7 +52,8 @@ class RunIdentity:
 
 
 def identity_of(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
-    """Identity of a run. Reads the FLAME model file but no images and no tracked meshes. Raises StgaError."""
+    """Identity of a run. Reads the FLAME model file but no images and no tracked meshes. Raises
+    StgaError."""
     views = [(split, view) for split, members in sorted(capture.views.items()) for view in members]
     return RunIdentity(
         principal_point,
@@ -65,7 +68,8 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
 
 
 def version_4_identity(identity: RunIdentity, settings: TrainingSettings) -> RunIdentity:
-    """The identity as a run of format version 4 recorded it; the same where the settings are not those of one."""
+    """The identity as a run of format version 4 recorded it; the same where the settings are not
+    those of one."""
     if any(getattr(settings, name) != getattr(TrainingSettings, name) for name in LATER_SETTINGS):
         return identity
     known = {name: value for name, value in to_json(settings).items() if name not in LATER_SETTINGS}
@@ -73,14 +77,22 @@ def version_4_identity(identity: RunIdentity, settings: TrainingSettings) -> Run
 
 
 def difference(trained: RunIdentity, given: RunIdentity) -> str | None:
-    """The first part of `given` that differs from `trained`, as in "has other images"; None where they agree."""
+    """The first part of `given` that differs from `trained`, as in "has other images"; None where
+    they agree."""
     phrases = {
         "faces": "has a mesh with other triangles",
         "images": "has other images or image sizes",
         "cameras": "has other camera poses or intrinsics",
         "neutral": "has another neutral mesh",
     }
-    return next((phrase for name, phrase in phrases.items() if getattr(trained, name) != getattr(given, name)), None)
+    return next(
+        (
+            phrase
+            for name, phrase in phrases.items()
+            if getattr(trained, name) != getattr(given, name)
+        ),
+        None,
+    )
 
 
 def _settings_digest(settings: dict[str, Any]) -> str:
@@ -107,15 +119,26 @@ def _summary(views: list[View]) -> str:
 
 def _image(split: str, view: View) -> tuple[object, ...]:
     camera = view.camera
-    return split, view.timestep, view.camera_index, view.name, camera.width, camera.height, view.mask is not None
+    return (
+        split,
+        view.timestep,
+        view.camera_index,
+        view.name,
+        camera.width,
+        camera.height,
+        view.mask is not None,
+    )
 
 
 def _camera_table(cameras: list[Camera]) -> np.ndarray:
     """(N, 20) float64: pose and intrinsics."""
     poses = np.array([camera.world_to_camera for camera in cameras], np.float64).reshape(-1, 16)
-    intrinsics = np.array([(c.fl_x, c.fl_y, c.cx, c.cy) for c in cameras], np.float64).reshape(-1, 4)
+    intrinsics = np.array([(c.fl_x, c.fl_y, c.cx, c.cy) for c in cameras], np.float64).reshape(
+        -1, 4
+    )
     return np.hstack([poses, intrinsics])
 
 
 def _quantized(values: np.ndarray) -> bytes:
-    return np.asarray(np.round(np.asarray(values, np.float64) / QUANTUM) + 0.0).tobytes()  # adding zero turns −0 into 0
+    # adding zero turns −0 into 0
+    return np.asarray(np.round(np.asarray(values, np.float64) / QUANTUM) + 0.0).tobytes()

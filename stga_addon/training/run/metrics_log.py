@@ -57,7 +57,8 @@ def cut_metrics(folder: Path, iteration: int) -> None:
 
 
 def _fault(line: Any) -> str | None:
-    """What is wrong with a line; None for a good one. Numbers other than the required ones need not be finite."""
+    """What is wrong with a line; None for a good one. Numbers other than the required ones need not
+    be finite."""
     if not isinstance(line, dict):
         return "is no object"
     for name in REQUIRED:
@@ -75,7 +76,9 @@ def _fault(line: Any) -> str | None:
 
 def _forecast_fault(line: dict[str, Any]) -> str | None:
     forecast = line["forecast"]
-    if not isinstance(forecast, dict) or not all(_is_finite(forecast.get(name)) for name in FORECAST):
+    if not isinstance(forecast, dict) or not all(
+        _is_finite(forecast.get(name)) for name in FORECAST
+    ):
         return f"forecast is {shorten(forecast)}, expected numbers named {', '.join(FORECAST)}"
     return None if _is_finite(line.get("psnr")) else "forecast has no psnr beside it"
 

@@ -1,4 +1,5 @@
-"""Training of a run in its folder: begun or resumed, then steps, evaluations and checkpoints in turn."""
+"""Training of a run in its folder: begun or resumed, then steps, evaluations and checkpoints in
+turn."""
 
 import logging
 import math
@@ -26,7 +27,11 @@ from ...progress import Cancelled, Progress, Report, ignore
 from ...schema import to_json
 from ...selection import select_capture
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import EvaluationView, choose_evaluation_views, read_evaluation_view
+from ..evaluate.evaluation_views import (
+    EvaluationView,
+    choose_evaluation_views,
+    read_evaluation_view,
+)
 from ..evaluate.evaluator import Evaluation, Evaluator, Spent
 from ..evaluate.match_exposure import known_exposure
 from ..evaluate.metrics import peak_memory_mb
@@ -38,7 +43,14 @@ from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
 from ..schedule import image_scale, view_order
 from ..settings import TrainingSettings
-from .checkpoint import OTHER_RUN, Checkpoint, read_checkpoint, read_selection, write_checkpoint, write_selection
+from .checkpoint import (
+    OTHER_RUN,
+    Checkpoint,
+    read_checkpoint,
+    read_selection,
+    write_checkpoint,
+    write_selection,
+)
 from .continuation import continued_evaluation_views, continued_order, starting_state
 from .folder import (
     AVATAR,
@@ -66,7 +78,8 @@ CHECKPOINT_S = 30.0
 CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 """Environment variable that replaces it, for machines that are taken away often."""
 TRACKING_START_SHARE, TRACKING_TIME_SHARE = 0.5, 0.2
-"""Of the budget, after which the avatar tracks its head; and of a budget in seconds, what that may take."""
+"""Of the budget, after which the avatar tracks its head; and of a budget in seconds, what that may
+take."""
 RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
 RESIDUAL_VIEWS = 24
@@ -110,14 +123,23 @@ class Session:
         settings, first = self.settings, self.trainer.iteration
         red, green, blue = (round(255 * c) for c in settings.background)
         if self.run.continuation is None:
-            order = view_order(self.capture.views["train"], settings.views_per_visit, settings.seed, first)
+            order = view_order(
+                self.capture.views["train"], settings.views_per_visit, settings.seed, first
+            )
         else:
             region = _refined_region(self.run, self.trainer)
-            order = continued_order(self.run.continuation, self.capture, region, settings.seed, first)
+            order = continued_order(
+                self.run.continuation, self.capture, region, settings.seed, first
+            )
         prepare = image_preparation(self.capture, settings)
-        mesh = self.capture.mesh if self.trainer.tracking is None else None  # refined meshes change with every step
+        # refined meshes change with every step
+        mesh = self.capture.mesh if self.trainer.tracking is None else None
         return ViewLoader(
-            order, lambda position: self._scale(first + position), (red, green, blue), prepare=prepare, mesh=mesh
+            order,
+            lambda position: self._scale(first + position),
+            (red, green, blue),
+            prepare=prepare,
+            mesh=mesh,
         )
 
     def step(self, loader: ViewLoader, clock: Callable[[], float]) -> None:
@@ -133,10 +155,15 @@ class Session:
     def tracking_is_due(self) -> bool:
         """Whether the avatar is to track the training's timesteps now."""
         tracking = self.trainer.tracking
-        return tracking is not None and not tracking.rounds and self.spent().share >= TRACKING_START_SHARE
+        return (
+            tracking is not None
+            and not tracking.rounds
+            and self.spent().share >= TRACKING_START_SHARE
+        )
 
     def track(self, clock: Callable[[], float], report: Callable[[int, int], bool]) -> bool:
-        """Track the training's timesteps by the avatar; returns False where the report said to stop."""
+        """Track the training's timesteps by the avatar; returns False where the report said to
+        stop."""
         tracking, begin, seconds = self.trainer.tracking, clock(), self.settings.seconds
         assert tracking is not None
         done = self._tracked(
@@ -158,12 +185,19 @@ class Session:
             limit = None if seconds is None else TRACKING_TIME_SHARE * seconds
             tracking.rounds += self._tracked(unseen, limit, report)
 
-    def _tracked(self, timesteps: list[int], seconds: float | None, report: Callable[[int, int], bool]) -> bool:
+    def _tracked(
+        self, timesteps: list[int], seconds: float | None, report: Callable[[int, int], bool]
+    ) -> bool:
         tracking = self.trainer.tracking
         assert tracking is not None
         try:
             found = track_by_avatar(
-                self.avatar(), self.settings, tracking.refined(self.capture), timesteps, seconds, report
+                self.avatar(),
+                self.settings,
+                tracking.refined(self.capture),
+                timesteps,
+                seconds,
+                report,
             )
         except Cancelled:
             return False
@@ -207,7 +241,8 @@ class Session:
         return figures if self.loss is None else {**figures, "loss": self.loss}
 
     def require_folder(self) -> None:
-        """Raise StgaError where the run is no longer in its folder, which writing would make anew."""
+        """Raise StgaError where the run is no longer in its folder, which writing would make
+        anew."""
         if (self.folder / RUN).exists() and read_run(self.folder).identity == self.run.identity:
             return
         raise StgaError(
@@ -234,7 +269,8 @@ class Session:
         write_checkpoint(self.folder, checkpoint)
 
     def write_residuals(self) -> None:
-        """Measure the error of the written avatar on each triangle, over a few views of all frames and cameras."""
+        """Measure the error of the written avatar on each triangle, over a few views of all frames
+        and cameras."""
         views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
         refined = self.trainer.tracking is not None
         capture = with_refined_tracking(self.capture, self.folder) if refined else self.capture
@@ -245,18 +281,26 @@ class Session:
         write_residuals(self.folder, residuals.mean())
 
     def _scale(self, iteration: int) -> float:
-        """Size of an iteration's image, as a share of the captured one; by the clock, a few images ahead of it."""
+        """Size of an iteration's image, as a share of the captured one; by the clock, a few images
+        ahead of it."""
         total = self.settings.iterations
-        return image_scale(self.settings, self.spent().share if total is None else iteration / total)
+        return image_scale(
+            self.settings, self.spent().share if total is None else iteration / total
+        )
 
     def _measure_refined_strain(self) -> None:
-        """Measure the strain of all training timesteps where refined tracking has moved their meshes."""
+        """Measure the strain of all training timesteps where refined tracking has moved their
+        meshes."""
         if self.settings.follows_strain:
             self.strain_range = trained_strain_range(self.capture, self.trainer.frames.mesh, None)
 
 
 def begin_session(
-    capture: Capture, folder: Path, run: Run, selection: Mapping[int, np.ndarray] | None, report: Report
+    capture: Capture,
+    folder: Path,
+    run: Run,
+    selection: Mapping[int, np.ndarray] | None,
+    report: Report,
 ) -> tuple[Session, Evaluator]:
     """Start a new run: select triangles, place splats, and write the run's files.
 
@@ -265,11 +309,14 @@ def begin_session(
     report(Progress(stage="Placing splats"))
     settings, continuation, state = run.settings, run.continuation, None
     if selection is None:
-        selection = select_capture(capture, settings.selection) if settings.strategy == "selective" else {}
+        selection = (
+            select_capture(capture, settings.selection) if settings.strategy == "selective" else {}
+        )
     if continuation is not None:
         state = starting_state(continuation, settings, len(capture.faces))
         _check_state(folder, capture, settings, state)
-    for stale in (TRACKING, CHECKPOINT, METRICS, STRAIN_RANGE, WORLD_FILE):  # of a run whose run.json was removed
+    # of a run whose run.json was removed
+    for stale in (TRACKING, CHECKPOINT, METRICS, STRAIN_RANGE, WORLD_FILE):
         (folder / stale).unlink(missing_ok=True)
     strain_range = _strain_range(folder, capture, run, report)
     trainer = Trainer(capture, settings, selection, state, run.device, strain_range)
@@ -285,8 +332,11 @@ def begin_session(
     return session, evaluator
 
 
-def resume_session(capture: Capture, folder: Path, run: Run, report: Report) -> tuple[Session, Evaluator]:
-    """Continue from the folder's checkpoint. Raises StgaError where it does not fit the capture or the settings."""
+def resume_session(
+    capture: Capture, folder: Path, run: Run, report: Report
+) -> tuple[Session, Evaluator]:
+    """Continue from the folder's checkpoint. Raises StgaError where it does not fit the capture or
+    the settings."""
     report(Progress(stage="Reading the checkpoint"))
     assert run.identity is not None
     checkpoint = read_checkpoint(folder)
@@ -315,8 +365,12 @@ def resume_session(capture: Capture, folder: Path, run: Run, report: Report) -> 
 def _restore(folder: Path, trainer: Trainer, checkpoint: Checkpoint) -> None:
     here, there = trainer.tracking, checkpoint.tracking
     if (None if here is None else here.tracked.shape) != (None if there is None else there.shape):
-        raise StgaError(f"{folder}: its checkpoint's refined tracking does not fit the capture or the settings")
-    trainer.restore(checkpoint.iteration, checkpoint.visit, checkpoint.last_timestep, checkpoint.initial_count)
+        raise StgaError(
+            f"{folder}: its checkpoint's refined tracking does not fit the capture or the settings"
+        )
+    trainer.restore(
+        checkpoint.iteration, checkpoint.visit, checkpoint.last_timestep, checkpoint.initial_count
+    )
     if here is not None and there is not None:
         here.parameters, here.rounds = there, checkpoint.rounds
 
@@ -331,7 +385,10 @@ def _evaluation_views(capture: Capture, run: Run, trainer: Trainer) -> list[Eval
     if run.continuation is not None:
         return continued_evaluation_views(run, capture, _refined_region(run, trainer))
     background, backdrop = run.settings.background, run.settings.backdrop
-    return [read_evaluation_view(capture, view, background, backdrop) for view in choose_evaluation_views(capture)]
+    return [
+        read_evaluation_view(capture, view, background, backdrop)
+        for view in choose_evaluation_views(capture)
+    ]
 
 
 def _exposure(capture: Capture, run: Run) -> ViewExposure | None:
@@ -344,22 +401,32 @@ def _refined_region(run: Run, trainer: Trainer) -> np.ndarray | None:
     return trainer.strategy.region if run.settings.strategy == "refine" else None
 
 
-def _check_state(folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState) -> None:
+def _check_state(
+    folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState
+) -> None:
     """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
     face, splats, faces = state.face, state.splats(), len(capture.faces)
     if len(face) and not 0 <= int(face.min()) <= int(face.max()) < faces:
-        raise StgaError(f"{folder}: its splats refer to triangles that {capture.root} does not have")
+        raise StgaError(
+            f"{folder}: its splats refer to triangles that {capture.root} does not have"
+        )
     if splats.sh_degree != settings.sh_degree:
         found = splats.sh_degree
-        raise StgaError(f"{folder}: its splats have SH degree {found}, run.json says {settings.sh_degree}")
+        raise StgaError(
+            f"{folder}: its splats have SH degree {found}, run.json says {settings.sh_degree}"
+        )
     for name in {name for name in ADDED if getattr(splats, name).shape[1]} ^ set(settings.added):
         raise StgaError(f"{folder}: its splats and run.json disagree on {name}")
     for name in state.driven_offsets.keys() ^ set(settings.driven_offsets):
-        raise StgaError(f"{folder}: its checkpoint and run.json disagree on the driven offset {name}")
+        raise StgaError(
+            f"{folder}: its checkpoint and run.json disagree on the driven offset {name}"
+        )
     for name, offset in state.driven_offsets.items():
         found = len(offset.steps)
         if found != faces:
-            raise StgaError(f"{folder}: its {name} is of {found} triangles, {capture.root} has {faces}")
+            raise StgaError(
+                f"{folder}: its {name} is of {found} triangles, {capture.root} has {faces}"
+            )
 
 
 # Training
@@ -376,12 +443,14 @@ def train(
 ) -> Path:
     """Train a capture into the folder `out` and return the path of the avatar file.
 
-    selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the folder's
-    checkpoint to the parameters that an unbroken run would have reached (same seed, number of threads and device).
+    selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the
+    folder's checkpoint to the parameters that an unbroken run would have reached (same seed, number
+    of threads and device).
     falls_back: where a GPU fails, continue from the last checkpoint on the CPU.
-    Raises StgaError where the capture has nothing to train on, the folder is in use, is the capture's or holds another
-    run or one that cannot be continued (`require_color_range`), or STGA_LPIPS names a file without its weights. A first
-    Ctrl-C raises KeyboardInterrupt when avatar and checkpoint are saved, a second one at once.
+    Raises StgaError where the capture has nothing to train on, the folder is in use, is the
+    capture's or holds another run or one that cannot be continued (`require_color_range`), or
+    STGA_LPIPS names a file without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar
+    and checkpoint are saved, a second one at once.
     """
     try:
         return _train(capture, out, run, selection, resume, report)
@@ -395,14 +464,21 @@ def train(
 
 
 def _train(
-    capture: Capture, out: Path, run: Run, selection: Mapping[int, np.ndarray] | None, resume: bool, report: Report
+    capture: Capture,
+    out: Path,
+    run: Run,
+    selection: Mapping[int, np.ndarray] | None,
+    resume: bool,
+    report: Report,
 ) -> Path:
     """`train` on the device of the run."""
     lpips.load_network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
-        raise StgaError(f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on")
+        raise StgaError(
+            f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on"
+        )
     if out.resolve() == capture.root:
         raise StgaError(f"{out}: is the folder of the capture; train into another one")
     with locked(out):
@@ -423,7 +499,8 @@ def _train(
 
 
 def _asked_interval_s() -> float | None:
-    """Seconds between checkpoints by the environment variable; None without it. Raises StgaError for no such number."""
+    """Seconds between checkpoints by the environment variable; None without it. Raises StgaError
+    for no such number."""
     text = os.environ.get(CHECKPOINT_VARIABLE, "")
     if not text:
         return None
@@ -432,7 +509,9 @@ def _asked_interval_s() -> float | None:
     except ValueError:
         seconds = -1.0
     if not 0 <= seconds < math.inf:
-        raise StgaError(f"{CHECKPOINT_VARIABLE}: expected seconds between checkpoints, got {shorten(text)}")
+        raise StgaError(
+            f"{CHECKPOINT_VARIABLE}: expected seconds between checkpoints, got {shorten(text)}"
+        )
     return seconds
 
 
@@ -451,10 +530,14 @@ class _Loop:
     speed: float = 0.0
 
     def work(self) -> None:
-        """Train until the budget is spent, a goal of the settings is reached or the report asks to stop."""
-        self.report(self._progress("Compiling kernels"))  # meanwhile, the splats are shown as they begin
+        """Train until the budget is spent, a goal of the settings is reached or the report asks to
+        stop."""
+        # meanwhile, the splats are shown as they begin
+        self.report(self._progress("Compiling kernels"))
         precompile_kernels(self.session.run.device)
-        self.began = perf_counter() - (self.evaluator.lines[-1]["wall_s"] if self.evaluator.lines else 0.0)
+        self.began = perf_counter() - (
+            self.evaluator.lines[-1]["wall_s"] if self.evaluator.lines else 0.0
+        )
         if self._is_finished():  # a finished run was resumed
             self._restore_avatar()
             return
@@ -464,7 +547,8 @@ class _Loop:
             self._train(interrupts)
             if self._is_finished():
                 self.session.track_unseen(self._tracks(interrupts))
-            self._evaluate(perceptual=self._is_finished())  # LPIPS takes long, so a run that is stopped goes without
+            # LPIPS takes long, so a run that is stopped goes without
+            self._evaluate(perceptual=self._is_finished())
             self.session.write_checkpoint(self.evaluator)
             if self._is_finished():
                 self.report(self._progress("Measuring residuals"))
@@ -478,7 +562,10 @@ class _Loop:
         path = self.session.folder / AVATAR
         if path.exists():
             return
-        _log.warning("%s was missing; it is written anew from the checkpoint, the last state of training", path)
+        _log.warning(
+            "%s was missing; it is written anew from the checkpoint, the last state of training",
+            path,
+        )
         self.report(self._progress("Writing the missing avatar from the checkpoint"))
         self.session.write_avatar()
         self.session.write_residuals()
@@ -490,7 +577,9 @@ class _Loop:
         with session.loader() as loader:
             while not session.spent().share >= 1:
                 session.step(loader, perf_counter)
-                if session.tracking_is_due and not session.track(perf_counter, self._tracks(interrupts)):
+                if session.tracking_is_due and not session.track(
+                    perf_counter, self._tracks(interrupts)
+                ):
                     break
                 if self.evaluator.is_due(session.spent()):
                     self._evaluate()
@@ -499,14 +588,17 @@ class _Loop:
                 if session.elapsed_s - saved > (CHECKPOINT_S if asked_s is None else asked_s):
                     session.write_checkpoint(self.evaluator)
                     saved = session.elapsed_s
-                self.speed = (session.trainer.iteration - first) / max(session.elapsed_s - started, 1e-9)
+                self.speed = (session.trainer.iteration - first) / max(
+                    session.elapsed_s - started, 1e-9
+                )
                 if self.report(self._progress("Training")) or interrupts:
                     break
 
     def _tracks(self, interrupts: list[int]) -> Callable[[int, int], bool]:
         """What tracking by the avatar reports to."""
         return lambda done, total: (
-            self.report(self._progress(f"Tracking by the avatar: {done} of {total}")) or bool(interrupts)
+            self.report(self._progress(f"Tracking by the avatar: {done} of {total}"))
+            or bool(interrupts)
         )
 
     def _evaluate(self, perceptual: bool = False) -> None:
@@ -541,7 +633,8 @@ class _Loop:
             return {name: float(value) for name, value in values.items() if value is not None}
 
         def preview(path: Path) -> None:
-            with suppress(StgaError):  # training continues without one, and reports a full disk itself
+            # training continues without one, and reports a full disk itself
+            with suppress(StgaError):
                 write_avatar(path, session.avatar())
 
         return Progress(min(1.0, spent.share), stage, evaluator.forecast_text, known, preview)

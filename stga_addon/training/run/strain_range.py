@@ -1,6 +1,8 @@
-"""Range of strain that a run has trained on, within which its avatar's colors and positions follow strain.
+"""Range of strain that a run has trained on, within which its avatar's colors and positions follow
+strain.
 
-strain_range.npz   `strain_range` (F, 2, 3) float32 of a run, and `identity`: the digest of the run's
+strain_range.npz   `strain_range` (F, 2, 3) float32 of a run, and `identity`: the digest of the
+                   run's
 """
 
 from collections.abc import Callable
@@ -22,7 +24,8 @@ OLDER_COLORS = "colors follow strain as in an earlier version; train it anew"
 def trained_strain_range(
     capture: Capture, mesh: Callable[[int], np.ndarray], continuation: Continuation | None
 ) -> np.ndarray:
-    """`Avatar.strain_range` (F, 2, 3) of a run: what all its training timesteps show, and what its parent's did.
+    """`Avatar.strain_range` (F, 2, 3) of a run: what all its training timesteps show, and what its
+    parent's did.
 
     mesh: timestep -> (V, 3) that is trained on; one at a time is held. Within COLOR_RANGE.
     """
@@ -43,9 +46,11 @@ def trained_strain_range(
 
 
 def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | None:
-    """The range (F, 2, 3) of a run that has begun in the folder, measured and written where the folder has no file yet.
+    """The range (F, 2, 3) of a run that has begun in the folder, measured and written where the
+    folder has no file yet.
 
-    None where nothing follows strain, and with refined tracking, which moves the meshes while it trains.
+    None where nothing follows strain, and with refined tracking, which moves the meshes while it
+    trains.
     """
     if not run.settings.follows_strain or run.settings.tracking:
         return None
@@ -64,7 +69,8 @@ def write_strain_range(folder: Path, limits: np.ndarray, identity: str) -> None:
 
 
 def read_strain_range(folder: Path, faces: int, identity: str) -> np.ndarray:
-    """(F, 2, 3) float32 as written. Raises StgaError where the file is damaged, or of another run or mesh."""
+    """(F, 2, 3) float32 as written. Raises StgaError where the file is damaged, or of another run
+    or mesh."""
     path = folder / STRAIN_RANGE
     arrays = read_npz(path)
     limits, stored = arrays.get("strain_range"), arrays.get("identity")
@@ -74,7 +80,9 @@ def read_strain_range(folder: Path, faces: int, identity: str) -> np.ndarray:
         found = "no such array" if limits is None else f"{limits.dtype} {limits.shape}"
         raise StgaError(f"{path}: expected 'strain_range', float32 ({faces}, 2, 3), found {found}")
     if not _is_color_range(limits):
-        raise StgaError(f"{path}: 'strain_range' is not within the range that colors are trained to follow; remove it")
+        raise StgaError(
+            f"{path}: 'strain_range' is not within the range that colors are trained to follow; remove it"
+        )
     return limits
 
 
@@ -83,7 +91,9 @@ def require_color_range(path: Path, avatar: Avatar) -> None:
 
     An earlier version trained it: more training would change it at once.
     """
-    if avatar.follows_strain and (avatar.strain_range is None or not _is_color_range(avatar.strain_range)):
+    if avatar.follows_strain and (
+        avatar.strain_range is None or not _is_color_range(avatar.strain_range)
+    ):
         raise StgaError(f"{path}: {OLDER_COLORS}")
 
 

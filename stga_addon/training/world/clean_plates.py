@@ -15,7 +15,8 @@ MAX_PLATE_VIEWS = 24
 MAX_PLATE_PIXELS = 500_000
 """Larger images are read smaller."""
 MATTE_MARGIN_SHARE = 0.008
-"""Around the person nothing is taken from a view, where a matte is uncertain; share of the image's height."""
+"""Around the person nothing is taken from a view, where a matte is uncertain; share of the image's
+height."""
 PERSON = 256
 """Above every level of a pixel: sorts behind them."""
 
@@ -42,7 +43,10 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
     for view in capture.views.get("train", ()):
         if view.mask is not None:
             by_camera.setdefault(view.camera_index, []).append(view)
-    return [_plate(evenly_spread(views, MAX_PLATE_VIEWS), correct) for _, views in sorted(by_camera.items())]
+    return [
+        _plate(evenly_spread(views, MAX_PLATE_VIEWS), correct)
+        for _, views in sorted(by_camera.items())
+    ]
 
 
 def _plate(views: Sequence[View], correct: Correction | None) -> CleanPlate:
@@ -58,7 +62,9 @@ def _plate(views: Sequence[View], correct: Correction | None) -> CleanPlate:
     levels = np.sort(np.stack(stack, axis=-1), axis=-1)
     count = (levels[:, :, 0] < PERSON).sum(axis=-1)
     middle = np.maximum(count - 1, 0)[..., None, None] // 2
-    image = np.take_along_axis(levels, np.broadcast_to(middle, (*count.shape, 3, 1)), axis=-1)[..., 0]
+    image = np.take_along_axis(levels, np.broadcast_to(middle, (*count.shape, 3, 1)), axis=-1)[
+        ..., 0
+    ]
     seen = count > 0
     return CleanPlate(view.camera, filled(image.astype(np.float32) / 255, seen), seen)
 
@@ -66,14 +72,16 @@ def _plate(views: Sequence[View], correct: Correction | None) -> CleanPlate:
 def _grown(person: np.ndarray) -> np.ndarray:
     from scipy.ndimage import binary_dilation
 
-    return np.asarray(binary_dilation(person, iterations=max(1, round(MATTE_MARGIN_SHARE * len(person)))))
+    return np.asarray(
+        binary_dilation(person, iterations=max(1, round(MATTE_MARGIN_SHARE * len(person))))
+    )
 
 
 def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """The image (H, W, 3) float32 with smooth colors where it is not `seen` (H, W) bool.
 
-    Push and pull: pixels without a color get that of the image at half the size, whose pixels are the means of those
-    that have one.
+    Push and pull: pixels without a color get that of the image at half the size, whose pixels are
+    the means of those that have one.
     """
     if seen.all() or not seen.any():
         return image

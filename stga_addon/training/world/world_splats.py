@@ -1,4 +1,5 @@
-"""Splats of the world: begun as blocks of the clean plates on a shell around the person, then trained on the plates."""
+"""Splats of the world: begun as blocks of the clean plates on a shell around the person, then
+trained on the plates."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,30 +21,35 @@ from ..settings import Rates, TrainingSettings
 from .clean_plates import CleanPlate, clean_plates
 
 RADII, NEAREST_RADIUS, FARTHEST_RADIUS = 24, 0.3, 12.0
-"""Shells that are tried, and the smallest and the largest, in distances of the cameras from the person."""
+"""Shells that are tried, and the smallest and the largest, in distances of the cameras from the
+person."""
 DEFAULT_RADIUS = 3.0
 """Where the plates do not tell, because a wall is of one color or a single camera sees it."""
 SAMPLED_POINTS = 4000
 """Pixels of each plate by which shells are compared."""
 MIN_SHARED, MIN_LIKENESS = 0.1, 0.3
-"""A shell tells how far away the world is where at least this share of the sampled pixels lies in another plate as
-well, and what both show there correlates at least so much."""
+"""A shell tells how far away the world is where at least this share of the sampled pixels lies in
+another plate as well, and what both show there correlates at least so much."""
 DETAIL_SHARES = 0.003, 0.03
-"""Standard deviations of the filters between which details lie by which plates are compared; of the image's height."""
+"""Standard deviations of the filters between which details lie by which plates are compared; of the
+image's height."""
 LARGEST_BLOCK, SMALLEST_BLOCK = 16, 2
 """Pixels."""
 FLAT_LEVELS, MAX_FIRST_SPLATS = 1.5, 60_000
-"""A block whose colors deviate less from their mean (standard deviation, of 255) is one splat; by more, twice as much
-and so on, where there would be too many."""
+"""A block whose colors deviate less from their mean (standard deviation, of 255) is one splat; by
+more, twice as much and so on, where there would be too many."""
 SAME_LEVELS = 8.0
-"""A block is left out whose color another plate shows there already, to within so many of 255 levels."""
+"""A block is left out whose color another plate shows there already, to within so many of 255
+levels."""
 BLOCK_WIDTH = 0.8
 """Standard deviation of a block's splat, in sides of the block."""
 THICKNESS_SHARE = 0.2
 START_OPACITY = 5.0
 """A logit."""
 MIN_STEPS, STEPS_PER_CAMERA = 200, 25
-RATES = Rates(xyz=1e-6, rotation=1e-3, log_scale=0.01, opacity=0.02, sh=0.02, sh_rest=0.004, end=0.1)
+RATES = Rates(
+    xyz=1e-6, rotation=1e-3, log_scale=0.01, opacity=0.02, sh=0.02, sh_rest=0.004, end=0.1
+)
 """Blocks begin where they belong."""
 SH_DEGREE = 1
 """Walls shine a little, and cameras differ."""
@@ -52,8 +58,8 @@ SH_DEGREE = 1
 def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Splats:
     """Splats, in world space, of what stands still behind the person of a capture that has masks.
 
-    settings: of the avatar's training; images are corrected for their exposure as there. Raises StgaError where a file
-    cannot be read.
+    settings: of the avatar's training; images are corrected for their exposure as there. Raises
+    StgaError where a file cannot be read.
     """
     report(Progress(stage="World"))
     plates = clean_plates(capture, exposure_correction(settings))
@@ -62,7 +68,8 @@ def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Sp
 
 
 def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report = ignore) -> Splats:
-    """Splats in world space, meters, that show the plates from their cameras; center: (3,) of the person."""
+    """Splats in world space, meters, that show the plates from their cameras; center: (3,) of the
+    person."""
     start = first_splats(plates, center)
     capture = _still_capture(plates, center)
     frames = face_frames(capture.neutral, capture.faces, capture.neutral)
@@ -71,7 +78,8 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
     trainer = Trainer(capture, _settings(plates, steps), {}, new_state(local))
     targets = [np.rint(255 * plate.image).astype(np.uint8) for plate in plates]
     for target in targets:
-        target.setflags(write=False)  # as in training: Numba would compile again for writable arrays
+        # as in training: Numba would compile again for writable arrays
+        target.setflags(write=False)
     turns, rng = -(-steps // len(plates)), np.random.default_rng(0)
     order = np.concatenate([rng.permutation(len(plates)) for _ in range(turns)])[:steps]
     for number in counted(order, steps, report, "World", "Step"):
@@ -82,9 +90,14 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
 def _still_capture(plates: Sequence[CleanPlate], center: np.ndarray) -> Capture:
     """A capture of one timestep, whose views are the plates' and whose mesh is one triangle."""
     mesh = center + np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
-    views = tuple(View(0, number, plate.camera, f"plate {number}", Path()) for number, plate in enumerate(plates))
+    views = tuple(
+        View(0, number, plate.camera, f"plate {number}", Path())
+        for number, plate in enumerate(plates)
+    )
     faces = np.arange(3, dtype=np.int32)[None]
-    return Capture(Path(), "world", faces, mesh, {"train": views}, (0,), {}, lambda _: mesh, lambda *_: mesh)
+    return Capture(
+        Path(), "world", faces, mesh, {"train": views}, (0,), {}, lambda _: mesh, lambda *_: mesh
+    )
 
 
 def _settings(plates: Sequence[CleanPlate], steps: int) -> TrainingSettings:
@@ -97,8 +110,11 @@ def _settings(plates: Sequence[CleanPlate], steps: int) -> TrainingSettings:
 
 
 def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
-    """Meters from the person's center (3,) to the shell on which plates of different cameras look most alike."""
-    distance = float(np.median([np.linalg.norm(plate.camera.position - center) for plate in plates]))
+    """Meters from the person's center (3,) to the shell on which plates of different cameras look
+    most alike."""
+    distance = float(
+        np.median([np.linalg.norm(plate.camera.position - center) for plate in plates])
+    )
     details = [_detail(plate) for plate in plates]
     radii = distance * np.geomspace(NEAREST_RADIUS, FARTHEST_RADIUS, RADII)
     likeness = [_likeness(plates, details, center, radius) for radius in radii]
@@ -107,15 +123,19 @@ def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
 
 
 def _detail(plate: CleanPlate) -> np.ndarray:
-    """(H, W, 3): the plate without its coarse colors, which light and exposure change, and without noise."""
+    """(H, W, 3): the plate without its coarse colors, which light and exposure change, and without
+    noise."""
     from scipy.ndimage import gaussian_filter
 
     fine, coarse = (np.asarray([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES)
     return np.asarray(gaussian_filter(plate.image, fine) - gaussian_filter(plate.image, coarse))
 
 
-def _likeness(plates: Sequence[CleanPlate], details: Sequence[np.ndarray], center: np.ndarray, radius: float) -> float:
-    """Correlation of what two plates show of the same points of a shell; 0 where they share too few."""
+def _likeness(
+    plates: Sequence[CleanPlate], details: Sequence[np.ndarray], center: np.ndarray, radius: float
+) -> float:
+    """Correlation of what two plates show of the same points of a shell; 0 where they share too
+    few."""
     mine, theirs, rng = [], [], np.random.default_rng(0)
     for plate, detail in zip(plates, details, strict=True):
         rows, columns = np.nonzero(plate.seen)
@@ -135,8 +155,9 @@ def _likeness(plates: Sequence[CleanPlate], details: Sequence[np.ndarray], cente
 
 
 def on_shell(camera: Camera, pixels: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
-    """World points (N, 3) where the rays of pixels (N, 2) meet a sphere behind its center; rays that pass beside the
-    sphere end where they are nearest to the center, and half a radius farther."""
+    """World points (N, 3) where the rays of pixels (N, 2) meet a sphere behind its center; rays
+    that pass beside the sphere end where they are nearest to the center, and half a radius
+    farther."""
     origin = camera.position
     toward = camera.unproject(pixels, np.ones(len(pixels))) - origin
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
@@ -147,8 +168,8 @@ def on_shell(camera: Camera, pixels: np.ndarray, center: np.ndarray, radius: flo
 
 
 def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
-    """A splat in world space for each block of the plates; of many plates more than MAX_FIRST_SPLATS, where blocks are
-    as large as they may be."""
+    """A splat in world space for each block of the plates; of many plates more than
+    MAX_FIRST_SPLATS, where blocks are as large as they may be."""
     radius, levels = shell_radius(plates, center), FLAT_LEVELS
     splats = _splats_of_blocks(plates, center, radius, levels)
     while len(splats) > MAX_FIRST_SPLATS and levels < 255:
@@ -157,7 +178,9 @@ def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
     return splats
 
 
-def _splats_of_blocks(plates: Sequence[CleanPlate], center: np.ndarray, radius: float, levels: float) -> Splats:
+def _splats_of_blocks(
+    plates: Sequence[CleanPlate], center: np.ndarray, radius: float, levels: float
+) -> Splats:
     parts = []
     for number, plate in enumerate(plates):
         middles, sides, colors = blocks(plate.image, levels)
@@ -172,10 +195,13 @@ def _splats_of_blocks(plates: Sequence[CleanPlate], center: np.ndarray, radius: 
 
 
 def blocks(image: np.ndarray, levels: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Squares of an image (H, W, 3) float32 whose colors deviate by less than so many of 255 levels, also a little
-    beyond its edge: their middles (N, 2) in pixels, sides (N,) and mean colors (N, 3)."""
+    """Squares of an image (H, W, 3) float32 whose colors deviate by less than so many of 255
+    levels, also a little beyond its edge: their middles (N, 2) in pixels, sides (N,) and mean
+    colors (N, 3)."""
     height, width = image.shape[:2]
-    pad = [(LARGEST_BLOCK, LARGEST_BLOCK + -side % LARGEST_BLOCK) for side in (height, width)] + [(0, 0)]
+    pad = [(LARGEST_BLOCK, LARGEST_BLOCK + -side % LARGEST_BLOCK) for side in (height, width)] + [
+        (0, 0)
+    ]
     padded = np.pad(image, pad, mode="edge")
     found, side = [], LARGEST_BLOCK
     open_ = np.ones((padded.shape[0] // side, padded.shape[1] // side), bool)
@@ -184,19 +210,25 @@ def blocks(image: np.ndarray, levels: float) -> tuple[np.ndarray, np.ndarray, np
         mean, deviation = squares.mean(axis=(1, 3)), squares.std(axis=(1, 3)).max(axis=-1)
         taken = open_ & ((deviation < levels / 255) | (side == SMALLEST_BLOCK))
         y, x = np.nonzero(taken)
-        found.append((side * (np.stack([x, y], 1) + 0.5) - LARGEST_BLOCK, np.full(len(x), side), mean[taken]))
+        found.append(
+            (side * (np.stack([x, y], 1) + 0.5) - LARGEST_BLOCK, np.full(len(x), side), mean[taken])
+        )
         open_, side = np.repeat(np.repeat(open_ & ~taken, 2, 0), 2, 1), side // 2
     middles, sides, colors = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return middles, sides.astype(np.float32), colors
 
 
-def _block_splats(camera: Camera, points: np.ndarray, sides: np.ndarray, colors: np.ndarray) -> Splats:
+def _block_splats(
+    camera: Camera, points: np.ndarray, sides: np.ndarray, colors: np.ndarray
+) -> Splats:
     """Flat splats (N) at points (N, 3) that face a camera in which they are so many pixels wide."""
     count = len(points)
     depth = camera.project(points)[1]
     width = BLOCK_WIDTH * sides * depth / camera.fl_x
     log_scale = np.log(np.stack([width, width, THICKNESS_SHARE * width], axis=1))
-    rotation = np.repeat(from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1)), count, axis=0)
+    rotation = np.repeat(
+        from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1)), count, axis=0
+    )
     sh = np.zeros((count, (SH_DEGREE + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colors - 0.5) / SH_C0
     return Splats(

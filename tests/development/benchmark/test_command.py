@@ -19,7 +19,11 @@ from stga_addon.training.run.folder import read_run
     ],
 )
 def test_impossible_benchmarks(
-    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+    toy_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
 ) -> None:
     """Catches a mistake found only after the first hour."""
     assert main(["benchmark", str(toy_root), "--out", str(tmp_path / "out"), *arguments]) == 2
@@ -29,9 +33,13 @@ def test_impossible_benchmarks(
 
 @pytest.mark.slow
 def test_slices_are_jobs_of_a_batch(
-    toy_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    toy_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches a benchmark whose seeds are not jobs, that trains again what is finished, or says nothing of a seed."""
+    """Catches a benchmark whose seeds are not jobs, that trains again what is finished, or says
+    nothing of a seed."""
     out, options = str(tmp_path / "out"), ["--budget", "1s", "--only", "draft", "--threads", "1"]
     command = ["benchmark", str(toy_root), "--out", out, "--seeds", "2", *options]
     assert main([*command, "--dry-run"]) == 0
@@ -52,7 +60,9 @@ def test_slices_are_jobs_of_a_batch(
     assert capsys.readouterr().out.endswith(printed.partition("report.html\n")[2])
 
 
-def test_a_benchmark_needs_held_out_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_benchmark_needs_held_out_views(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches an hour of training of which nothing can be said."""
     root = factory.write_mesh_capture(tmp_path / "one", (0,), range(2))
     (root / "transforms_val.json").unlink()

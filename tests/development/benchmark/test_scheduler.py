@@ -15,7 +15,11 @@ from stga_addon.development.benchmark import scheduler, variants
 from stga_addon.development.benchmark.benchmark import write_report
 from stga_addon.development.benchmark.scheduler import BenchmarkRun, train_in_turns
 from stga_addon.development.benchmark.slice import runs_of
-from stga_addon.development.benchmark.variants import MAIN_VARIANTS, SETTING_VARIANTS, select_variants
+from stga_addon.development.benchmark.variants import (
+    MAIN_VARIANTS,
+    SETTING_VARIANTS,
+    select_variants,
+)
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
 from stga_addon.jobs.folder import request_folder, write_request
@@ -34,7 +38,9 @@ VARIANTS = {"standard": TINY, "coarse": {**TINY, "scale": 0.5}}
 
 
 def run_in(capture: Capture, out: Path, **changes: Any) -> BenchmarkRun:
-    return BenchmarkRun(Train(out, capture.root, make_settings(**{**TINY, **changes}), device="cpu"))
+    return BenchmarkRun(
+        Train(out, capture.root, make_settings(**{**TINY, **changes}), device="cpu")
+    )
 
 
 def progress(share: float, iteration: int = 1) -> Progress:
@@ -42,7 +48,8 @@ def progress(share: float, iteration: int = 1) -> Progress:
 
 
 def test_turns() -> None:
-    """Catches a run that trains out of its turn, one that waits after its end, and one that outlives its parent."""
+    """Catches a run that trains out of its turn, one that waits after its end, and one that
+    outlives its parent."""
     replies = io.StringIO()
     turns = Turns(io.StringIO("0.5\n0.7\n"), replies)
     assert not turns.report(progress(0.0, iteration=0))  # still compiling
@@ -56,7 +63,8 @@ def test_turns() -> None:
 
 
 def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a worker that writes no figures of the finished avatar, and mistakes that end in a traceback."""
+    """Catches a worker that writes no figures of the finished avatar, and mistakes that end in a
+    traceback."""
     monkeypatch.setattr("stga_addon.development.benchmark.worker.WARM_UP_S", 0.01)
     run = run_in(toy, tmp_path / "run", iterations=20)
     write_request(request_folder(run.out), run.request)
@@ -65,7 +73,9 @@ def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     first, second, last = (json.loads(line) for line in replies.getvalue().splitlines())
     assert (first["iteration"], second["share"], last) == (1, 0.5, {"done": True})
     quality = json.loads((run.out / QUALITY).read_text())
-    assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality["val"]) & set(quality["test"])
+    assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality["val"]) & set(
+        quality["test"]
+    )
     assert run.finished
     assert "psnr_unmatched" not in quality["val"]
     work(run.out, io.StringIO(), io.StringIO(), fits_exposure=True)
@@ -85,7 +95,8 @@ def two_variants(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_variants: None) -> None:
-    """Catches training lost to Ctrl-C, runs trained twice or not in turns, and files that are missing at the end."""
+    """Catches training lost to Ctrl-C, runs trained twice or not in turns, and files that are
+    missing at the end."""
     request = Benchmark(tmp_path, toy.root, 2.0, seed=4)
     said: list[str] = []
 
@@ -100,7 +111,9 @@ def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_varian
     said.clear()
     shares: list[float] = []
     perform(request, lambda progress: bool(shares.append(progress.share)), said.append)
-    assert [text for text in said if "Starting" in text] == [f"Starting {name}" for name in VARIANTS]
+    assert [text for text in said if "Starting" in text] == [
+        f"Starting {name}" for name in VARIANTS
+    ]
     assert shares == sorted(shares)
     report = write_report([request], tmp_path)
     for name in VARIANTS:
@@ -110,7 +123,9 @@ def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_varian
         assert [line["iteration"] for line in lines] == sorted(line["iteration"] for line in lines)
         assert read_run(tmp_path / name).settings.seed == 4
     assert (tmp_path / "report.txt").read_text() == report + "\n"
-    assert {run["variant"] for run in json.loads((tmp_path / "benchmark.json").read_text())["runs"]} == set(VARIANTS)
+    assert {
+        run["variant"] for run in json.loads((tmp_path / "benchmark.json").read_text())["runs"]
+    } == set(VARIANTS)
     assert (tmp_path / "benchmark.csv").read_text().startswith("variant,seed,iteration,seconds,")
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
     said.clear()
@@ -120,12 +135,20 @@ def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_varian
         perform(replace(request, seconds=3.0))
 
 
-def test_exposure_is_fitted_for_all_or_none(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches variants with the effect that are measured with fitted exposure beside others without it."""
+def test_exposure_is_fitted_for_all_or_none(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches variants with the effect that are measured with fitted exposure beside others without
+    it."""
     request = Benchmark(tmp_path, toy.root, 2.0)
     rows = ((0.0, 1.1, 1.0, 1.0, 0.0, 0.0, 0.0),)
-    plain = {name: {**changes, "effects": {"exposure": "off"}} for name, changes in VARIANTS.items()}
-    with_rows = {"paper": {**TINY, "schedule": "paper"}, "corrected": {**TINY, "exposure": rows, "effects": None}}
+    plain = {
+        name: {**changes, "effects": {"exposure": "off"}} for name, changes in VARIANTS.items()
+    }
+    with_rows = {
+        "paper": {**TINY, "schedule": "paper"},
+        "corrected": {**TINY, "exposure": rows, "effects": None},
+    }
     fitted = []
     for chosen in (plain, with_rows):
         monkeypatch.setattr(variants, "MAIN_VARIANTS", chosen)
@@ -135,7 +158,8 @@ def test_exposure_is_fitted_for_all_or_none(toy: Capture, tmp_path: Path, monkey
 
 @pytest.fixture
 def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program in place of workers: it trains in one turn, or cannot where the run's folder is called `lost`."""
+    """A program in place of workers: it trains in one turn, or cannot where the run's folder is
+    called `lost`."""
     interpreter = tmp_path / "python"
     interpreter.write_text(
         '#!/bin/sh\ncase "$*" in */lost*) echo \'{"error": "nowhere"}\'; exit;; esac\n'
@@ -160,7 +184,9 @@ def test_ended_workers_are_reaped(
     ended: list[list[bool]] = []
     monkeypatch.setattr(subprocess, "Popen", Recorded)
     runs = [run_in(toy, tmp_path / name, seconds=1.0) for name in ("first", "second")]
-    train_in_turns(runs, lambda text: ended.append([process.returncode is not None for process in started]))
+    train_in_turns(
+        runs, lambda text: ended.append([process.returncode is not None for process in started])
+    )
     assert ended == [[], [False], [False, False], [True, True]]  # two starts, two turns
 
 
@@ -172,10 +198,13 @@ def test_one_failure_does_not_end_the_others(toy: Capture, tmp_path: Path, stand
 
 
 def test_variants() -> None:
-    """Catches a variant whose settings cannot be made, or that the table cannot compare with the standard."""
+    """Catches a variant whose settings cannot be made, or that the table cannot compare with the
+    standard."""
     for table in (MAIN_VARIANTS, SETTING_VARIANTS):
         made = [make_settings(**{"seconds": 1.0, **changes}) for changes in table.values()]
-        assert len({json.dumps(str(replace(settings, preset=None))) for settings in made}) == len(table)
+        assert len({json.dumps(str(replace(settings, preset=None))) for settings in made}) == len(
+            table
+        )
         assert "standard" in table
     assert list(select_variants(MAIN_VARIANTS, ["final", "draft"])) == ["draft", "final"]
     with pytest.raises(StgaError, match="--only: 'fast' is not one of draft, standard"):

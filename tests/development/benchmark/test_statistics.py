@@ -21,7 +21,14 @@ from stga_addon.report import evaluation_share
 
 
 def line(seconds: float, psnr: float, iteration: int = 0, **more: Any) -> dict[str, Any]:
-    return {"seconds": seconds, "psnr": psnr, "iteration": iteration, "splats": 7, "evaluation_s": 0.5, **more}
+    return {
+        "seconds": seconds,
+        "psnr": psnr,
+        "iteration": iteration,
+        "splats": 7,
+        "evaluation_s": 0.5,
+        **more,
+    }
 
 
 def outcome(variant: str, seed: int, psnr: float, finished: bool = True) -> Outcome:
@@ -31,7 +38,8 @@ def outcome(variant: str, seed: int, psnr: float, finished: bool = True) -> Outc
 
 
 def test_summary_over_seeds() -> None:
-    """Catches the population's deviation for the sample's, seeds of other variants, and unfinished runs that count."""
+    """Catches the population's deviation for the sample's, seeds of other variants, and unfinished
+    runs that count."""
     runs = [outcome("a", seed, psnr) for seed, psnr in enumerate((30.0, 31.0, 32.0))]
     table = summarize([*runs, outcome("a", 3, 99.0, finished=False), outcome("b", 0, 20.0)])
     assert table["a"]["val_psnr"] == Spread(31.0, 1.0, 3)
@@ -45,7 +53,8 @@ def test_within_spread() -> None:
     a, b = spread_of([30.0, 30.4]), spread_of([30.3, 30.9])
     assert within_spread(a, b)
     assert not within_spread(a, Spread(31.0, 0.1, 2))
-    assert not within_spread(Spread(30.0, float("nan"), 1), Spread(30.0, float("nan"), 1))  # nothing is known
+    # nothing is known
+    assert not within_spread(Spread(30.0, float("nan"), 1), Spread(30.0, float("nan"), 1))
 
 
 def test_mean_curves() -> None:
@@ -60,7 +69,8 @@ def test_mean_curves() -> None:
 
 
 def test_curves_compare_psnr_without_fit() -> None:
-    """Catches a variant that leads because exposure is fitted for it alone, in the chart and on the front."""
+    """Catches a variant that leads because exposure is fitted for it alone, in the chart and on the
+    front."""
     fitted = Outcome("a", 0, [line(s, 35.0, psnr_unmatched=28.0) for s in (1.0, 5.0)], {})
     curves = mean_curves([fitted, Outcome("b", 0, [line(s, 30.0) for s in (1.0, 5.0)], {})])
     np.testing.assert_allclose(curves["a"].mean, 28.0)
@@ -69,10 +79,19 @@ def test_curves_compare_psnr_without_fit() -> None:
 
 def test_both_psnrs_are_in_the_table() -> None:
     """Catches a table of fitted figures that does not say so, or hides the others."""
-    runs = [Outcome("a", 0, [line(1.0, 35.0, 1)], {"val": {"psnr": 35.0, "psnr_unmatched": 28.0, "ssim": 0.9}})]
+    runs = [
+        Outcome(
+            "a",
+            0,
+            [line(1.0, 35.0, 1)],
+            {"val": {"psnr": 35.0, "psnr_unmatched": 28.0, "ssim": 0.9}},
+        )
+    ]
     heading = table_lines(summarize(runs))[0]
     assert [cell.strip() for cell in heading.strip("|").split("|")][4:6] == ["val", "val unfitted"]
-    assert "The exposure of held-out cameras is fitted for all variants" in report_text(runs, {}, 1.0, Path("head"))
+    assert "The exposure of held-out cameras is fitted for all variants" in report_text(
+        runs, {}, 1.0, Path("head")
+    )
 
 
 def curve(seconds: list[float], psnr: list[float]) -> MeanCurve:
@@ -97,8 +116,13 @@ def test_the_front() -> None:
 
 
 def test_the_table() -> None:
-    """Catches columns out of line, figures under the wrong heading, and a comparison with the wrong variant."""
-    runs = [outcome(name, seed, psnr + seed) for name, psnr in (("standard", 30.0), ("draft", 27.0)) for seed in (0, 1)]
+    """Catches columns out of line, figures under the wrong heading, and a comparison with the wrong
+    variant."""
+    runs = [
+        outcome(name, seed, psnr + seed)
+        for name, psnr in (("standard", 30.0), ("draft", 27.0))
+        for seed in (0, 1)
+    ]
     lines = table_lines(summarize(runs))
     assert len({len(text) for text in lines}) == 1
     cells = [[cell.strip() for cell in text.strip("|").split("|")] for text in lines]
@@ -110,7 +134,9 @@ def test_the_table() -> None:
 def test_the_report_says_what_is_not_shown() -> None:
     """Catches a ranking that the seeds do not bear out, and one seed taken for certainty."""
     two = [
-        outcome(name, seed, psnr + seed) for name, psnr in (("a", 30.0), ("b", 30.5), ("c", 20.0)) for seed in (0, 1)
+        outcome(name, seed, psnr + seed)
+        for name, psnr in (("a", 30.0), ("b", 30.5), ("c", 20.0))
+        for seed in (0, 1)
     ]
     text = report_text(two, mean_curves(two), 10.0, Path("head"))
     assert "b and a are 0.50 dB apart, which is within their spread" in text

@@ -33,7 +33,10 @@ def test_size():
 
 def test_splits(capture):
     """Catches an expression or a camera that training has seen among what it is judged by."""
-    seen = {split: [(v.timestep, v.camera_index) for v in views] for split, views in capture.views.items()}
+    seen = {
+        split: [(v.timestep, v.camera_index) for v in views]
+        for split, views in capture.views.items()
+    }
     timesteps = {split: {timestep for timestep, _ in of} for split, of in seen.items()}
     cameras = {split: {camera for _, camera in of} for split, of in seen.items()}
     assert not timesteps["train"] & timesteps["test"]
@@ -46,8 +49,8 @@ def test_splits(capture):
 
 
 def test_heads_are_where_the_pictures_show_them(capture):
-    """Catches pictures of another pose, person or camera than the files say: skin ends where the mask does, and hair
-    and cloth are all that the head lacks."""
+    """Catches pictures of another pose, person or camera than the files say: skin ends where the
+    mask does, and hair and cloth are all that the head lacks."""
     for view in [view for views in capture.views.values() for view in views][::7]:
         head = silhouette(capture.mesh(view.timestep), capture.faces, view.camera)
         mask = read_mask(view) > 127
@@ -56,7 +59,8 @@ def test_heads_are_where_the_pictures_show_them(capture):
 
 
 def test_the_pictured_head_moves_as_the_bundled_one(capture, shared_data):
-    """Catches skinning, shapes or joints of the head in the pictures that are not those of the head in the files."""
+    """Catches skinning, shapes or joints of the head in the pictures that are not those of the head
+    in the files."""
     whole = whole_head(read_npz(shared_data / "ict_facekit.npz"))
     of = cKDTree(whole.v_template).query(capture.flame.model.v_template)[1]
     for timestep in capture.timesteps:
@@ -65,8 +69,8 @@ def test_the_pictured_head_moves_as_the_bundled_one(capture, shared_data):
 
 
 def test_eyes_look_where_the_pictures_show_them(capture):
-    """Catches a gaze of the other sign, and eyes that the pictures leave still: pupils are dark, and what is beside
-    them is not."""
+    """Catches a gaze of the other sign, and eyes that the pictures leave still: pupils are dark,
+    and what is beside them is not."""
     model = capture.flame.model
     pupils = []
     for name in ("left_eyeball", "right_eyeball"):

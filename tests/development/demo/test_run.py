@@ -1,4 +1,5 @@
-"""Demo with few of its capture's images: Blender scene, selection, training, splats that follow the mesh."""
+"""Demo with few of its capture's images: Blender scene, selection, training, splats that follow the
+mesh."""
 
 import json
 
@@ -24,7 +25,11 @@ def unpack_few(folder):
     unpack_capture(folder)
     for path in folder.glob("transforms*.json"):
         document = read_json(path)
-        few = [f for f in document["frames"] if f["timestep_index"] in TIMESTEPS and f["camera_index"] in CAMERAS]
+        few = [
+            f
+            for f in document["frames"]
+            if f["timestep_index"] in TIMESTEPS and f["camera_index"] in CAMERAS
+        ]
         for frame in few:
             factor = WIDTH / frame["w"]
             frame |= {name: factor * frame[name] for name in ("fl_x", "fl_y", "cx", "cy")}
@@ -69,7 +74,10 @@ def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, caps
 
     adapter = gpu_device.device().name
     monkeypatch.setattr(run, "unpack_capture", unpack_few)
-    assert main(["demo", "--out", str(tmp_path), "--iterations", "4", "--device", f"gpu:{adapter}"]) == 0
+    assert (
+        main(["demo", "--out", str(tmp_path), "--iterations", "4", "--device", f"gpu:{adapter}"])
+        == 0
+    )
     assert f"Training on {adapter}" in capsys.readouterr().out
     assert read_run(tmp_path / "run").device == f"gpu:{adapter}"
     assert read_metrics(tmp_path / "run")[-1]["iteration"] == 4
@@ -87,10 +95,17 @@ def test_the_blend_file_opens_with_head_groups_and_splats(demo):
     assert heads[0].hide_get(), "the head covers its splats"
     assert [group for group in heads[0].vertex_groups if group.name.startswith("stga_")]
     assert sum(thing.type == "CAMERA" for thing in bpy.data.objects) == len(CAMERAS)
-    views = [area.spaces.active for screen in bpy.data.screens for area in screen.areas if area.type == "VIEW_3D"]
+    views = [
+        area.spaces.active
+        for screen in bpy.data.screens
+        for area in screen.areas
+        if area.type == "VIEW_3D"
+    ]
     assert views
     pose = np.array(heads[0].matrix_world)
     center = pose[:3, :3] @ np.mean(heads[0].bound_box, axis=0) + pose[:3, 3]
     for region in (view.region_3d for view in views):
-        assert np.linalg.norm(np.subtract(region.view_location, center)) < 0.05, "the viewport looks beside the head"
+        assert np.linalg.norm(np.subtract(region.view_location, center)) < 0.05, (
+            "the viewport looks beside the head"
+        )
         assert region.view_distance < 1, "the head is a dot on Blender's grid"

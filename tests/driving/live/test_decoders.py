@@ -1,4 +1,5 @@
-"""Decoders of live sources, against bytes written from the layouts and against independent encoders."""
+"""Decoders of live sources, against bytes written from the layouts and against independent
+encoders."""
 
 import math
 import struct
@@ -22,8 +23,8 @@ def as_dict(weights) -> dict[str, float]:
 
 
 def test_live_link_face():
-    """Catches values at the place of the CSV's columns, where jaw and mouth have the right first, a time in frames, and
-    head angles taken from the eyes."""
+    """Catches values at the place of the CSV's columns, where jaw and mouth have the right first, a
+    time in frames, and head angles taken from the eyes."""
     weights = wire.mixed(0)
     packet = link.decode(wire.live_link_face(weights, 120, (0.1, -0.2, 0.3), "Änne"))
     assert packet is not None
@@ -34,13 +35,16 @@ def test_live_link_face():
 
 
 def test_live_link_face_with_other_counts():
-    """Catches senders of 51 or 52 shapes that are refused, and a packet without a face that is taken as one at rest."""
+    """Catches senders of 51 or 52 shapes that are refused, and a packet without a face that is
+    taken as one at rest."""
     weights = wire.mixed(1)
     packet = link.decode(wire.live_link_face(weights, count=51))
     assert as_dict(packet.weights) == pytest.approx({**weights, "tongueOut": 0.0})
     assert packet.head is None
     assert "tongueOut" not in packet.names
-    assert as_dict(link.decode(wire.live_link_face(weights, count=52)).weights) == pytest.approx(weights)
+    assert as_dict(link.decode(wire.live_link_face(weights, count=52)).weights) == pytest.approx(
+        weights
+    )
     for absent in (wire.live_link_face({}, count=0), wire.live_link_face({}, count=0) + b"\0"):
         packet = link.decode(absent)
         assert packet is not None
@@ -49,13 +53,18 @@ def test_live_link_face_with_other_counts():
 
 
 def test_packets_of_pylivelinkface():
-    """Catches a header that is read little-endian, as that library writes it: version as four bytes, then '$', which is
-    the first byte of a length of 36. Its layout, written here from its source of version 0.1."""
+    """Catches a header that is read little-endian, as that library writes it: version as four
+    bytes, then '$', which is the first byte of a length of 36. Its layout, written here from its
+    source of version 0.1."""
     device = "$" + "12345678-1234-1234-1234-123456789abc"
     name = b"Python_LiveLinkFace"
     values = np.linspace(0, 1, 61)
     data = struct.pack("<I", 6) + device.encode() + struct.pack("!i", len(name)) + name
-    data += struct.pack("!II", 600, 1056060032) + struct.pack("!II", 60, 1) + struct.pack("!B61f", 61, *values)
+    data += (
+        struct.pack("!II", 600, 1056060032)
+        + struct.pack("!II", 60, 1)
+        + struct.pack("!B61f", 61, *values)
+    )
     packet = link.decode(data)
     assert packet.subject == name.decode()
     assert packet.time == pytest.approx((600 + 0.47295) / 60, abs=1e-5)
@@ -63,7 +72,8 @@ def test_packets_of_pylivelinkface():
 
 
 def test_facial_mocap():
-    """Catches percent taken as weights, degrees as radians, pitch as yaw, and the second version's separator."""
+    """Catches percent taken as weights, degrees as radians, pitch as yaw, and the second version's
+    separator."""
     weights = {name: round(value, 2) for name, value in wire.mixed(2).items()}
     for separator in "-&":
         packet = read_performance.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
@@ -79,32 +89,44 @@ def osc_text(text: str) -> bytes:
 
 
 def blend(name: str, value: float) -> bytes:
-    return osc_text("/VMC/Ext/Blend/Val") + osc_text(",sf") + osc_text(name) + struct.pack(">f", value)
+    return (
+        osc_text("/VMC/Ext/Blend/Val") + osc_text(",sf") + osc_text(name) + struct.pack(">f", value)
+    )
 
 
 APPLY = osc_text("/VMC/Ext/Blend/Apply") + osc_text(",")
 
 
 def bundle(*messages: bytes) -> bytes:
-    return osc_text("#bundle") + struct.pack(">Q", 1) + b"".join(struct.pack(">i", len(m)) + m for m in messages)
+    return (
+        osc_text("#bundle")
+        + struct.pack(">Q", 1)
+        + b"".join(struct.pack(">i", len(m)) + m for m in messages)
+    )
 
 
 def test_vmc_by_hand():
-    """Catches values that count before they are applied, are forgotten between two datagrams, or of VRM's own
-    expressions, whose A is no shape of ARKit."""
+    """Catches values that count before they are applied, are forgotten between two datagrams, or of
+    VRM's own expressions, whose A is no shape of ARKit."""
     packet, known = vmc.decode(bundle(blend("JawOpen", 0.5), blend("A", 1.0)), vmc.Received())
     assert packet is None
-    packet, known = vmc.decode(bundle(blend("MouthSmile_L", 0.25), bundle(blend("cheekPuff", 0.75), APPLY)), known)
+    packet, known = vmc.decode(
+        bundle(blend("MouthSmile_L", 0.25), bundle(blend("cheekPuff", 0.75), APPLY)), known
+    )
     expected = {"jawOpen": 0.5, "mouthSmileLeft": 0.25, "cheekPuff": 0.75}
     assert {name: value for name, value in as_dict(packet.weights).items() if value} == expected
     assert set(packet.names) == set(expected)
     packet, _ = vmc.decode(bundle(blend("jawOpen", 0.0), APPLY), known)
     assert as_dict(packet.weights)["cheekPuff"] == 0.75
-    assert vmc.decode(osc_text("/avatar/x") + osc_text(",f") + struct.pack(">f", 1), vmc.Received()) is None
+    assert (
+        vmc.decode(osc_text("/avatar/x") + osc_text(",f") + struct.pack(">f", 1), vmc.Received())
+        is None
+    )
 
 
 def test_vmc_with_python_osc():
-    """Catches what bytes by hand and decoder get wrong together: python-osc writes the datagrams."""
+    """Catches what bytes by hand and decoder get wrong together: python-osc writes the
+    datagrams."""
     message = pytest.importorskip("pythonosc.osc_message_builder")
     bundles = pytest.importorskip("pythonosc.osc_bundle_builder")
     weights, known = wire.mixed(3), vmc.Received()
@@ -129,7 +151,8 @@ def test_vmc_with_python_osc():
 
 @pytest.mark.parametrize("axis", range(3))
 def test_vmc_head(axis):
-    """Catches Unity's left-handed axes: a quaternion about x nods alike, about y and z turns the other way."""
+    """Catches Unity's left-handed axes: a quaternion about x nods alike, about y and z turns the
+    other way."""
     angle = 0.3
     quaternion = np.array([0.0, 0.0, 0.0, math.cos(angle / 2)])
     quaternion[axis] = math.sin(angle / 2)
@@ -169,7 +192,11 @@ def test_ten_thousand_malformed_packets():
         data = malformed(rng)
         decoded = vmc.decode(data, known)
         known = known if decoded is None else decoded[1]
-        for packet in (link.decode(data), read_performance.parse_packet(data), decoded and decoded[0]):
+        for packet in (
+            link.decode(data),
+            read_performance.parse_packet(data),
+            decoded and decoded[0],
+        ):
             if packet is not None and packet.weights is not None:
                 assert np.isfinite(packet.weights).all()
                 assert packet.time is None or math.isfinite(packet.time)

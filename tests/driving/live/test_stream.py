@@ -37,8 +37,8 @@ def shown(stream: Stream) -> float:
 
 
 def test_late_doubled_and_lost_packets():
-    """Catches a head that jumps back in time, packets that count twice, and losses that are not counted: rows of half
-    the rate of the clock are no losses."""
+    """Catches a head that jumps back in time, packets that count twice, and losses that are not
+    counted: rows of half the rate of the clock are no losses."""
     stream = Stream(LINK)
     order = [0, 2, 4, 8, 6, 8, 10, 16]
     for number, frame in enumerate(order):
@@ -76,8 +76,8 @@ def test_a_face_that_leaves_the_picture():
 
 
 def test_two_phones_on_one_port():
-    """Catches a head that trembles between two faces, one that cannot be handed over, and one that waits for a phone
-    that is gone."""
+    """Catches a head that trembles between two faces, one that cannot be handed over, and one that
+    waits for a phone that is gone."""
     stream = Stream(LINK)
     for frame in range(60):
         stream.receive("10.0.0.5", jaw(frame, 0.1, subject="A"), frame / 60)
@@ -94,10 +94,13 @@ def test_two_phones_on_one_port():
 
 
 def test_rate_and_delay():
-    """Catches a rate that is not that of the last seconds, and a delay that grows with the clocks' difference."""
+    """Catches a rate that is not that of the last seconds, and a delay that grows with the clocks'
+    difference."""
     stream = Stream(LINK)
     for frame in range(300):
-        stream.receive("a", jaw(1_000_000 + frame, 0.5), frame / 60 + (0.05 if frame == 299 else 0.0))
+        stream.receive(
+            "a", jaw(1_000_000 + frame, 0.5), frame / 60 + (0.05 if frame == 299 else 0.0)
+        )
     health = stream.health(5.0)
     assert health.rate == pytest.approx(60, rel=0.03)
     assert health.delay_s == pytest.approx(0.05, abs=1e-3)
@@ -115,7 +118,8 @@ def test_nothing_grows():
 
 
 def test_on_loopback(monkeypatch):
-    """Catches a socket that waits, listens where it was not told to, or holds Blender up while it is flooded."""
+    """Catches a socket that waits, listens where it was not told to, or holds Blender up while it
+    is flooded."""
     monkeypatch.setattr("stga_addon.driving.live.sources.MAX_DATAGRAMS", 50)
     receiver = Receiver(LINK, port=free_port())
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -178,9 +182,12 @@ def test_addresses():
 
 
 def test_recording():
-    """Catches a take that has arrival times, a resting face that is not taken off, and sides exchanged twice."""
+    """Catches a take that has arrival times, a resting face that is not taken off, and sides
+    exchanged twice."""
     stream = Stream(LINK)
-    first = stream.receive("a", wire.live_link_face({"jawOpen": 0.2, "mouthLeft": 0.3}, 0, (0.1, 0, 0)), 0.0)
+    first = stream.receive(
+        "a", wire.live_link_face({"jawOpen": 0.2, "mouthLeft": 0.3}, 0, (0.1, 0, 0)), 0.0
+    )
     recording = Recording(7, resting([first]), ("mouth",))
     for frame in (0, 1, 2, 5):
         data = wire.live_link_face({"jawOpen": 1.0, "mouthLeft": 0.5}, 100 + frame, (0.4, 0, 0))
@@ -195,17 +202,22 @@ def test_recording():
     assert Recording(0, None).performance() is None
 
 
-@pytest.mark.parametrize("jump", ["app restarted", "midnight", "another sender", "clock set forward"])
+@pytest.mark.parametrize(
+    "jump", ["app restarted", "midnight", "another sender", "clock set forward"]
+)
 def test_a_recording_goes_on_where_the_clock_jumps(jump, tmp_path):
-    """Catches packets that are left out, a take as long as two clocks are apart, and a CSV that cannot be read back.
-    Packets arrive two at once, and those around the jump while Blender is busy."""
+    """Catches packets that are left out, a take as long as two clocks are apart, and a CSV that
+    cannot be read back. Packets arrive two at once, and those around the jump while Blender is
+    busy."""
     stream, recording = Stream(LINK), Recording(1, None)
     day = 24 * 3600 * 60
     change = {"app restarted": -500_000, "midnight": -day}.get(jump, 79_001 * 60)
     for number in range(60):
         subject = "B" if jump == "another sender" and number >= 30 else "A"
         stream.follow(("a", subject))
-        data = jaw(day - 30 + number + (change if number >= 30 else 0), number / 100, subject=subject)
+        data = jaw(
+            day - 30 + number + (change if number >= 30 else 0), number / 100, subject=subject
+        )
         now = 1000 + (40 if 20 < number < 40 else number | 1) / 60
         recording.add(stream.receive("a", data, now), now)
     write_performance(tmp_path / "take.csv", recording.performance())
@@ -230,9 +242,12 @@ def test_vmc_whose_clock_stands_still(sent):
 
 
 def test_smoothing():
-    """Catches a filter that depends on the rate of the packets: a step is 63 % done after its time constant."""
+    """Catches a filter that depends on the rate of the packets: a step is 63 % done after its time
+    constant."""
     stream = Stream(LINK)
-    low, high = (row_of(stream.receive("a", jaw(f, value), 0.0)) for f, value in ((0, 0.0), (1, 1.0)))
+    low, high = (
+        row_of(stream.receive("a", jaw(f, value), 0.0)) for f, value in ((0, 0.0), (1, 1.0))
+    )
     for rate in (30, 120):
         row = low
         for _ in range(rate // 10):

@@ -21,22 +21,33 @@ def live_link_face(
     count: int = 61,
     rate: int = 60,
 ) -> bytes:
-    """Big-endian: version 6; device and subject with their lengths; frame, subframe, rate, denominator; the values."""
+    """Big-endian: version 6; device and subject with their lengths; frame, subframe, rate,
+    denominator; the values."""
     values = [weights.get(name, 0.0) for name in UDP_ORDER] + [*head] + [0.0] * 6
-    names = b"".join(struct.pack(">i", len(text.encode())) + text.encode() for text in (device, subject))
+    names = b"".join(
+        struct.pack(">i", len(text.encode())) + text.encode() for text in (device, subject)
+    )
     time = struct.pack(">ifii", frame, 0.25, rate, 1)
     body = struct.pack(f">B{count}f", count, *values[:count]) if count else b""
     return b"\x06" + names + time + body
 
 
-def facial_mocap(weights: dict[str, float], head: tuple[float, ...] = (0, 0, 0), separator: str = "-") -> bytes:
+def facial_mocap(
+    weights: dict[str, float], head: tuple[float, ...] = (0, 0, 0), separator: str = "-"
+) -> bytes:
     """Percent; pitch, yaw and roll in degrees, and a position."""
     fields = []
     for name in ARKIT_SHAPES:
-        spelled = name.replace("Left", "_L").replace("Right", "_R") if name.endswith(("Left", "Right")) else name
+        spelled = (
+            name.replace("Left", "_L").replace("Right", "_R")
+            if name.endswith(("Left", "Right"))
+            else name
+        )
         fields.append(f"{spelled}{separator}{round(100 * weights.get(name, 0.0))}")
     angles = ",".join(f"{value}" for value in head)
-    return ("|".join(fields) + f"|=head#{angles},0.1,0.2,-0.3|rightEye#1,2,0|leftEye#1,2,0|").encode()
+    return (
+        "|".join(fields) + f"|=head#{angles},0.1,0.2,-0.3|rightEye#1,2,0|leftEye#1,2,0|"
+    ).encode()
 
 
 def mixed(seed: int) -> dict[str, float]:

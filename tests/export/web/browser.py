@@ -31,10 +31,12 @@ def find_browser() -> str | None:
 
 
 class Browser:
-    """One browser window. `requests` are the addresses that pages asked for, `errors` what they complained of."""
+    """One browser window. `requests` are the addresses that pages asked for, `errors` what they
+    complained of."""
 
     def __init__(self, executable: str, profile: Path, size: tuple[int, int] = (900, 700)) -> None:
-        """`executable`: of a Chromium (`find_browser`); `profile`: folder of its own files; `size` in pixels."""
+        """`executable`: of a Chromium (`find_browser`); `profile`: folder of its own files; `size`
+        in pixels."""
         out_read, self._out = os.pipe()
         self._in, in_write = os.pipe()
 
@@ -87,11 +89,15 @@ class Browser:
         self.requests.clear()
         self.errors.clear()
         self.send("Page.navigate", url=address)
-        self.evaluate("new Promise(r => document.readyState === 'complete' ? r() : addEventListener('load', r))")
+        self.evaluate(
+            "new Promise(r => document.readyState === 'complete' ? r() : addEventListener('load', r))"
+        )
 
     def evaluate(self, expression: str) -> Any:
         """Value of a JavaScript expression; promises are awaited."""
-        result = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        result = self.send(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
 
@@ -99,7 +105,9 @@ class Browser:
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))
             if not ready:
-                raise TimeoutError(f"no answer from the browser within {TIMEOUT_S:g} s; errors: {self.errors}")
+                raise TimeoutError(
+                    f"no answer from the browser within {TIMEOUT_S:g} s; errors: {self.errors}"
+                )
             part = os.read(self._in, 1 << 20)
             assert part, "the browser has closed"
             self._buffer += part
@@ -111,6 +119,8 @@ class Browser:
         if event.get("method") == "Network.requestWillBeSent":
             self.requests.append(details["request"]["url"])
         if event.get("method") == "Runtime.exceptionThrown":
-            self.errors.append(details["exceptionDetails"].get("exception", {}).get("description", "exception"))
+            self.errors.append(
+                details["exceptionDetails"].get("exception", {}).get("description", "exception")
+            )
         if event.get("method") == "Log.entryAdded" and details["entry"]["level"] == "error":
             self.errors.append(details["entry"]["text"])

@@ -28,7 +28,8 @@ READY = """new Promise((done) => {
 })"""
 
 
-@pytest.fixture(scope="module")  # not longer: the page would go on playing, on software graphics, beside other tests
+# not longer: the page would go on playing, on software graphics, beside other tests
+@pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     opened = Browser(str(find_browser()), tmp_path_factory.mktemp("profile"), (500, 400))
     yield opened
@@ -55,9 +56,13 @@ class Head:
     def rig(self) -> WebRig:
         return flame_rig(self.sequence)
 
-    def data(self, rig: WebRig | None = None, exact: bool = False, controls: ShapeControls | None = None) -> bytes:
+    def data(
+        self, rig: WebRig | None = None, exact: bool = False, controls: ShapeControls | None = None
+    ) -> bytes:
         views = {"front": self.camera}
-        playback = Playback(title="Zoë", fps=2.0, views=views, selection=self.selection, controls=controls)
+        playback = Playback(
+            title="Zoë", fps=2.0, views=views, selection=self.selection, controls=controls
+        )
         return data_file(self.avatar, rig or self.rig, playback, exact)
 
     @property
@@ -73,7 +78,8 @@ def make_head(
     strain: bool = True,
     strain_position: bool = False,
 ) -> Head:
-    """strain: whether colors follow it; strain_position: whether splats move with it, as far as they spread."""
+    """strain: whether colors follow it; strain_position: whether splats move with it, as far as
+    they spread."""
     model = small_head(0)
     rng = np.random.default_rng(3)
     frames = [
@@ -94,7 +100,11 @@ def make_head(
     unit = 1.0 if convention == "gaussian_avatars" else 0.005
     splats = random_splats(5, SPLATS, len(model.faces), sh_degree)
     object.__setattr__(splats, "xyz", splats.xyz * np.float32(0.3 * unit))
-    object.__setattr__(splats, "log_scale", splats.log_scale * np.float32(0.3) + np.float32(np.log(0.8 * unit) + 1.2))
+    object.__setattr__(
+        splats,
+        "log_scale",
+        splats.log_scale * np.float32(0.3) + np.float32(np.log(0.8 * unit) + 1.2),
+    )
     object.__setattr__(splats, "sh", splats.sh * np.float32(0.3))
     if strain:
         strain_color = rng.normal(0, 0.1, (SPLATS, 3, 3)).astype(np.float32)

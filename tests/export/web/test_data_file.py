@@ -17,24 +17,34 @@ from .web_data import read_web_data, splats_of
 
 
 def test_fixed_point_errs_by_half_a_step():
-    """Catches planes in the wrong order, a lost sign, and outliers that take the precision of the others."""
+    """Catches planes in the wrong order, a lost sign, and outliers that take the precision of the
+    others."""
     values = np.random.default_rng(0).normal(size=(50, 3)) * [1, 1e3, 1e-3]
-    _, arrays = read_web_data(pack({}, {"a": FixedPoint(values, 1e-3), "b": np.array([[-70000, 3], [4, 5]])}))
+    _, arrays = read_web_data(
+        pack({}, {"a": FixedPoint(values, 1e-3), "b": np.array([[-70000, 3], [4, 5]])})
+    )
     assert np.abs(arrays["a"] - values).max() <= 0.5e-3 + 1e-4  # float32 of values near 3,000
     assert np.array_equal(arrays["b"], [[-70000, 3], [4, 5]])
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
 def test_values_that_no_step_holds(bad, head, tmp_path):
-    """Catches a page that plays garbage, or half a file, where the avatar holds a value that cannot be stored."""
+    """Catches a page that plays garbage, or half a file, where the avatar holds a value that cannot
+    be stored."""
     splats = replace(head.avatar.splats, xyz=np.full_like(head.avatar.splats.xyz, bad))
     with pytest.raises(StgaError, match="xyz"):
-        write_web(tmp_path / "a.html", replace(head.avatar, splats=splats), Playback(), sequence=head.sequence)
+        write_web(
+            tmp_path / "a.html",
+            replace(head.avatar, splats=splats),
+            Playback(),
+            sequence=head.sequence,
+        )
     assert not list(tmp_path.iterdir())
 
 
 def test_splats_come_back_within_their_steps(head):
-    """Catches a field that is quantized by another field's step, or splats that land on another triangle."""
+    """Catches a field that is quantized by another field's step, or splats that land on another
+    triangle."""
     _, arrays = read_web_data(head.data())
     order = np.argsort(head.avatar.splats.face, kind="stable")
     original, found = head.avatar.splats.rows(order), splats_of(arrays)
@@ -44,20 +54,28 @@ def test_splats_come_back_within_their_steps(head):
     assert np.abs(np.abs((found.rotation * unit).sum(1)) - 1).max() < 1e-5
     assert np.abs(found.log_scale - original.log_scale).max() <= data_file.LOG_SCALE_STEP / 2 + 1e-6
     assert np.abs(found.sh[:, 1:] - original.sh[:, 1:]).max() <= data_file.SH_STEP / 2 + 1e-6
-    assert np.abs(found.strain_color - original.strain_color).max() <= data_file.STRAIN_COLOR_STEP / 2 + 1e-6
-    selected = np.unpackbits(arrays["selection"].astype(np.uint8), axis=1)[:, : len(head.avatar.faces)]
+    assert (
+        np.abs(found.strain_color - original.strain_color).max()
+        <= data_file.STRAIN_COLOR_STEP / 2 + 1e-6
+    )
+    selected = np.unpackbits(arrays["selection"].astype(np.uint8), axis=1)[
+        :, : len(head.avatar.faces)
+    ]
     assert np.array_equal(selected.astype(bool), head.selection)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 @pytest.mark.parametrize("strain", [False, True])
 def test_strain_moves_splats_by_less_than_their_own_step(convention, strain):
-    """Catches vectors stored in another unit or order, and a range that is left out where no color needs it."""
+    """Catches vectors stored in another unit or order, and a range that is left out where no color
+    needs it."""
     head = make_head(convention, strain=strain, strain_position=True)
     avatar = head.avatar
     _, arrays = read_web_data(head.data())
     assert ("strain_color" in arrays) == strain
-    assert np.abs(arrays["strain_range"].reshape(-1, 2, 3) - avatar.strain_range).max() <= 0.001 + 1e-6
+    assert (
+        np.abs(arrays["strain_range"].reshape(-1, 2, 3) - avatar.strain_range).max() <= 0.001 + 1e-6
+    )
     unit = avatar.frames(avatar.neutral).scale.max()
     found = arrays["strain_position"].reshape(-1, 3, 3)
     assert (
@@ -67,8 +85,12 @@ def test_strain_moves_splats_by_less_than_their_own_step(convention, strain):
     stored = replace(avatar, driven_offsets={"strain_position": found})
     for mesh in head.meshes:
         expected = avatar.frames(mesh)
-        moved = np.linalg.norm(expected.origin - replace(avatar, driven_offsets={}).frames(mesh).origin, axis=1)
-        error = np.abs(stored.frames(mesh).origin - expected.origin).max(1) / np.maximum(expected.scale / unit, 1)
+        moved = np.linalg.norm(
+            expected.origin - replace(avatar, driven_offsets={}).frames(mesh).origin, axis=1
+        )
+        error = np.abs(stored.frames(mesh).origin - expected.origin).max(1) / np.maximum(
+            expected.scale / unit, 1
+        )
         assert moved.max() > 100 * data_file.POSITION_STEP_M
         assert error.max() < data_file.POSITION_STEP_M / 4
 
@@ -79,7 +101,8 @@ def test_equal_avatars_give_equal_bytes(head):
 
 
 def test_baked_meshes_come_back(head):
-    """Catches a lost mean, rotation or component of a baked sequence, and a baked rig that has sliders."""
+    """Catches a lost mean, rotation or component of a baked sequence, and a baked rig that has
+    sliders."""
     rig = baked_rig(list(head.meshes))
     angles = np.linalg.norm(rig.pose[:, 0], axis=1)
     assert angles.max() < 1
@@ -87,15 +110,24 @@ def test_baked_meshes_come_back(head):
         shaped = rig.base + np.einsum("r,rvc->vc", rig.coefficients[frame], rig.basis)
         x, y, z = rig.pose[frame, 0] / max(angles[frame], 1e-12)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        turn = np.eye(3) + np.sin(angles[frame]) * cross + (1 - np.cos(angles[frame])) * cross @ cross
+        turn = (
+            np.eye(3) + np.sin(angles[frame]) * cross + (1 - np.cos(angles[frame])) * cross @ cross
+        )
         assert np.abs(shaped @ turn.T + rig.translation[frame] - mesh).max() <= BAKE_TOLERANCE_M
     assert rig.expressions == 0
     assert np.abs(rig.coefficients).max() <= 1 + 1e-9
 
 
 def test_motion_only_leaves_the_rig_out(head, tmp_path):
-    """Catches FLAME's blend shapes in a file that was asked for without them, and a page that does not name them."""
-    write_web(tmp_path / "a.stga", head.avatar, Playback(motion_only=True), list(head.meshes), head.sequence)
+    """Catches FLAME's blend shapes in a file that was asked for without them, and a page that does
+    not name them."""
+    write_web(
+        tmp_path / "a.stga",
+        head.avatar,
+        Playback(motion_only=True),
+        list(head.meshes),
+        head.sequence,
+    )
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert header["sliders"] == []
     assert arrays["weights"].shape[1] == 1
@@ -105,8 +137,8 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
 
 
 def test_pages_of_flame_meshes_name_flames_licence(head, tmp_path):
-    """Catches a page without FLAME's rig that keeps quiet about FLAME's triangles and meshes in it, and one of any
-    other head that names FLAME's licence."""
+    """Catches a page without FLAME's rig that keeps quiet about FLAME's triangles and meshes in it,
+    and one of any other head that names FLAME's licence."""
     path = tmp_path / "a.html"
 
     def notice(avatar, sequence):
@@ -129,7 +161,8 @@ def test_no_data_without_its_player(head, tmp_path):
 
 
 def test_every_module_is_in_the_page():
-    """Catches a module of the player that is not joined into the page, or an import that is left in it."""
+    """Catches a module of the player that is not joined into the page, or an import that is left in
+    it."""
     assert {path.name for path in PLAYER.glob("*.js")} == {*modules(), PAGE}
     assert "\nimport " not in element_script()
     assert "MIT" in element_script()[:100]

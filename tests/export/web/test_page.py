@@ -1,4 +1,5 @@
-"""The page in a real browser: its pictures against the renderer, its interface, and damaged data."""
+"""The page in a real browser: its pictures against the renderer, its interface, and damaged
+data."""
 
 import base64
 import io
@@ -27,10 +28,11 @@ pytestmark = pytest.mark.needs("chromium")
 
 MIN_PSNR, MIN_EXCHANGED_PSNR = 55.0, 45.0
 MIN_QUANTIZED_PSNR = 58.0
-"""Quantized against unquantized, of opaque splats with random colors. Trained heads reach 60 dB and more."""
+"""Quantized against unquantized, of opaque splats with random colors. Trained heads reach 60 dB and
+more."""
 MIN_EXACT_PSNR = 68.0
-"""Unquantized. Splats placed on the driver's grid of 1/16 pixel, as interpolated offsets are, lower it to 58 dB; colors
-in half floats take some dB of the rest."""
+"""Unquantized. Splats placed on the driver's grid of 1/16 pixel, as interpolated offsets are, lower
+it to 58 dB; colors in half floats take some dB of the rest."""
 SNAPSHOT = """(async () => {
   const avatar = document.querySelector('stga-avatar');
   avatar.player.frame = avatar.frame = %d;
@@ -69,14 +71,23 @@ def psnr(browser: Browser, head: Head, frame: int) -> float:
     [
         ({}, True),
         ({}, False),
-        ({"convention": "gaussian_avatars", "sh_degree": 1, "strain": False, "antialiased": False}, True),
+        (
+            {
+                "convention": "gaussian_avatars",
+                "sh_degree": 1,
+                "strain": False,
+                "antialiased": False,
+            },
+            True,
+        ),
         ({"strain_position": True}, True),
         ({"strain_position": True}, False),
         ({"convention": "gaussian_avatars", "strain": False, "strain_position": True}, False),
     ],
 )
 def test_picture_is_the_renderers(options, exact, browser, tmp_path):
-    """Catches a difference of projection, position, color, blending or quantization, and any request of the page."""
+    """Catches a difference of projection, position, color, blending or quantization, and any
+    request of the page."""
     head = make_head(**options)
     show(browser, tmp_path, head.data(exact=exact))
     found = sorted(psnr(browser, head, frame) for frame in range(3))
@@ -98,8 +109,8 @@ def test_baked_meshes_play_as_rendered(browser, head, tmp_path):
 
 @pytest.mark.slow
 def test_a_capture_plays_as_rendered(browser, shared_data, tmp_path):
-    """Catches a page that differs from the renderer on the size, cameras and meshes of a capture, and steps of the data
-    file that are coarse enough to be seen."""
+    """Catches a page that differs from the renderer on the size, cameras and meshes of a capture,
+    and steps of the data file that are coarse enough to be seen."""
     capture = open_capture(shared_data / "studio_head")
     splats = initial_splats(capture, make_settings(iterations=1, strain_color=True))
     rng = np.random.default_rng(0)
@@ -109,7 +120,9 @@ def test_a_capture_plays_as_rendered(browser, shared_data, tmp_path):
         sh=splats.sh + rng.normal(0, 0.05, splats.sh.shape).astype(np.float32),
         strain_color=rng.normal(0, 0.03, splats.strain_color.shape).astype(np.float32),
     )
-    avatar = Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces, antialiased=True)
+    avatar = Avatar(
+        splats, "stga", capture.neutral.astype(np.float32), capture.faces, antialiased=True
+    )
     views = [capture.views["val"][0], capture.views["test"][20]]
     meshes = [capture.mesh(view.timestep) for view in views]
     playback = Playback(title="Studio", fps=2.0, views={"a": views[0].camera, "b": views[1].camera})
@@ -124,7 +137,8 @@ def test_a_capture_plays_as_rendered(browser, shared_data, tmp_path):
 
 
 def test_controls(browser, head, tmp_path):
-    """Catches a slider, key or property of the page that does nothing, or something else than it says."""
+    """Catches a slider, key or property of the page that does nothing, or something else than it
+    says."""
     show(browser, tmp_path, head.data())
     found = browser.evaluate("""(() => {
       const avatar = document.querySelector('stga-avatar');
@@ -152,7 +166,9 @@ def test_controls(browser, head, tmp_path):
     })()""")
     assert found["sliders"] == head.sequence.model.n_expression + 6
     assert (found["pinned"], found["value"], found["frame"], found["shown"]) == (1, 0.5, 2, True)
-    assert found["shown_value"] == pytest.approx(head.rig.coefficients[2, found["played"]], abs=0.006)
+    assert found["shown_value"] == pytest.approx(
+        head.rig.coefficients[2, found["played"]], abs=0.006
+    )
     assert found["jaw"] == pytest.approx(0.3)
     assert found["notice"] == "3 / 3"
     assert np.allclose(found["before"], head.camera.world_to_camera.ravel())
@@ -173,7 +189,10 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
     "cut in the heading": (lambda page: cut(page, '<p id="facts">Load'), INCOMPLETE),
     "cut in the script": (lambda page: cut(page, '<script type="module">', 9000), INCOMPLETE),
     "script altered": (lambda page: page.replace("class Player {", "class Player {{"), INCOMPLETE),
-    "script altered elsewhere": (lambda page: page.replace("function addViews(", "function addView("), INCOMPLETE),
+    "script altered elsewhere": (
+        lambda page: page.replace("function addViews(", "function addView("),
+        INCOMPLETE,
+    ),
     "no data": (
         lambda page: re.sub(r'<script [^>]*id="data">.*?</script>', "", page),
         "This page holds no avatar data.",
@@ -182,8 +201,14 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
     "no base64": (lambda page: re.sub(DATA, "H4sI%%", page), "The avatar data is damaged."),
     "other data": (lambda page: re.sub(DATA, "AAAA", page), "This is not an avatar data file."),
     "cut at the data": (lambda page: cut(page, 'id="data">'), "This page holds no avatar data."),
-    "cut in the data": (lambda page: cut(page, 'id="data">', 40_000), "The avatar data is damaged."),
-    "cut to odd base64": (lambda page: cut(page, 'id="data">', 40_001), "The avatar data is damaged."),
+    "cut in the data": (
+        lambda page: cut(page, 'id="data">', 40_000),
+        "The avatar data is damaged.",
+    ),
+    "cut to odd base64": (
+        lambda page: cut(page, 'id="data">', 40_001),
+        "The avatar data is damaged.",
+    ),
 }
 SHOWN = """(() => {
   const message = document.querySelector('stga-avatar')?.shadowRoot?.querySelector('p');
@@ -199,7 +224,8 @@ def whole_page(head: Head) -> str:
 
 @pytest.mark.parametrize("damage", DAMAGED_PAGES)
 def test_damaged_pages_show_a_sentence(damage, whole_page, browser, tmp_path):
-    """Catches a page that says that it is loading for ever, stays blank, or whose controls throw."""
+    """Catches a page that says that it is loading for ever, stays blank, or whose controls
+    throw."""
     alter, sentence = DAMAGED_PAGES[damage]
     altered = alter(whole_page)
     assert altered != whole_page
@@ -220,6 +246,8 @@ def test_a_browser_without_webgl2_is_told(browser, head, tmp_path):
         show(browser, tmp_path, head.data())
     finally:
         browser.send("Page.removeScriptToEvaluateOnNewDocument", **added)
-    shown = browser.evaluate("document.querySelector('stga-avatar').shadowRoot.querySelector('p').textContent")
+    shown = browser.evaluate(
+        "document.querySelector('stga-avatar').shadowRoot.querySelector('p').textContent"
+    )
     assert shown == "This page needs WebGL 2, which this browser or graphics driver does not offer."
     assert browser.errors == []

@@ -1,4 +1,5 @@
-"""The page's light in a real browser: colors and pictures against the Python renderer, and the controls."""
+"""The page's light in a real browser: colors and pictures against the Python renderer, and the
+controls."""
 
 from dataclasses import replace
 
@@ -25,7 +26,8 @@ pytestmark = pytest.mark.needs("chromium")
 
 LASHES = 40
 MIN_PSNR = 55.0
-"""Of relit pictures against the renderer's, which also lets the sun's shadow dim the light between skin and skin."""
+"""Of relit pictures against the renderer's, which also lets the sun's shadow dim the light between
+skin and skin."""
 SUN = {"toward": [0.5, 0.6, 0.62], "color": [2.4, 2.1, 1.6]}
 COLORS = """(() => {
   const { gl, lightPass } = document.querySelector('stga-avatar').player;
@@ -39,8 +41,8 @@ COLORS = """(() => {
 
 
 def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> Head:
-    """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes. lashes: around a nose
-    that is wet as well."""
+    """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes.
+    lashes: around a nose that is wet as well."""
     head = make_head(**options)  # type: ignore[arg-type]
     neutral, faces = head.avatar.neutral.astype(np.float64), head.avatar.faces
     transfer, occlusion = transfer_of(neutral, faces, 48)
@@ -51,16 +53,25 @@ def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> H
     eye = lashes & (np.linalg.norm(neutral - neutral[neutral[:, 2].argmax()], axis=1) < 0.012)
     wet = np.where((neutral[:, 0] > 0.05) | eye, 0.2, 0).astype(np.float32)
     light = AvatarLight(
-        radiance.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), wet, 0.05, damping
+        radiance.astype(np.float32),
+        transfer,
+        occlusion,
+        arriving.astype(np.float32),
+        wet,
+        0.05,
+        damping,
     )
     splats = with_lashes(head.avatar, eye) if lashes else head.avatar.splats
     return replace(head, avatar=replace(head.avatar, light=light, splats=splats))
 
 
 def with_lashes(avatar: Avatar, eye: np.ndarray) -> Splats:
-    """The splats of an avatar, the first LASHES of them black and 5 mm above the triangles around an eye (V,) bool."""
+    """The splats of an avatar, the first LASHES of them black and 5 mm above the triangles around
+    an eye (V,) bool."""
     middle, centers = avatar.neutral[eye].mean(0), avatar.neutral[avatar.faces].mean(1)
-    around = np.flatnonzero(~eye[avatar.faces].any(1) & (np.linalg.norm(centers - middle, axis=1) < 0.02))
+    around = np.flatnonzero(
+        ~eye[avatar.faces].any(1) & (np.linalg.norm(centers - middle, axis=1) < 0.02)
+    )
     unit = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention).scale
     splats = avatar.splats.rows(np.arange(len(avatar.splats)))
     chosen = np.resize(around, LASHES)
@@ -81,7 +92,9 @@ def harmonics() -> np.ndarray:
 
 
 def set_lighting(browser: Browser, lighting: str) -> None:
-    browser.evaluate(f"(() => {{ document.querySelector('stga-avatar').lighting = {lighting}; }})()")
+    browser.evaluate(
+        f"(() => {{ document.querySelector('stga-avatar').lighting = {lighting}; }})()"
+    )
 
 
 @pytest.mark.parametrize(
@@ -94,15 +107,21 @@ def set_lighting(browser: Browser, lighting: str) -> None:
     ],
 )
 def test_colors_are_the_relighters(options, exact, browser, tmp_path):
-    """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows (of lashes as well),
-    highlights or a share of recorded colors that differ from Python's, and a picture that shows other colors."""
+    """Catches albedo, harmonics, the turn of the head, light between skin and skin, shadows (of
+    lashes as well), highlights or a share of recorded colors that differ from Python's, and a
+    picture that shows other colors."""
     alike = options.pop("alike", False)
     head = lit_head(lashes=True, **options)
     show(browser, tmp_path, head.data(exact=exact))
     world, sun_light = harmonics(), SUN
     if alike:
-        world, sun_light = head.avatar.light.radiance * np.array([1.2, 1.0, 0.8]), {**SUN, "color": [0.6, 0.45, 0.3]}
-    set_lighting(browser, str({"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5}))
+        world, sun_light = (
+            head.avatar.light.radiance * np.array([1.2, 1.0, 0.8]),
+            {**SUN, "color": [0.6, 0.45, 0.3]},
+        )
+    set_lighting(
+        browser, str({"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5})
+    )
     relighter = Relighter(head.avatar)
     order = np.lexsort((relighter.face, head.avatar.splats.face))
     assert len(relighter.lashes.face) == LASHES
@@ -110,7 +129,9 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     share = relighter.distant_in_head(head.meshes[0], Lighting(world, (sun,)))[1].share
     assert 0.3 < share < 0.95 if alike else share < 0.1
     for frame in (0, 2):
-        colors = relighter.colors(head.meshes[frame], head.camera.position, Lighting(world, (sun,), exposure=0.5))
+        colors = relighter.colors(
+            head.meshes[frame], head.camera.position, Lighting(world, (sun,), exposure=0.5)
+        )
         shown = picture(browser, frame)
         found = np.reshape(browser.evaluate(COLORS), (-1, 4))[:, :3]
         error = np.abs(found - colors[order]).max(1)
@@ -123,8 +144,8 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
 
 
 def test_as_recorded_is_what_a_page_without_light_shows(browser, tmp_path):
-    """Catches a pixel that changes because the light is known, or because it was on before; and data of light in a page
-    of an avatar that has none."""
+    """Catches a pixel that changes because the light is known, or because it was on before; and
+    data of light in a page of an avatar that has none."""
     head = lit_head()
     dark = replace(head, avatar=replace(head.avatar, light=None))
     show(browser, tmp_path, dark.data())
@@ -159,20 +180,28 @@ def test_environments_stand_upright_and_turn(up, browser, tmp_path):
         found.append((np.reshape(light["world"], (9, 3)), np.array(light["sun"]["toward"])))
     (world, toward), (turned_world, turned_toward) = found
     assert toward @ up == pytest.approx(0.28, abs=0.03)
-    quarter = np.cross(np.eye(3), up).T + np.outer(up, up)  # x ↦ up × x, and what lies along `up` stays
-    quarter = np.array([np.cross(up, axis) + np.array(up) * (np.array(up) @ axis) for axis in np.eye(3)]).T
+    # x ↦ up × x, and what lies along `up` stays
+    quarter = np.cross(np.eye(3), up).T + np.outer(up, up)
+    quarter = np.array(
+        [np.cross(up, axis) + np.array(up) * (np.array(up) @ axis) for axis in np.eye(3)]
+    ).T
     np.testing.assert_allclose(turned_toward, quarter @ toward, atol=1e-9)
     np.testing.assert_allclose(turned_world, rotated(world, quarter), atol=1e-9)
 
 
 def test_light_controls(browser, tmp_path):
-    """Catches a control of the section Light that does nothing, and a light that is dragged the wrong way."""
+    """Catches a control of the section Light that does nothing, and a light that is dragged the
+    wrong way."""
     head = lit_head()
     show(browser, tmp_path, head.data())
     assert not browser.evaluate("document.getElementById('light').hidden")
     choose = "(() => {{ const list = document.querySelector('#light select'); list.value = '{}';"
     choose += " list.dispatchEvent(new Event('change')); return document.querySelector('stga-avatar').lighting; }})()"
-    assert browser.evaluate(choose.format("studio")) == {"environment": "studio", "turn": 0, "exposure": 0}
+    assert browser.evaluate(choose.format("studio")) == {
+        "environment": "studio",
+        "turn": 0,
+        "exposure": 0,
+    }
     dragged = browser.evaluate(choose.format("dragged"))
     assert set(dragged) == {"even", "sun", "exposure"}
     assert browser.evaluate("document.querySelector('#light-dragged').hidden") is False
@@ -182,7 +211,11 @@ def test_light_controls(browser, tmp_path):
         levels = picture(browser, 0)
         covered = levels.min(2) < 250
         left, right = np.hsplit(np.where(covered, levels.mean(2), 0), 2)
-        return float(right.sum() / np.hsplit(covered, 2)[1].sum() / (left.sum() / np.hsplit(covered, 2)[0].sum()))
+        return float(
+            right.sum()
+            / np.hsplit(covered, 2)[1].sum()
+            / (left.sum() / np.hsplit(covered, 2)[0].sum())
+        )
 
     box = browser.evaluate("""(() => {
       document.getElementById('panel').hidden = false;
@@ -193,7 +226,12 @@ def test_light_controls(browser, tmp_path):
     })()""")
     shares = []
     for x in (0.15, 0.85):
-        at = {"x": box[0] + x * box[2], "y": box[1] + 0.5 * box[2], "button": "left", "clickCount": 1}
+        at = {
+            "x": box[0] + x * box[2],
+            "y": box[1] + 0.5 * box[2],
+            "button": "left",
+            "clickCount": 1,
+        }
         browser.send("Input.dispatchMouseEvent", type="mousePressed", **at)
         browser.send("Input.dispatchMouseEvent", type="mouseReleased", **at)
         shares.append(side_of_light())
@@ -202,11 +240,23 @@ def test_light_controls(browser, tmp_path):
     before = browser.evaluate("document.querySelector('stga-avatar').camera.matrix.join()")
     for kind, x in (("mousePressed", 200), ("mouseMoved", 100), ("mouseReleased", 100)):
         browser.send(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=150, button="left", buttons=1, modifiers=1, clickCount=1
+            "Input.dispatchMouseEvent",
+            type=kind,
+            x=x,
+            y=150,
+            button="left",
+            buttons=1,
+            modifiers=1,
+            clickCount=1,
         )
     assert side_of_light() < shares[1]
     assert browser.evaluate("document.querySelector('stga-avatar').camera.matrix.join()") == before
-    assert browser.evaluate("getComputedStyle(document.getElementById('light-pad')).getPropertyValue('--x')") != "85%"
+    assert (
+        browser.evaluate(
+            "getComputedStyle(document.getElementById('light-pad')).getPropertyValue('--x')"
+        )
+        != "85%"
+    )
     refused = "(() => {{ try {{ document.querySelector('stga-avatar').lighting = {}; }}"
     refused += " catch (error) {{ return error.message; }} }})()"
     assert "no environment" in browser.evaluate(refused.format("{ environment: 'toString' }"))

@@ -1,4 +1,5 @@
-"""The page in use in a real browser: touch, keys, sliders, a lost graphics context, long play, embedding."""
+"""The page in use in a real browser: touch, keys, sliders, a lost graphics context, long play,
+embedding."""
 
 import functools
 import json
@@ -32,14 +33,16 @@ PLAY_S, PLAY_RATE = 600, 4
 BATCH = 200
 """Pictures drawn at once."""
 MAX_HEAP_GROWTH = 300_000
-"""Bytes that may be left over from a run of pictures: compiled code and the browser's own bookkeeping."""
+"""Bytes that may be left over from a run of pictures: compiled code and the browser's own
+bookkeeping."""
 CAMERA = "[...document.querySelector('stga-avatar').camera.matrix]"
 MIDDLE_IN_CAMERA = """(() => {
   const { player, camera } = document.querySelector('stga-avatar');
   const p = [...player.middle, 1];
   return [0, 1, 2].map((row) => p.reduce((sum, value, k) => sum + camera.matrix[4 * row + k] * value, 0));
 })()"""
-# Counts WebGL objects alive, draws one splat, and lets the test turn the clock of requestAnimationFrame.
+# Counts WebGL objects alive, draws one splat, and lets the test turn the clock of
+# requestAnimationFrame.
 INSTRUMENTS = """
 window.alive = 0;
 const prototype = WebGL2RenderingContext.prototype;
@@ -74,13 +77,23 @@ window.playFor = (pictures, rate) => {
 def touch(browser: Browser, *paths: list[tuple[float, float]]) -> None:
     """Fingers that go along `paths` of equal length together (pixels)."""
     for step in range(len(paths[0])):
-        points = [{"x": path[step][0], "y": path[step][1], "id": finger} for finger, path in enumerate(paths)]
-        browser.send("Input.dispatchTouchEvent", type="touchMove" if step else "touchStart", touchPoints=points)
+        points = [
+            {"x": path[step][0], "y": path[step][1], "id": finger}
+            for finger, path in enumerate(paths)
+        ]
+        browser.send(
+            "Input.dispatchTouchEvent",
+            type="touchMove" if step else "touchStart",
+            touchPoints=points,
+        )
     browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
 
 def line(start: tuple[float, float], end: tuple[float, float]) -> list[tuple[float, float]]:
-    return [(start[0] + s * (end[0] - start[0]), start[1] + s * (end[1] - start[1])) for s in np.linspace(0, 1, 6)]
+    return [
+        (start[0] + s * (end[0] - start[0]), start[1] + s * (end[1] - start[1]))
+        for s in np.linspace(0, 1, 6)
+    ]
 
 
 def press(browser: Browser, key: str) -> None:
@@ -141,7 +154,9 @@ def test_keyboard(browser, head, tmp_path):
         assert browser.evaluate(expression) != state, key
     browser.evaluate("document.querySelector('stga-avatar').setExpression(0, 0.5)")
     press(browser, "x")
-    assert browser.evaluate("[...document.querySelector('stga-avatar').player.motion.pinnedCoefficients].every(isNaN)")
+    assert browser.evaluate(
+        "[...document.querySelector('stga-avatar').player.motion.pinnedCoefficients].every(isNaN)"
+    )
     assert browser.errors == []
 
 
@@ -171,7 +186,9 @@ def test_sliders_are_flames(browser, head, tmp_path):
         translation=recorded.translation,
         eyes_pose=recorded.eyes_pose,
     )
-    expected = flame_forward(head.sequence.model, head.sequence.shape, wanted, head.sequence.static_offset)
+    expected = flame_forward(
+        head.sequence.model, head.sequence.shape, wanted, head.sequence.static_offset
+    )
     assert np.abs(np.reshape(found, (-1, 3)) - expected).max() < 1e-5
 
 
@@ -207,7 +224,8 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
 
 @pytest.mark.slow
 def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
-    """Catches textures, buffers and objects that pile up with the frames (ten minutes on an accelerated clock)."""
+    """Catches textures, buffers and objects that pile up with the frames (ten minutes on an
+    accelerated clock)."""
     added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=INSTRUMENTS)
     try:
         show(browser, tmp_path, head.data())
@@ -223,13 +241,21 @@ def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
 
     def played(pictures: int) -> tuple[int, int, int]:
         """Rounds of the motion, WebGL objects alive and bytes of JavaScript afterwards."""
-        rounds = sum(browser.evaluate(f"window.playFor({BATCH}, {PLAY_RATE})") for _ in range(pictures // BATCH))
+        rounds = sum(
+            browser.evaluate(f"window.playFor({BATCH}, {PLAY_RATE})")
+            for _ in range(pictures // BATCH)
+        )
         browser.send("HeapProfiler.collectGarbage")
-        return rounds, browser.evaluate("window.alive"), browser.send("Runtime.getHeapUsage")["usedSize"]
+        return (
+            rounds,
+            browser.evaluate("window.alive"),
+            browser.send("Runtime.getHeapUsage")["usedSize"],
+        )
 
     _, alive_before, heap_before = played(4 * BATCH)  # compiled by then
     rounds, alive, heap = played(PLAY_S * PLAY_RATE)
-    assert rounds == pytest.approx(PLAY_S * 2 / 3, abs=2)  # two recorded frames a second, three in a round
+    # two recorded frames a second, three in a round
+    assert rounds == pytest.approx(PLAY_S * 2 / 3, abs=2)
     assert alive == alive_before
     assert heap < heap_before + MAX_HEAP_GROWTH
     assert browser.errors == []
@@ -243,7 +269,9 @@ def server(tmp_path: Path) -> Iterator[str]:
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, format: str, *values: Any) -> None: ...
 
-    made = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(tmp_path / "site")))
+    made = ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(Quiet, directory=str(tmp_path / "site"))
+    )
     threading.Thread(target=made.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{made.server_port}"
     made.shutdown()
@@ -251,11 +279,14 @@ def server(tmp_path: Path) -> Iterator[str]:
 
 
 def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
-    """Catches a snippet of docs/web.md that does not work as it stands, and an element that loads something else."""
+    """Catches a snippet of docs/web.md that does not work as it stands, and an element that loads
+    something else."""
     site = tmp_path / "site"
     write_web(site / "anna.stga", head.avatar, Playback(title="Anna"), sequence=head.sequence)
     text = (ROOT / "docs/web.md").read_text(encoding="utf-8")
-    markup, script = (re.search(rf"```{kind}\n(.*?)```", text, re.DOTALL)[1] for kind in ("html", "js"))
+    markup, script = (
+        re.search(rf"```{kind}\n(.*?)```", text, re.DOTALL)[1] for kind in ("html", "js")
+    )
     own = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><h1>Our team</h1>'
     (site / "index.html").write_text(f"{own}{markup}<script>{script}</script>", encoding="utf-8")
     browser.open(f"{server}/index.html")
@@ -278,13 +309,20 @@ def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
 
 
 def driven_mesh(head: Head, weights: np.ndarray, angles: np.ndarray | None = None) -> np.ndarray:
-    """Where ARKit weights (52,) put the head in its first recorded place; angles: yaw, pitch, roll of the neck."""
+    """Where ARKit weights (52,) put the head in its first recorded place; angles: yaw, pitch, roll
+    of the neck."""
     turned = None if angles is None else angles[None]
-    (found,) = head_map(head.sequence, "head").frames(Performance(np.zeros(1), weights[None], turned, 60.0))
+    (found,) = head_map(head.sequence, "head").frames(
+        Performance(np.zeros(1), weights[None], turned, 60.0)
+    )
     first = head.sequence.frame(0)
     neck = first.neck_pose if angles is None else found.neck_pose
-    frame = replace(first, expr=found.expr, jaw_pose=found.jaw_pose, eyes_pose=found.eyes_pose, neck_pose=neck)
-    return flame_forward(head.sequence.model, head.sequence.shape, frame, head.sequence.static_offset)
+    frame = replace(
+        first, expr=found.expr, jaw_pose=found.jaw_pose, eyes_pose=found.eyes_pose, neck_pose=neck
+    )
+    return flame_forward(
+        head.sequence.model, head.sequence.shape, frame, head.sequence.static_offset
+    )
 
 
 def vertices(browser: Browser, script: str) -> np.ndarray:
@@ -301,11 +339,13 @@ def vertices(browser: Browser, script: str) -> np.ndarray:
 
 
 def test_face_shapes_and_a_performance(browser, head, tmp_path):
-    """Catches ARKit's sliders that move a head otherwise than Blender does, closed lips without an open jaw, rows of a
-    CSV that come at the wrong time, and a recording that does not come back."""
+    """Catches ARKit's sliders that move a head otherwise than Blender does, closed lips without an
+    open jaw, rows of a CSV that come at the wrong time, and a recording that does not come back."""
     show(browser, tmp_path, head.data(exact=True, controls=page_controls(head.sequence)))
     before = vertices(browser, "avatar.frame = 0;")
-    weights = np.random.default_rng(2).random(COUNT) * (np.random.default_rng(3).random(COUNT) < 0.5)
+    weights = np.random.default_rng(2).random(COUNT) * (
+        np.random.default_rng(3).random(COUNT) < 0.5
+    )
     weights[[COLUMN["jawOpen"], COLUMN["mouthClose"]]] = 0.4, 0.9
     chosen = dict(zip(ARKIT_SHAPES, weights.tolist(), strict=True))
     found = vertices(
@@ -321,7 +361,9 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
 
     rows = np.random.default_rng(4).random((4, COUNT)) * 0.5
     turns = np.random.default_rng(5).normal(0, 0.2, (4, 3))
-    write_performance(tmp_path / "take.csv", Performance(np.array([0, 1, 2, 4]) / 30, rows, turns, 30.0))
+    write_performance(
+        tmp_path / "take.csv", Performance(np.array([0, 1, 2, 4]) / 30, rows, turns, 30.0)
+    )
     text = json.dumps((tmp_path / "take.csv").read_text())
     for frame, row, turn in (
         (0, rows[0], turns[0]),
@@ -331,11 +373,15 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
     ):
         found = vertices(browser, f"avatar.setPerformance({text}); avatar.frame = {frame};")
         np.testing.assert_allclose(found, driven_mesh(head, row, turn), atol=1e-5)
-    assert browser.evaluate("document.querySelector('stga-avatar').fps") == pytest.approx(30, rel=1e-3)
+    assert browser.evaluate("document.querySelector('stga-avatar').fps") == pytest.approx(
+        30, rel=1e-3
+    )
     assert browser.evaluate("document.querySelector('#scrub').max") == "4"
     refused = browser.evaluate(
         "(() => { try { document.querySelector('stga-avatar').setPerformance('a,b'); }"
         " catch (error) { return error.message; } })()"
     )
     assert refused.startswith("This file is no table of face shapes")
-    np.testing.assert_allclose(vertices(browser, "avatar.setPerformance(null);"), before, atol=1e-12)
+    np.testing.assert_allclose(
+        vertices(browser, "avatar.setPerformance(null);"), before, atol=1e-12
+    )

@@ -28,7 +28,9 @@ def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
     """What evaluate.mjs makes of a data file."""
     (folder / "a.stga").write_bytes(data)
     script = Path(__file__).with_name("evaluate.mjs")
-    done = subprocess.run(["node", str(script), str(PLAYER), str(folder / "a.stga")], capture_output=True, timeout=120)
+    done = subprocess.run(
+        ["node", str(script), str(PLAYER), str(folder / "a.stga")], capture_output=True, timeout=120
+    )
     assert not done.stderr, done.stderr.decode()
     return dict(json.loads(done.stdout))
 
@@ -54,8 +56,9 @@ def test_pose_is_flames(head, baked, tmp_path):
     ],
 )
 def test_frames_and_strain_are_the_embedding(convention, strain, strain_position, tmp_path):
-    """Catches another axis, scale, sliver rule or strain than the one that the splats were trained with, and origins
-    that do not move with the smoothed strain, or with that of the frame before."""
+    """Catches another axis, scale, sliver rule or strain than the one that the splats were trained
+    with, and origins that do not move with the smoothed strain, or with that of the frame
+    before."""
     head = make_head(convention, strain=strain, strain_position=strain_position)
     results = evaluated(head.data(exact=True), tmp_path)["results"]
     for mesh, result in zip(head.meshes, results, strict=True):
@@ -63,33 +66,51 @@ def test_frames_and_strain_are_the_embedding(convention, strain, strain_position
         found = np.reshape(result["frames"], (-1, 3, 4))
         scale = np.abs(expected.rotation * expected.scale[:, None, None]).max()
         # The mesh is that of float32 blend shapes: a thin triangle's axes turn with the last digit.
-        error = np.abs(found[..., :3] - expected.rotation * expected.scale[:, None, None]).max((1, 2)) / scale
+        error = (
+            np.abs(found[..., :3] - expected.rotation * expected.scale[:, None, None]).max((1, 2))
+            / scale
+        )
         assert np.quantile(error, 0.99) < 1e-3
         assert np.abs(found[..., 3] - expected.origin).max() < 1e-6
         still = replace(head.avatar, driven_offsets={}).frames(mesh).origin
         assert (np.abs(expected.origin - still).max() > 1e-3) == strain_position
-        assert np.quantile(np.abs(np.reshape(result["strain"], (-1, 3)) - expected.strain), 0.99) < 2e-3
+        assert (
+            np.quantile(np.abs(np.reshape(result["strain"], (-1, 3)) - expected.strain), 0.99)
+            < 2e-3
+        )
         free = replace(head.avatar, strain_range=None).frames(mesh).strain
         assert (np.abs(free - expected.strain) > 0.01).mean() > 0.05  # the range matters here
 
 
 def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
-    """Catches neighbors that are lost, or counted another number of times, where more than two triangles share an edge,
-    two share all edges, or one has an edge twice: against a search of all pairs of edges, and numpy's frames."""
+    """Catches neighbors that are lost, or counted another number of times, where more than two
+    triangles share an edge, two share all edges, or one has an edge twice: against a search of all
+    pairs of edges, and numpy's frames."""
     rng = np.random.default_rng(0)
     neutral = rng.normal(0, 0.1, (9, 3)).astype(np.float32)
     faces = np.stack([rng.permutation(9)[:3] for _ in range(40)]).astype(np.int32)
     faces[30:33], faces[33] = faces[:3], faces[0, ::-1]
     faces[35:] = [[3, 3, 4], [3, 4, 4], [5, 6, 5], [7, 7, 7], [4, 3, 8]]
     moves = rng.normal(0, 0.01, (40, 3, 3)).astype(np.float32)
-    avatar = Avatar(random_splats(1, 60, 40, 0), "stga", neutral, faces, driven_offsets={"strain_position": moves})
+    avatar = Avatar(
+        random_splats(1, 60, 40, 0),
+        "stga",
+        neutral,
+        faces,
+        driven_offsets={"strain_position": moves},
+    )
     meshes = [neutral, neutral * [0.9, 1.0, 1.1], neutral + rng.normal(0, 0.01, neutral.shape)]
     data = data_file(avatar, baked_rig(meshes), Playback(), exact=True)
     edges = [{frozenset((face[k - 1], face[k])): 0 for k in range(3)} for face in faces]
     for own, face in zip(edges, faces, strict=True):
         for k in range(3):
             own[frozenset((face[k - 1], face[k]))] += 1
-    weight = np.array([[sum(n * other.get(edge, 0) for edge, n in own.items()) for other in edges] for own in edges])
+    weight = np.array(
+        [
+            [sum(n * other.get(edge, 0) for edge, n in own.items()) for other in edges]
+            for own in edges
+        ]
+    )
     np.fill_diagonal(weight, 1)
     assert (weight.sum(1).max() > 10, weight.sum(1).min()) == (True, 1)
     for mesh, result in zip(meshes, evaluated(data, tmp_path)["results"], strict=True):
@@ -106,7 +127,9 @@ def test_a_head_at_rest_stays_where_it_is(tmp_path):
     head = make_head(strain_position=True)
     neutral = head.avatar.neutral
     avatar = replace(head.avatar, strain_range=color_range(len(head.avatar.faces)))
-    [result] = evaluated(data_file(avatar, baked_rig([neutral]), Playback(), exact=True), tmp_path)["results"]
+    [result] = evaluated(data_file(avatar, baked_rig([neutral]), Playback(), exact=True), tmp_path)[
+        "results"
+    ]
     assert np.min(result["strain"]) < -0.19
     origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
     assert np.abs(origin - neutral[avatar.faces].mean(1)).max() < 1e-6
@@ -138,7 +161,8 @@ LIGHT = {"damping": 0.5, "recorded": [1] * 27, "typical": [1] * 3}
 
 
 def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
-    """Catches a player that hangs, or draws garbage, on a file that was cut off, altered or made by a later version."""
+    """Catches a player that hangs, or draws garbage, on a file that was cut off, altered or made by
+    a later version."""
     whole, packed = head.data(), functools.partial(gzip.compress, compresslevel=1)
     raw = gzip.decompress(whole)
     altered = [
@@ -148,7 +172,10 @@ def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
         (packed(raw[:4] + b"\x09" + raw[5:]), "format version 9"),
         (packed(raw[:8] + b"\xff\xff\xff\x7f" + raw[12:]), "is cut off."),
         *(
-            (packed(with_header(raw, *keys, value=value)), f"damaged: {field} is missing or malformed.")
+            (
+                packed(with_header(raw, *keys, value=value)),
+                f"damaged: {field} is missing or malformed.",
+            )
             for field, keys, value in [
                 ("sliders", ("sliders", 0, "component"), 0.5),
                 ("sliders", ("sliders", 0, "component"), 10**6),
@@ -178,7 +205,8 @@ def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
 
 
 def test_an_avatar_without_motion_plays(head, tmp_path):
-    """Catches a single frame, or an avatar without selection, color harmonics and strain, that the player refuses."""
+    """Catches a single frame, or an avatar without selection, color harmonics and strain, that the
+    player refuses."""
     plain = make_head(sh_degree=0, strain=False)
     data = data_file(plain.avatar, baked_rig([plain.avatar.neutral]), Playback())
     vertices = evaluated(data, tmp_path)["results"][0]["vertices"]

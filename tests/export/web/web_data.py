@@ -25,11 +25,19 @@ def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             arrays[name] = np.frombuffer(raw, "<f4", count, at).reshape(shape)
             at += 4 * count
             continue
-        planes = np.frombuffer(raw, np.uint8, entry["planes"] * count, at).reshape(entry["planes"], count)
+        planes = np.frombuffer(raw, np.uint8, entry["planes"] * count, at).reshape(
+            entry["planes"], count
+        )
         at += planes.size
-        integers = sum(plane.astype(np.int64) << 8 * k for k, plane in enumerate(planes)) + entry["low"]
+        integers = (
+            sum(plane.astype(np.int64) << 8 * k for k, plane in enumerate(planes)) + entry["low"]
+        )
         integers = np.moveaxis(np.reshape(integers, [*shape[-1:], *shape[:-1]]), 0, -1)
-        arrays[name] = integers if entry["type"] == "integer" else (integers * entry["step"]).astype(np.float32)
+        arrays[name] = (
+            integers
+            if entry["type"] == "integer"
+            else (integers * entry["step"]).astype(np.float32)
+        )
     assert at == len(raw)
     return header, arrays
 
@@ -54,14 +62,21 @@ def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
         sh=np.concatenate([arrays["color"][:, None], rest], axis=1).astype(np.float32),
         face=np.repeat(np.arange(len(per_face)), per_face).astype(np.int32),
         unbound=np.zeros(count, bool),
-        strain_color=arrays.get("strain_color", np.zeros((count, 0), np.float32)).reshape(count, -1, 3),
+        strain_color=arrays.get("strain_color", np.zeros((count, 0), np.float32)).reshape(
+            count, -1, 3
+        ),
     )
 
 
 def posed_mesh(
-    header: dict[str, Any], arrays: dict[str, np.ndarray], coefficients: np.ndarray, pose: np.ndarray, frame: int
+    header: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    coefficients: np.ndarray,
+    pose: np.ndarray,
+    frame: int,
 ) -> np.ndarray:
-    """Vertices (V, 3) of coefficients (R,), pose (J, 3) axis-angle and the translation of a frame."""
+    """Vertices (V, 3) of coefficients (R,), pose (J, 3) axis-angle and the translation of a
+    frame."""
     parents = header["parents"]
     local = np.stack([_rotation(vector) for vector in pose])
     features = (local[1:] - np.eye(3)).ravel()

@@ -1,4 +1,5 @@
-"""Captures of a ball that deforms, painted triangle by triangle, of which it is known what colors depend on."""
+"""Captures of a ball that deforms, painted triangle by triangle, of which it is known what colors
+depend on."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ SIZE, FOCAL, SUPERSAMPLED = 100, 420.0, 3
 NOISE = 1.5  # levels
 
 Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(strain (F, 3), unit direction from the camera (F, 3), unit place on the ball (F, 3)) -> levels (F,) that are added
-to the triangles' own colors."""
+"""(strain (F, 3), unit direction from the camera (F, 3), unit place on the ball (F, 3)) -> levels
+(F,) that are added to the triangles' own colors."""
 
 
 def nothing(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -43,8 +44,9 @@ def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class Scene:
-    """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, gain over time (timesteps, 3), what else
-    colors depend on, the color behind the ball, and how far timesteps deform it."""
+    """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, gain over time
+    (timesteps, 3), what else colors depend on, the color behind the ball, and how far timesteps
+    deform it."""
 
     cameras: int = 8
     timesteps: int = 8
@@ -73,7 +75,12 @@ def photograph(folder: Path, scene: Scene) -> Capture:
         for c in range(scene.cameras):
             camera = _camera(c, scene.cameras)
             away = mesh[faces].mean(1) - camera.position
-            seen = colors + scene.paint(strain, away / np.linalg.norm(away, axis=1, keepdims=True), place)[:, None]
+            seen = (
+                colors
+                + scene.paint(strain, away / np.linalg.norm(away, axis=1, keepdims=True), place)[
+                    :, None
+                ]
+            )
             if scene.drift is not None:
                 seen = seen * scene.drift[t]
             if scene.gain is not None:
@@ -103,7 +110,9 @@ def own_colors(capture: Capture, seed: int = 0) -> np.ndarray:
 
 
 def _own_colors(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return np.asarray(120 + 40 * np.sin(place @ rng.normal(0, 4, (3, 3))) + rng.uniform(-8, 8, (len(place), 1)))
+    return np.asarray(
+        120 + 40 * np.sin(place @ rng.normal(0, 4, (3, 3))) + rng.uniform(-8, 8, (len(place), 1))
+    )
 
 
 def _deform(vertices: np.ndarray, timestep: int, amount: float) -> np.ndarray:
@@ -119,7 +128,9 @@ def _deform(vertices: np.ndarray, timestep: int, amount: float) -> np.ndarray:
 def _camera(number: int, count: int) -> Camera:
     angle = np.linspace(-0.9, 0.9, count)[number] if count > 1 else 0.0
     height = 0.3 * (-1) ** number
-    back = np.array([np.sin(angle) * np.cos(height), np.sin(height), np.cos(angle) * np.cos(height)])
+    back = np.array(
+        [np.sin(angle) * np.cos(height), np.sin(height), np.cos(angle) * np.cos(height)]
+    )
     right = np.cross([0, 1, 0], back) / np.linalg.norm(np.cross([0, 1, 0], back))
     rotation = np.stack([right, -np.cross(back, right), -back])
     view = np.eye(4)
@@ -127,7 +138,9 @@ def _camera(number: int, count: int) -> Camera:
     return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, view)
 
 
-def _draw(mesh: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _draw(
+    mesh: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Picture (SIZE, SIZE, 3) float and mask (SIZE, SIZE) uint8, drawn large and shrunk."""
     pixels, depth = camera.project(mesh)
     pixels = SUPERSAMPLED * pixels - 0.5
@@ -146,7 +159,9 @@ def _draw(mesh: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarra
     return color / weight[..., None], np.where(coverage > 127, 255, 0).astype(np.uint8)
 
 
-def _keep(folder: Path, t: int, c: int, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> View:
+def _keep(
+    folder: Path, t: int, c: int, camera: Camera, image: np.ndarray, mask: np.ndarray | None
+) -> View:
     name = f"{t:05d}_{c:02d}.png"
     Image.fromarray(np.clip(image, 0, 255).round().astype(np.uint8)).save(folder / name)
     mask_path = None if mask is None else folder / f"mask_{name}"

@@ -1,4 +1,5 @@
-"""Cost of effects: one that is off takes no memory and makes no calls; one that is on reaches the training."""
+"""Cost of effects: one that is off takes no memory and makes no calls; one that is on reaches the
+training."""
 
 from collections import Counter
 from dataclasses import replace
@@ -77,13 +78,22 @@ def test_on_calls_all(painted, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("choice", ["on", "off"])
 def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
-    """Catches parameters that are refined or written with the effect off, or not refined with it on."""
+    """Catches parameters that are refined or written with the effect off, or not refined with it
+    on."""
     capture, _ = write_head(tmp_path / "head")
-    settings, _ = plan_effects(capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice}))
+    settings, _ = plan_effects(
+        capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice})
+    )
     calls: Counter[str] = Counter()
-    for module, name in ((trainer, "RefinedTracking"), (cpu_backend, "frame_backward"), (session, "write_tracking")):
+    for module, name in (
+        (trainer, "RefinedTracking"),
+        (cpu_backend, "frame_backward"),
+        (session, "write_tracking"),
+    ):
         monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
-    session.train(capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings))
+    session.train(
+        capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings)
+    )
     if choice == "off":
         assert calls == {}
         assert read_checkpoint(tmp_path / "run").tracking is None
@@ -97,13 +107,19 @@ def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
 def test_exposure_is_taken_away(painted):
     """Catches gains and offsets applied inversely, to the background, or to another camera."""
     gain, offset = unlike_cameras()
-    rows = tuple((float(n), *g, *o) for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True)))
+    rows = tuple(
+        (float(n), *g, *o)
+        for n, (g, o) in enumerate(zip(gain.tolist(), offset.tolist(), strict=True))
+    )
     correct = exposure_correction(make_settings(iterations=1, exposure=rows))
     assert correct is not None
     alike, unlike = painted(), painted(gain=gain, offset=offset)
     for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
         (_, expected, _), (view, image, mask) = read_view(same), read_view(other)
-        before, after = (abs(i.astype(int) - expected)[mask > 0].mean() for i in (image, correct(view, image, mask)))
+        before, after = (
+            abs(i.astype(int) - expected)[mask > 0].mean()
+            for i in (image, correct(view, image, mask))
+        )
         assert after < 1.0
         assert before > 2 * after
         assert (correct(view, image, mask)[mask == 0] == image[mask == 0]).all()
@@ -120,7 +136,11 @@ def test_no_splats_on_teeth(painted):
     """Catches splats on teeth that are never visible."""
     capture = painted()
     vertices = len(capture.neutral)
-    rows = np.zeros((120, 3)) + capture.neutral[0] + np.random.default_rng(0).normal(0, 0.002, (120, 3))
+    rows = (
+        np.zeros((120, 3))
+        + capture.neutral[0]
+        + np.random.default_rng(0).normal(0, 0.002, (120, 3))
+    )
     faces = np.concatenate([capture.faces, teeth_faces(vertices)])
     masks = {"teeth": np.arange(vertices, vertices + 120)}
     flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
@@ -132,19 +152,24 @@ def test_no_splats_on_teeth(painted):
         flame=flame,
     )
     for kept in (True, False):
-        splats = initial_splats.initial_splats(toothed, make_settings(iterations=1, hull_points=False, teeth=kept))
+        splats = initial_splats.initial_splats(
+            toothed, make_settings(iterations=1, hull_points=False, teeth=kept)
+        )
         on_teeth = (splats.face >= len(capture.faces)).sum()
         assert on_teeth == (6 * TEETH_FACES if kept else 0)
         assert len(splats) - on_teeth == 6 * len(capture.faces)
 
 
 def test_antialiasing_reaches_training_and_evaluation(painted):
-    """Catches an effect that is decided and then forgotten: losses and pixels must be those of the reference."""
+    """Catches an effect that is decided and then forgotten: losses and pixels must be those of the
+    reference."""
     capture, losses, pictures = painted(), [], []
     view, image, _ = read_view(capture.views["train"][0], 0.4)
     target = torch.from_numpy(image.transpose(2, 0, 1) / 255)
     for choice in ("on", "off"):
-        settings, _ = plan_effects(capture, make_settings(iterations=1, effects={"antialiasing": choice}))
+        settings, _ = plan_effects(
+            capture, make_settings(iterations=1, effects={"antialiasing": choice})
+        )
         settings = replace(settings, lattice=0, hull_points=False)
         small = trainer.Trainer(capture, settings, {})
         for parameters in (small.state.parameters, small.state.average):
@@ -168,5 +193,7 @@ def reference_image(small: trainer.Trainer, view: View, antialiased: bool) -> to
     p = Parameters(*(torch.from_numpy(array).double() for array in state.parameters))
     face, frames = torch.from_numpy(state.face).long(), small.frames.of(view.timestep)
     placed = reference.embed(p.xyz, p.rotation, p.log_scale, frames, face)
-    color, alpha, _ = reference.render(*placed, p.opacity, p.sh, view.camera, 0, antialiased=antialiased)
+    color, alpha, _ = reference.render(
+        *placed, p.opacity, p.sh, view.camera, 0, antialiased=antialiased
+    )
     return color + 1 - alpha

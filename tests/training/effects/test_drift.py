@@ -24,7 +24,10 @@ def recorded(folder, drift):
     """One camera; some timesteps are left out of the training."""
     capture = photograph(folder, Scene(cameras=1, timesteps=TIMESTEPS, drift=drift))
     split = {"train": lambda t: t not in LEFT_OUT, "val": lambda t: t in LEFT_OUT}
-    views = {name: tuple(v for v in capture.views["train"] if use(v.timestep)) for name, use in split.items()}
+    views = {
+        name: tuple(v for v in capture.views["train"] if use(v.timestep))
+        for name, use in split.items()
+    }
     return replace(capture, views=views)
 
 
@@ -53,7 +56,8 @@ def test_drift_is_found(drifting):
 
 
 def test_images_in_no_order_do_not_drift(tmp_path_factory):
-    """Catches gains that are interpolated between images that have nothing to do with each other."""
+    """Catches gains that are interpolated between images that have nothing to do with each
+    other."""
     shuffled = np.random.default_rng(1).permutation(DRIFT)
     for drift in (shuffled, None):
         decision = planned(recorded(tmp_path_factory.mktemp("no_drift"), drift))[1]
@@ -61,11 +65,16 @@ def test_images_in_no_order_do_not_drift(tmp_path_factory):
 
 
 def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path):
-    """Catches drift that is averaged into the avatar, or not given to renderings of other timesteps."""
+    """Catches drift that is averaged into the avatar, or not given to renderings of other
+    timesteps."""
     psnr = {}
     for choice in ("on", "off"):
         settings, _ = planned(drifting, iterations=200, exposure=choice)
-        avatar = train(drifting, tmp_path / choice, Run(drifting.root, None, "vhap", replace(settings, effects=None)))
+        avatar = train(
+            drifting,
+            tmp_path / choice,
+            Run(drifting.root, None, "vhap", replace(settings, effects=None)),
+        )
         quality = evaluate_avatar(read_avatar(avatar), drifting, "val")
         assert quality.psnr_unmatched is None
         psnr[choice] = quality.psnr

@@ -23,33 +23,41 @@ def test_a_linear_dependence_is_found_and_noise_is_not() -> None:
 
 
 def test_features_beyond_the_fitted_range_are_clipped() -> None:
-    """Catches evidence against colors that saturate, which an avatar with its range of strain can hold: the one
-    extrapolated expression would outweigh what all the others gain."""
+    """Catches evidence against colors that saturate, which an avatar with its range of strain can
+    hold: the one extrapolated expression would outweigh what all the others gain."""
     rng = np.random.default_rng(1)
     strength = np.array([0.2, -0.3, 0.5, -0.5, 0.4, -0.2, 0.3, 4.0])
     features = np.zeros((VIEWS, TRIANGLES, 3))
     features[..., 0] = strength[GROUP][:, None]
-    color = 100 + 20 * np.clip(features[..., :1], -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
+    color = (
+        100 + 20 * np.clip(features[..., :1], -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
+    )
     assert linear_evidence(color, features, FOLDS).gain == 0
     rest = np.zeros((TRIANGLES, 3))
     assert linear_evidence(color, features, FOLDS, rest=rest).gain > 5
     inside = features[GROUP != 7], consecutive_folds(GROUP[GROUP != 7])
-    free, limited = (linear_evidence(color[GROUP != 7], *inside, rest=given) for given in (None, rest))
+    free, limited = (
+        linear_evidence(color[GROUP != 7], *inside, rest=given) for given in (None, rest)
+    )
     assert abs(free.gain - limited.gain) < 0.5
 
 
 def test_the_range_is_counted_from_rest() -> None:
-    """Catches a margin counted from 0: a constant added to all strain, at rest too, changes nothing that colors say."""
+    """Catches a margin counted from 0: a constant added to all strain, at rest too, changes nothing
+    that colors say."""
     rng = np.random.default_rng(2)
     rest, features = np.zeros((TRIANGLES, 3)), rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
     color = 100 + 20 * np.clip(features, -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
-    plain, shifted = (linear_evidence(color, features + by, FOLDS, rest=rest + by) for by in (0.0, -0.2))
+    plain, shifted = (
+        linear_evidence(color, features + by, FOLDS, rest=rest + by) for by in (0.0, -0.2)
+    )
     assert plain.gain > 5
     np.testing.assert_allclose(shifted.gain, plain.gain, rtol=1e-9)
 
 
 def slowly(rng, timesteps, *shape):
-    """(timesteps, *shape) noise of standard deviation 1 that is like itself for three timesteps or so."""
+    """(timesteps, *shape) noise of standard deviation 1 that is like itself for three timesteps or
+    so."""
     weights = np.hanning(8)[1:-1]
     noise = rng.normal(size=(timesteps + len(weights) - 1, *shape))
     windows = np.lib.stride_tricks.sliding_window_view(noise, len(weights), 0)
@@ -58,8 +66,9 @@ def slowly(rng, timesteps, *shape):
 
 @pytest.mark.parametrize("timesteps", [8, 12])
 def test_what_only_neighboring_timesteps_know(timesteps):
-    """Catches timesteps that are predicted from their neighbors: colors and features that change slowly, each by
-    itself, say nothing of an unseen expression. Folds that take every fourth timestep find two levels and more."""
+    """Catches timesteps that are predicted from their neighbors: colors and features that change
+    slowly, each by itself, say nothing of an unseen expression. Folds that take every fourth
+    timestep find two levels and more."""
     timestep = np.repeat(np.arange(timesteps), 6)
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -81,7 +90,8 @@ def test_slow_expressions_that_colors_follow():
 
 @pytest.mark.parametrize(("timesteps", "folds"), [(1, 0), (2, 0), (3, 2), (5, 4), (12, 4)])
 def test_each_timestep_is_held_out_once(timesteps, folds):
-    """Catches timesteps beside the fold that the model is fitted to, and folds without anything to fit."""
+    """Catches timesteps beside the fold that the model is fitted to, and folds without anything to
+    fit."""
     timestep = np.repeat(7 * np.arange(timesteps), 2)
     found = consecutive_folds(timestep)
     assert len(found) == folds

@@ -16,7 +16,8 @@ from .scenes import own_colors
 
 
 def test_splats_start_with_the_colors_of_the_images(painted):
-    """Catches colors of other triangles, mirrored images, channels in another order, and colors mixed with white."""
+    """Catches colors of other triangles, mirrored images, channels in another order, and colors
+    mixed with white."""
     capture = painted()
     splats = initial_splats(capture, make_settings(iterations=1, lattice=1, hull_points=False))
     found = 255 * (0.5 + SH_C0 * splats.sh[:, 0])
@@ -43,7 +44,8 @@ def test_what_no_view_shows_has_the_nearest_color(painted):
 
 
 def test_the_side_that_no_camera_sees_has_the_colors_of_its_mirror_image(painted):
-    """Catches a head whose other side has the color of the outline, where the camera sees it worst."""
+    """Catches a head whose other side has the color of the outline, where the camera sees it
+    worst."""
     capture = painted()
     views = [view for view in capture.views["train"] if view.camera_index == 0]
     center = capture.neutral[capture.faces].mean(1)
@@ -68,7 +70,10 @@ def test_cameras_on_both_sides_mirror_nothing(painted, monkeypatch):
 def test_masks_that_show_nothing_give_gray(painted, tmp_path):
     """Catches a division by zero where no triangle is seen."""
     capture = painted()
-    views = [replace(view, camera=replace(view.camera, cx=-1000.0)) for view in capture.views["train"][:2]]
+    views = [
+        replace(view, camera=replace(view.camera, cx=-1000.0))
+        for view in capture.views["train"][:2]
+    ]
     np.testing.assert_array_equal(triangle_colors(capture, views), 0.5)
 
 
@@ -81,9 +86,12 @@ PLATES = {
 
 
 def test_teeth_behind_closed_lips_have_their_own_color(tmp_path):
-    """Catches teeth that start with the color of the lips, and stay so where no image shows them."""
+    """Catches teeth that start with the color of the lips, and stay so where no image shows
+    them."""
     capture = _mouth(tmp_path)
-    lip, tooth, molar = (colors.mean(0) for colors in np.split(triangle_colors(capture, capture.views["train"]), 3))
+    lip, tooth, molar = (
+        colors.mean(0) for colors in np.split(triangle_colors(capture, capture.views["train"]), 3)
+    )
     np.testing.assert_allclose(255 * lip, PLATES["lip"][-1], atol=2)
     np.testing.assert_allclose(255 * tooth, PLATES["tooth"][-1], atol=2)
     np.testing.assert_allclose(255 * molar, PLATES["tooth"][-1], atol=2)
@@ -97,8 +105,9 @@ def test_without_later_timesteps_what_is_hidden_has_the_nearest_color(tmp_path):
 
 
 def _mouth(folder: Path) -> Capture:
-    """Plates of two triangles each: a lip in front of a tooth, which is lifted in the second timestep far enough to
-    show the tooth but not the molar, which is nearer to the lip than to the tooth."""
+    """Plates of two triangles each: a lip in front of a tooth, which is lifted in the second
+    timestep far enough to show the tooth but not the molar, which is nearer to the lip than to the
+    tooth."""
     camera = Camera(200, 200, 400.0, 400.0, 100.0, 100.0, np.eye(4))
     corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     plates = [
@@ -113,7 +122,9 @@ def _mouth(folder: Path) -> Capture:
         for plate, (*_, color) in sorted(
             zip(np.split(mesh, 3), PLATES.values(), strict=True), key=lambda p: -p[0][0, 2]
         ):
-            ImageDraw.Draw(picture).polygon((camera.project(plate)[0] - 0.5).ravel().tolist(), fill=color)
+            ImageDraw.Draw(picture).polygon(
+                (camera.project(plate)[0] - 0.5).ravel().tolist(), fill=color
+            )
         picture.save(folder / f"{timestep}.png")
         views.append(View(timestep, 0, camera, f"{timestep}.png", folder / f"{timestep}.png"))
     return Capture(

@@ -1,4 +1,5 @@
-"""The recipe "an effect with a parameter" of docs/architecture.md, followed by a toy that the product does not know."""
+"""The recipe "an effect with a parameter" of docs/architecture.md, followed by a toy that the
+product does not know."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,8 +42,12 @@ def growth(basis: StrainBasis, frames: FaceFrames) -> np.ndarray:
 def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the recipe asks for: a file of its own (`growth`), and a row in each table."""
     monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, 2, growth, 1.0))
-    monkeypatch.setitem(EFFECTS, "toy-growth", Effect("toy-growth", "6 numbers", offset=NAME, added_later=True))
-    monkeypatch.setitem(RULES, "toy-growth", lambda facts: Verdict(facts.timesteps > 1, "the head grows"))
+    monkeypatch.setitem(
+        EFFECTS, "toy-growth", Effect("toy-growth", "6 numbers", offset=NAME, added_later=True)
+    )
+    monkeypatch.setitem(
+        RULES, "toy-growth", lambda facts: Verdict(facts.timesteps > 1, "the head grows")
+    )
 
 
 @pytest.fixture
@@ -53,7 +58,9 @@ def capture(toy: Capture) -> Capture:
 
 def planned(capture: Capture) -> Run:
     choices = dict.fromkeys(("strain-color", "strain-position", "view-color", "exposure"), "off")
-    settings = quick_settings("global", lattice=1, iterations=30, effects={**choices, "tracking": "auto"})
+    settings = quick_settings(
+        "global", lattice=1, iterations=30, effects={**choices, "tracking": "auto"}
+    )
     settings = replace(settings, density_interval=10, density_span=(0.0, 1.0))
     return Run(capture.root, None, "vhap", *plan_effects(capture, settings))
 
@@ -64,31 +71,44 @@ def made(seed: int = 0) -> tuple[Avatar, np.ndarray]:
     neutral = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.3]]) / 10
     faces = np.int32([[0, 1, 2], [1, 3, 2]])
     values = {NAME: rng.normal(0, 0.05, (2, 2, 3)).astype(np.float32)}
-    return Avatar(lattice_splats(neutral, faces, 1), "stga", neutral, faces, driven_offsets=values), neutral * 1.3
+    return Avatar(
+        lattice_splats(neutral, faces, 1), "stga", neutral, faces, driven_offsets=values
+    ), neutral * 1.3
 
 
-def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture: Capture, tmp_path: Path) -> None:
-    """Catches a parameter that the plan, training, density control, the checkpoint, the avatar file or a continuation
-    loses, because one of them goes by names instead of the tables."""
+def test_it_is_decided_trained_and_resumed_to_the_same_bits(
+    capture: Capture, tmp_path: Path
+) -> None:
+    """Catches a parameter that the plan, training, density control, the checkpoint, the avatar file
+    or a continuation loses, because one of them goes by names instead of the tables."""
     run = planned(capture)
     assert run.settings.driven_offsets == (NAME,)
     assert dict(describe_effects(run.effect_plan))["toy-growth"] == "on: the head grows [6 numbers]"
     train(capture, tmp_path / "whole", run)
-    train(capture, tmp_path / "parts", run, report=lambda progress: progress.figures().get("iteration", 0) == 13)
+    train(
+        capture,
+        tmp_path / "parts",
+        run,
+        report=lambda progress: progress.figures().get("iteration", 0) == 13,
+    )
     assert read_checkpoint(tmp_path / "parts").iteration == 13
     train(capture, tmp_path / "parts", run, resume=True)
     whole, parts = (read_checkpoint(tmp_path / name).state for name in ("whole", "parts"))
     for name, expected in bits(whole).items():
         np.testing.assert_array_equal(bits(parts)[name], expected, err_msg=name)
     for name, expected in vars(whole.driven_offsets[NAME]).items():
-        np.testing.assert_array_equal(getattr(parts.driven_offsets[NAME], name), expected, err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(parts.driven_offsets[NAME], name), expected, err_msg=name
+        )
     avatar = read_avatar(tmp_path / "parts" / "avatar.npz")
     np.testing.assert_array_equal(avatar.driven_offsets[NAME], whole.driven_offsets[NAME].average)
     assert np.abs(avatar.driven_offsets[NAME]).max() > 1e-4
     folder = tmp_path / "whole"
     continuation = Continuation(folder, file_digest(folder / "avatar.npz"), 0, 9)
     state = starting_state(continuation, run.settings, len(capture.faces))
-    np.testing.assert_array_equal(state.driven_offsets[NAME].second, whole.driven_offsets[NAME].second)
+    np.testing.assert_array_equal(
+        state.driven_offsets[NAME].second, whole.driven_offsets[NAME].second
+    )
 
 
 def test_a_continuation_adds_it(capture: Capture) -> None:
@@ -102,11 +122,17 @@ def test_a_continuation_adds_it(capture: Capture) -> None:
 
 def test_a_device_without_its_kernels_says_so(capture: Capture) -> None:
     """Catches an effect that trains without its parameter on a GPU."""
-    with pytest.raises(StgaError, match=f"driven offset {NAME}: is trained on the CPU only, not on gpu"):
-        Trainer(capture, quick_settings("global", lattice=0, driven_offsets=(NAME,)), {}, device="gpu")
+    with pytest.raises(
+        StgaError, match=f"driven offset {NAME}: is trained on the CPU only, not on gpu"
+    ):
+        Trainer(
+            capture, quick_settings("global", lattice=0, driven_offsets=(NAME,)), {}, device="gpu"
+        )
 
 
-@pytest.mark.parametrize("format", [name for name, row in FORMATS.items() if row.source != "motion"])
+@pytest.mark.parametrize(
+    "format", [name for name, row in FORMATS.items() if row.source != "motion"]
+)
 def test_exports_hold_it_or_say_that_they_cannot(format: str, tmp_path: Path) -> None:
     """Catches an export that shows the avatar without the effect."""
     if format == "usd":
@@ -124,7 +150,8 @@ def test_exports_hold_it_or_say_that_they_cannot(format: str, tmp_path: Path) ->
 
 
 def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
-    """Catches an offset in other axes or units than those of the triangle: against float64, by hand."""
+    """Catches an offset in other axes or units than those of the triangle: against float64, by
+    hand."""
     avatar, posed = made()
     [file] = export_avatar(tmp_path / "a.ply", avatar, "ply", [(0, posed)])
     frames = face_frames(posed, avatar.faces, avatar.neutral)
@@ -137,7 +164,8 @@ def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
 
 
 def test_blender_keeps_it() -> None:
-    """Catches a parameter that is lost in a .blend file, which is what the viewport and renders pose."""
+    """Catches a parameter that is lost in a .blend file, which is what the viewport and renders
+    pose."""
     bpy = pytest.importorskip("bpy")
     from stga_addon.scene.arrays import triangle_mesh
     from stga_addon.scene.display.splat_object import show_avatar, stored_avatar

@@ -20,7 +20,9 @@ from stga_addon.training.settings import make_settings
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return factory.write_mesh_capture(tmp_path_factory.mktemp("effects") / "ball", (0, 1, 3), range(3))
+    return factory.write_mesh_capture(
+        tmp_path_factory.mktemp("effects") / "ball", (0, 1, 3), range(3)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +34,20 @@ def trained(root, tmp_path_factory):
 
 
 def test_the_run_keeps_its_plan(trained):
-    """Catches decisions or their reasons that are lost in run.json, and settings that do not follow them."""
+    """Catches decisions or their reasons that are lost in run.json, and settings that do not follow
+    them."""
     run = read_run(trained)
     plan = {decision.effect: decision for decision in run.effect_plan}
-    assert (plan["strain-color"].choice, plan["strain-color"].on, run.settings.strain_color) == ("on", True, True)
-    assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == ("off", False, False)
+    assert (plan["strain-color"].choice, plan["strain-color"].on, run.settings.strain_color) == (
+        "on",
+        True,
+        True,
+    )
+    assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == (
+        "off",
+        False,
+        False,
+    )
     assert plan["exposure"].choice == "auto"
     assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
 
@@ -44,7 +55,8 @@ def test_the_run_keeps_its_plan(trained):
 @pytest.mark.parametrize("effect", ["strain-color", "strain-position"])
 @pytest.mark.parametrize(("choice", "expected"), [("auto", True), ("off", False)])
 def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
-    """Catches an extended run that cannot hold its takes' expressions, and a user's choice that is overruled."""
+    """Catches an extended run that cannot hold its takes' expressions, and a user's choice that is
+    overruled."""
     capture = open_capture(root)
     settings = make_settings(iterations=1, effects={} if choice == "auto" else {effect: choice})
     settings, plan = plan_effects(capture, settings)
@@ -54,7 +66,9 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
     extended, later = add_effects(capture, settings, plan)
     assert (on.items() <= vars(extended).items()) == expected
     changed = [now for now, then in zip(later, plan, strict=True) if now != then]
-    assert [(each.effect, each.on, each.reason) for each in changed] == expected * [(effect, True, "two takes say so")]
+    assert [(each.effect, each.on, each.reason) for each in changed] == expected * [
+        (effect, True, "two takes say so")
+    ]
     assert add_effects(capture, extended, later) == (extended, later)
 
 
@@ -66,21 +80,25 @@ def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     assert main([*train, "--effect", "strain-color=on"]) == 0
     assert read_run(trained) == before
     assert any(
-        line.split()[:4] == ["strain-color", "on,", "as", "asked:"] for line in capsys.readouterr().out.splitlines()
+        line.split()[:4] == ["strain-color", "on,", "as", "asked:"]
+        for line in capsys.readouterr().out.splitlines()
     )
     assert main([*train, "--effect", "strain-color=off"]) == 2
     assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
 def test_info_shows_the_plan(tmp_path, capsys):
-    """Catches an overview without the plan or the figures behind it, or with choices that it does not heed."""
+    """Catches an overview without the plan or the figures behind it, or with choices that it does
+    not heed."""
     root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 2, 3, 4, 5), range(3))
     assert main(["info", str(root), "--effect", "strain-color=on"]) == 0
     lines = capsys.readouterr().out.splitlines()
     (strain,) = [line for line in lines if line.startswith("strain-color")]
     assert "on, as asked: " in strain
     assert "coefficients more a splat" in strain
-    assert re.search(r"[+-]\d\.\d\d dB in left-out frames and [+-]\d\.\d\d dB in left-out cameras", strain)
+    assert re.search(
+        r"[+-]\d\.\d\d dB in left-out frames and [+-]\d\.\d\d dB in left-out cameras", strain
+    )
     assert any(line.startswith("view-color") and "off: " in line for line in lines)
 
 
@@ -95,7 +113,18 @@ def test_info_shows_the_plan(tmp_path, capsys):
 def test_what_cannot_be_is_one_sentence(root, tmp_path, capsys, effect, says):
     """Catches an impossible choice that is taken in silence, or ends in a traceback."""
     try:
-        code = main(["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2", "--effect", effect])
+        code = main(
+            [
+                "train",
+                str(root),
+                "--out",
+                str(tmp_path / "run"),
+                "--iterations",
+                "2",
+                "--effect",
+                effect,
+            ]
+        )
     except SystemExit as stop:  # argparse's, of a value that no capture could have
         code = stop.code
     assert code == 2
@@ -109,7 +138,11 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
         out = tmp_path / options[1]
         assert main(["train", str(root), "--out", str(out), "--iterations", "2", *options]) == 0
         run = read_run(out)
-        assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == ((), None, False)
+        assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == (
+            (),
+            None,
+            False,
+        )
         again = ["train", str(root), "--out", str(tmp_path / "no"), "--iterations", "2", *options]
         assert main([*again, "--effect", "strain-color=on"]) == 2
         assert "--effect cannot be combined with" in capsys.readouterr().err
@@ -126,11 +159,19 @@ def test_a_damaged_plan(tmp_path):
     write_run(tmp_path, Run(Path("/capture"), None, "vhap", make_settings(iterations=5)))
     whole = read_json(tmp_path / "run.json")
     good = {"effect": "jaw", "choice": "auto", "on": True, "reason": "", "cost": ""}
-    for plan in (7, [7], [{**good, "on": "yes"}], [{**good, "choice": "maybe"}], [{"effect": "jaw"}]):
+    for plan in (
+        7,
+        [7],
+        [{**good, "on": "yes"}],
+        [{**good, "choice": "maybe"}],
+        [{"effect": "jaw"}],
+    ):
         write_json(tmp_path / "run.json", {**whole, "effect_plan": plan})
         with pytest.raises(StgaError, match=r"run\.json: "):
             read_run(tmp_path)
     for row in ([0.0] * 7, [0.0, 1, 1, 1, 0, 0], [0.0, 1, float("nan"), 1, 0, 0, 0]):
-        write_json(tmp_path / "run.json", {**whole, "settings": {**whole["settings"], "exposure": [row]}})
+        write_json(
+            tmp_path / "run.json", {**whole, "settings": {**whole["settings"], "exposure": [row]}}
+        )
         with pytest.raises(StgaError, match=r"run\.json: "):
             read_run(tmp_path)

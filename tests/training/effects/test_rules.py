@@ -42,17 +42,27 @@ def on(plan):
 
 def gains(decision):
     """In decibels, of colors in frames, and in cameras, that were left out."""
-    return [float(gain) for gain in re.findall(r"([+-]\d+\.\d+) dB in left-out (?:frames|cameras)", decision.reason)]
+    return [
+        float(gain)
+        for gain in re.findall(r"([+-]\d+\.\d+) dB in left-out (?:frames|cameras)", decision.reason)
+    ]
 
 
 def test_plain(painted):
-    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's colors is there; and
-    an effect of FLAME's that is planned for a capture without its parameters."""
+    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's
+    colors is there; and an effect of FLAME's that is planned for a capture without its
+    parameters."""
     plan, settings = planned(painted())
     assert on(plan) == {"antialiasing", "background", "density"}
-    assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (0, False, (), False)
+    assert (settings.sh_degree, settings.strain_color, settings.exposure, settings.hull_points) == (
+        0,
+        False,
+        (),
+        False,
+    )
     assert plan[RELIGHT].on
-    assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets", "tracking"}  # there is no FLAME
+    # there is no FLAME
+    assert not set(plan) & {"teeth", "neck", "jaw", "eyes", "dynamic-offsets", "tracking"}
 
 
 def test_color_that_follows_strain(painted):
@@ -66,8 +76,8 @@ def test_color_that_follows_strain(painted):
 
 
 def deforming(**errors):
-    """Facts of a capture whose colors, where these views are left out, are so many levels wrong without the effects and
-    with them."""
+    """Facts of a capture whose colors, where these views are left out, are so many levels wrong
+    without the effects and with them."""
     found = {kind: Evidence(*pair) for kind, pair in errors.items()}
     names = ("strain_dependence", "smoothed_strain_dependence")
     return SimpleNamespace(strain=0.1, timesteps=10, **dict.fromkeys(names, found))
@@ -77,16 +87,18 @@ def deforming(**errors):
 @pytest.mark.parametrize(
     ("frames", "cameras", "gained", "on"),
     [
-        ((10, 10.4), (10, 8), "-0.34 +1.94", True),  # much gained in other views, little lost in other expressions
+        # much gained in other views, little lost in other expressions
+        ((10, 10.4), (10, 8), "-0.34 +1.94", True),
         ((10, 8), (10, 10.4), "+1.94 -0.34", True),
         ((10, 12), (10, 9.5), "-1.58 +0.45", False),
         ((10, 9.5), (10, 12), "+0.45 -1.58", False),
-        ((30, 29.98), (30, 29.98), "+0.01 +0.01", False),  # 1.1 levels of 30 are nothing that can be seen
+        # 1.1 levels of 30 are nothing that can be seen
+        ((30, 29.98), (30, 29.98), "+0.01 +0.01", False),
     ],
 )
 def test_what_is_gained_outweighs_what_is_lost(rule, frames, cameras, gained, on):
-    """Catches an effect left off for a small loss in one kind of view although it gains much in the other, one that is
-    on for what only one kind gains, and a figure that does not show a loss."""
+    """Catches an effect left off for a small loss in one kind of view although it gains much in the
+    other, one that is on for what only one kind gains, and a figure that does not show a loss."""
     verdict = rule(deforming(frames=frames, cameras=cameras))
     assert [f"{gain:+.2f}" for gain in gains(verdict)] == gained.split()
     assert verdict.on == on
@@ -100,20 +112,24 @@ def test_one_camera_is_not_left_out():
 
 @pytest.mark.parametrize("rule", [rules.strain_color, rules.strain_position])
 def test_few_frames_tell_nothing_of_unseen_ones(rule):
-    """Catches a figure of 0 levels given as the reason, where no timestep could be left out with its neighbors."""
+    """Catches a figure of 0 levels given as the reason, where no timestep could be left out with
+    its neighbors."""
     verdict = rule(SimpleNamespace(strain=0.1, timesteps=3))
     assert (verdict.on, verdict.fixed) == (False, False)
     assert verdict.reason.startswith("3 frames are too few to tell how")
 
 
 def test_what_moves_over_triangles_with_strain(painted):
-    """Catches positions that follow the mesh alone where its surface slides, and that choice where it is refused."""
+    """Catches positions that follow the mesh alone where its surface slides, and that choice where
+    it is refused."""
     plan, settings = planned(painted(paint=sliding))
     assert plan["strain-position"].on
     assert settings.driven_offsets == ("strain_position",)
     assert min(gains(plan["strain-position"])) > 0.5
     assert not planned(painted(paint=sliding), strain_position="off")[1].driven_offsets
-    with pytest.raises(StgaError, match="strain-position=on: is not possible, because the mesh has the same shape"):
+    with pytest.raises(
+        StgaError, match="strain-position=on: is not possible, because the mesh has the same shape"
+    ):
         planned(painted(timesteps=1, deformed=0.0), strain_position="on")
 
 
@@ -131,7 +147,8 @@ def unlike_cameras():
 
 
 def test_cameras_of_different_exposure(painted):
-    """Catches gains and offsets that are not found, mixed up between cameras, or wrong by more than two levels."""
+    """Catches gains and offsets that are not found, mixed up between cameras, or wrong by more than
+    two levels."""
     gain, offset = unlike_cameras()
     plan, settings = planned(painted(gain=gain, offset=offset))
     assert on(plan) == {"antialiasing", "background", "density", "exposure"}
@@ -148,46 +165,60 @@ def test_one_camera(painted):
     plan, settings = planned(painted(cameras=1, paint=gloss))
     assert on(plan) == {"antialiasing", "background", "density", "depth-limits"}
     assert (settings.scale_limit, settings.stray_limit, settings.adam_epsilon) == (1.5, 0.5, 0.03)
-    with pytest.raises(StgaError, match="--effect view-color=on: is not possible, because a single camera"):
+    with pytest.raises(
+        StgaError, match="--effect view-color=on: is not possible, because a single camera"
+    ):
         planned(painted(cameras=1, paint=gloss), view_color="on")
-    with pytest.raises(StgaError, match="--effect exposure=on: is not possible, because a single image"):
+    with pytest.raises(
+        StgaError, match="--effect exposure=on: is not possible, because a single image"
+    ):
         planned(painted(cameras=1, timesteps=1, paint=gloss), exposure="on")
     assert settings.sh_steps == ()
 
 
 def test_one_frame(painted):
-    """Catches strain that is asked of a single frame, and a static capture that is refused as a whole."""
+    """Catches strain that is asked of a single frame, and a static capture that is refused as a
+    whole."""
     plan, _ = planned(painted(timesteps=1, deformed=0.0))
     assert on(plan) == {"antialiasing", "background", "density"}
-    with pytest.raises(StgaError, match="strain-color=on: is not possible, because the mesh has the same shape"):
+    with pytest.raises(
+        StgaError, match="strain-color=on: is not possible, because the mesh has the same shape"
+    ):
         planned(painted(timesteps=1, deformed=0.0), strain_color="on")
     with pytest.raises(StgaError, match="selection=on: is not possible, because no triangle moves"):
         planned(painted(timesteps=1, deformed=0.0), selection="on")
 
 
 def test_background(painted):
-    """Catches a background that is guessed without masks, and a wrong color that splats are trained against."""
+    """Catches a background that is guessed without masks, and a wrong color that splats are trained
+    against."""
     plan, settings = planned(painted(background=(0, 0, 0), **FEW_VIEWS))
     assert plan["background"].on
     assert settings.background == (0.0, 0.0, 0.0)
     plan, settings = planned(painted(masks=False, **FEW_VIEWS))
     assert not plan["background"].on
     assert not settings.random_background
-    with pytest.raises(StgaError, match="background=on: is not possible, because not every image has a mask"):
+    with pytest.raises(
+        StgaError, match="background=on: is not possible, because not every image has a mask"
+    ):
         planned(painted(masks=False, **FEW_VIEWS), background="on")
 
 
 def test_a_room_behind_the_head(painted):
-    """Catches masks that are not used, and a background of many colors that is exchanged as if it had one."""
+    """Catches masks that are not used, and a background of many colors that is exchanged as if it
+    had one."""
     facts = CaptureFacts(painted(), make_settings(iterations=1))
-    facts.samples = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
+    facts.samples = replace(
+        facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0)
+    )
     verdict = rules.background(facts)
     assert (verdict.on, verdict.changes["backdrop"]) == (True, "masked")
     assert "varies by 40 of 255 levels, is replaced" in verdict.reason
 
 
 def test_a_world_is_kept_where_it_is_asked_for(painted):
-    """Catches splats of a wall that nobody asked for, and a world that is told from a camera that moves."""
+    """Catches splats of a wall that nobody asked for, and a world that is told from a camera that
+    moves."""
     facts = CaptureFacts(painted(), make_settings(iterations=1))
     assert rules.world(facts).fixed
     varied = replace(facts.samples, background_spread=np.full(len(facts.samples.camera), 40.0))
@@ -198,17 +229,26 @@ def test_a_world_is_kept_where_it_is_asked_for(painted):
     first, *rest = facts.capture.views["train"]
     pose = first.camera.world_to_camera.copy()
     pose[0, 3] += 0.001
-    again = replace(first, camera=replace(first.camera, world_to_camera=pose), timestep=first.timestep + 1)
-    moved = CaptureFacts(replace(facts.capture, views={"train": (first, *rest, again)}), facts.settings)
+    again = replace(
+        first, camera=replace(first.camera, world_to_camera=pose), timestep=first.timestep + 1
+    )
+    moved = CaptureFacts(
+        replace(facts.capture, views={"train": (first, *rest, again)}), facts.settings
+    )
     moved.samples = varied
     assert (rules.world(moved).fixed, rules.world(moved).reason[:9]) == (True, "1 of 8 ca")
 
 
 def test_a_room_without_masks(painted):
-    """Catches a run that makes splats of the wall behind the head, or that does not say what it leaves out."""
+    """Catches a run that makes splats of the wall behind the head, or that does not say what it
+    leaves out."""
     capture = painted(masks=False, background=(90, 110, 70), **FEW_VIEWS)
     plan, settings = planned(capture)
-    assert (settings.backdrop, settings.hull_points, settings.random_background) == ("mesh", False, True)
+    assert (settings.backdrop, settings.hull_points, settings.random_background) == (
+        "mesh",
+        False,
+        True,
+    )
     assert "sampled images have no mask" in plan["background"].reason
     with pytest.raises(StgaError, match="hull-points=on: is not possible, because without masks"):
         planned(capture, hull_points="on")
@@ -218,16 +258,19 @@ def test_a_room_without_masks(painted):
 def test_something_beside_the_mesh(painted):
     """Catches hair that gets no splats because the mesh ends below it."""
     capture = painted()
-    low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]  # the ball's top is cut off
+    # the ball's top is cut off
+    low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]
     plan, settings = planned(replace(capture, faces=low))
     assert plan["hull-points"].on
     assert settings.hull_points
 
 
 def test_something_beside_the_mesh_of_one_camera(painted):
-    """Catches hair that a single camera shows and nothing is trained for, and depth that is promised from it."""
+    """Catches hair that a single camera shows and nothing is trained for, and depth that is
+    promised from it."""
     capture = painted(cameras=1)
-    low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]  # the ball's top is cut off
+    # the ball's top is cut off
+    low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]
     plan, settings = planned(replace(capture, faces=low))
     assert settings.hull_points
     assert "becomes a flat layer" in plan["hull-points"].reason
@@ -237,26 +280,36 @@ def test_different_pixels(painted):
     """Catches cameras whose pixels are of different size and are treated as alike."""
     capture = painted()
     views = [
-        replace(view, camera=replace(view.camera, fl_x=840.0, fl_y=840.0)) if view.camera_index == 0 else view
+        replace(view, camera=replace(view.camera, fl_x=840.0, fl_y=840.0))
+        if view.camera_index == 0
+        else view
         for view in capture.views["train"]
     ]
-    facts = CaptureFacts(replace(capture, views={"train": tuple(views)}), make_settings(iterations=1, lattice=0))
+    facts = CaptureFacts(
+        replace(capture, views={"train": tuple(views)}), make_settings(iterations=1, lattice=0)
+    )
     assert facts.pixel_range == pytest.approx(2.0, abs=0.1)
     assert rules.antialiasing(facts).on
-    assert not rules.antialiasing(CaptureFacts(painted(), make_settings(iterations=1, lattice=0))).on
+    assert not rules.antialiasing(
+        CaptureFacts(painted(), make_settings(iterations=1, lattice=0))
+    ).on
     assert rules.antialiasing(CaptureFacts(painted(), make_settings(iterations=1))).on
 
 
 def test_many_splats_a_pixel(painted):
     """Catches density control where the first splats are already finer than the images."""
-    settings, plan = plan_effects(painted(**FEW_VIEWS), make_settings(iterations=1, lattice=8, effects={}))
+    settings, plan = plan_effects(
+        painted(**FEW_VIEWS), make_settings(iterations=1, lattice=8, effects={})
+    )
     assert not next(decision.on for decision in plan if decision.effect == "density")
     assert settings.density_interval == 0
 
 
 def test_selection_follows_the_strategy(painted):
     """Catches a strategy that was asked for and is dropped, or one that was not and is taken."""
-    settings, _ = plan_effects(painted(**FEW_VIEWS), make_settings("selective", iterations=1, effects={}))
+    settings, _ = plan_effects(
+        painted(**FEW_VIEWS), make_settings("selective", iterations=1, effects={})
+    )
     assert settings.strategy == "selective"
     _, settings = planned(painted(**FEW_VIEWS), selection="on")
     assert settings.strategy == "selective"
@@ -275,7 +328,9 @@ def frame(**pose):
 def with_frames(*frames):
     """Facts of a FLAME capture that has these frames and no teeth."""
     model = SimpleNamespace(v_template=np.zeros((10, 3)), masks={})
-    flame = SimpleNamespace(timesteps=tuple(range(len(frames))), frame=lambda timestep: frames[timestep], model=model)
+    flame = SimpleNamespace(
+        timesteps=tuple(range(len(frames))), frame=lambda timestep: frames[timestep], model=model
+    )
     capture = SimpleNamespace(views={"train": ()}, flame=flame, timesteps=flame.timesteps)
     return CaptureFacts(capture, make_settings(iterations=1))
 
@@ -301,7 +356,8 @@ def test_joints_that_move(name, pose):
 
 
 def test_dynamic_offsets():
-    """Catches offsets that are switched off although the tracked mesh is made with them, and the other way round."""
+    """Catches offsets that are switched off although the tracked mesh is made with them, and the
+    other way round."""
     assert looked(with_frames(frame()), "dynamic-offsets").on is False
     found = looked(with_frames(frame(), frame(dynamic_offset=np.ones((10, 3)))), "dynamic-offsets")
     assert (found.on, found.fixed) == (True, True)
@@ -309,28 +365,38 @@ def test_dynamic_offsets():
 
 def off_track(capture, meters, device="cpu"):
     """Facts of the ball as if it were a FLAME capture tracked so far beside its images."""
-    meshes = {timestep: capture.mesh(timestep) + np.array([meters, 0, 0]) for timestep in capture.timesteps}
-    facts = CaptureFacts(replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device)
+    meshes = {
+        timestep: capture.mesh(timestep) + np.array([meters, 0, 0])
+        for timestep in capture.timesteps
+    }
+    facts = CaptureFacts(
+        replace(capture, mesh=meshes.__getitem__), make_settings(iterations=1), device
+    )
     facts.frames = [frame()]
     return facts
 
 
 def test_mesh_and_mask_disagree(painted):
-    """Catches a tracking that is off and left so, and one that is refined although nothing says that it is off."""
+    """Catches a tracking that is off and left so, and one that is refined although nothing says
+    that it is off."""
     assert not rules.tracking(off_track(painted(), 0.0)).on
     found = rules.tracking(off_track(painted(), 0.012))  # five pixels
     assert found.on
     assert 0.5 < float(found.reason.split("%")[0]) < 5.0
     unknown = rules.tracking(off_track(painted(masks=False), 0.012))
     assert (unknown.on, unknown.fixed) == (False, False)
-    for impossible in (off_track(painted(timesteps=1), 0.012), off_track(painted(), 0.012, "cuda:0")):
+    for impossible in (
+        off_track(painted(timesteps=1), 0.012),
+        off_track(painted(), 0.012, "cuda:0"),
+    ):
         verdict = rules.tracking(impossible)
         assert (verdict.on, verdict.fixed) == (False, True)
     assert "on the CPU only, not on cuda:0" in verdict.reason
 
 
 def test_a_capture_that_was_tracked_here(painted, tmp_path):
-    """Catches the effect left off where masks are filled and the tracking is known to be that of landmarks."""
+    """Catches the effect left off where masks are filled and the tracking is known to be that of
+    landmarks."""
     facts = off_track(painted(), 0.0)
     facts.capture = replace(facts.capture, root=tmp_path)
     assert not rules.tracking(facts).on
@@ -352,8 +418,14 @@ def test_what_a_mesh_sequence_has_not(painted):
 
 def test_overrides(painted):
     """Catches a choice that does not reach the settings, or whose reason is lost."""
-    plan, settings = planned(painted(), strain_color="on", view_color="on", background="off", density="off")
-    assert (settings.strain_color, settings.sh_degree, settings.random_background) == (True, 3, False)
+    plan, settings = planned(
+        painted(), strain_color="on", view_color="on", background="off", density="off"
+    )
+    assert (settings.strain_color, settings.sh_degree, settings.random_background) == (
+        True,
+        3,
+        False,
+    )
     assert settings.density_interval == 0
     assert plan["strain-color"].choice == "on"
     assert "as asked" in str(plan["strain-color"])
@@ -367,24 +439,39 @@ def tracked(root, report):
 
 
 def test_torso(tmp_path):
-    """Catches shoulders that are taken off the head without evidence, and evidence that is not shown."""
+    """Catches shoulders that are taken off the head without evidence, and evidence that is not
+    shown."""
     misfit = {"head": 0.4, "still": 0.2, "own": 0.1}
-    verdict = rules.torso(tracked(tmp_path, {"torso": {"motion": "own", "misfit": misfit, "turn_deg": 17.3}}))
+    verdict = rules.torso(
+        tracked(tmp_path, {"torso": {"motion": "own", "misfit": misfit, "turn_deg": 17.3}})
+    )
     assert verdict.on
     assert all(figure in verdict.reason for figure in ("17°", "40%", "20%", "10%"))
     shifted = {"motion": "own", "misfit": misfit, "turn_deg": 3.0, "shift_mm": 8.2}
     assert "3° and 8 mm" in rules.torso(tracked(tmp_path, {"torso": shifted})).reason
-    assert "bends by up to 10 mm" in rules.torso(tracked(tmp_path, {"torso": {**shifted, "bend_mm": 10.4}})).reason
-    assert not rules.torso(tracked(tmp_path, {"torso": {"motion": "head", "misfit": misfit, "turn_deg": 0.0}})).on
+    assert (
+        "bends by up to 10 mm"
+        in rules.torso(tracked(tmp_path, {"torso": {**shifted, "bend_mm": 10.4}})).reason
+    )
+    assert not rules.torso(
+        tracked(tmp_path, {"torso": {"motion": "head", "misfit": misfit, "turn_deg": 0.0}})
+    ).on
     assert not rules.torso(tracked(tmp_path, {"torso": None})).on
     assert not rules.torso(tracked(tmp_path, {})).on
     assert rules.torso(SimpleNamespace(frames=[])) is None
 
 
-@pytest.mark.parametrize("change", [{"motion": "falls"}, {"misfit": {"head": 2.0}}, {"turn_deg": None}, {"more": 1}])
+@pytest.mark.parametrize(
+    "change", [{"motion": "falls"}, {"misfit": {"head": 2.0}}, {"turn_deg": None}, {"more": 1}]
+)
 def test_a_report_that_does_not_tell_how_the_torso_moves(tmp_path, change):
     """Catches a traceback on a damaged tracking.json."""
-    torso = {"motion": "own", "misfit": {"head": 0.4, "still": 0.2, "own": 0.1}, "turn_deg": 17.3, **change}
+    torso = {
+        "motion": "own",
+        "misfit": {"head": 0.4, "still": 0.2, "own": 0.1},
+        "turn_deg": 17.3,
+        **change,
+    }
     with pytest.raises(StgaError, match=r"tracking\.json: torso"):
         rules.torso(tracked(tmp_path, {"torso": torso}))
 
@@ -414,9 +501,11 @@ def test_samples(painted):
 
 
 def test_hidden_triangles(painted):
-    """Catches colors of whatever stands in front, a hand or the nose, that are taken for the triangle's own."""
+    """Catches colors of whatever stands in front, a hand or the nose, that are taken for the
+    triangle's own."""
     capture = painted()
-    plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])  # above the ball's equator
+    # above the ball's equator
+    plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])
     corners = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(capture.neutral)
     neutral = np.concatenate([capture.neutral, plate])
     front = replace(
@@ -436,7 +525,8 @@ def test_hidden_triangles(painted):
 
 
 def test_views_are_spread():
-    """Catches cameras or timesteps that are left out of a long sequence, and more views than there is time for."""
+    """Catches cameras or timesteps that are left out of a long sequence, and more views than there
+    is time for."""
     views = [SimpleNamespace(timestep=t, camera_index=c) for t in range(500) for c in range(16)]
     chosen = sample_views(views)
     assert len(chosen) == MAX_VIEWS == len({(view.timestep, view.camera_index) for view in chosen})
@@ -448,15 +538,21 @@ def test_views_are_spread():
 
 
 def test_every_camera_is_sampled(painted):
-    """Catches cameras without exposure: those beyond the sampled views, and one that films where no timestep is."""
-    views = [SimpleNamespace(timestep=t, camera_index=c) for t in range(20) for c in range(3 * MAX_VIEWS)]
+    """Catches cameras without exposure: those beyond the sampled views, and one that films where no
+    timestep is."""
+    views = [
+        SimpleNamespace(timestep=t, camera_index=c) for t in range(20) for c in range(3 * MAX_VIEWS)
+    ]
     late = [view for view in views if view.camera_index != 7 or view.timestep == 4]
     for given in (views, late):
         chosen = [view.camera_index for view in sample_views(given)]
         assert set(chosen) == set(range(3 * MAX_VIEWS))
         assert len(chosen) <= 3 * MAX_VIEWS + 1
     capture = painted(cameras=MAX_VIEWS + 12, timesteps=1, deformed=0.0)
-    assert len(CaptureFacts(capture, make_settings(iterations=5)).camera_colors.camera) == MAX_VIEWS + 12
+    assert (
+        len(CaptureFacts(capture, make_settings(iterations=5)).camera_colors.camera)
+        == MAX_VIEWS + 12
+    )
 
 
 def test_two_cameras_that_are_alike(painted):
@@ -467,8 +563,11 @@ def test_two_cameras_that_are_alike(painted):
 
 
 def test_each_timestep_is_posed_once(painted, monkeypatch):
-    """Catches a long capture of which every timestep is posed, or one several times, to decide its effects."""
-    monkeypatch.setattr("stga_addon.training.effects.facts.lip_pairs", lambda model: np.arange(30).reshape(2, 15))
+    """Catches a long capture of which every timestep is posed, or one several times, to decide its
+    effects."""
+    monkeypatch.setattr(
+        "stga_addon.training.effects.facts.lip_pairs", lambda model: np.arange(30).reshape(2, 15)
+    )
     neutral = np.random.default_rng(0).normal(size=(TEMPLATE_VERTICES + TEETH_VERTICES, 3))
     posed: list[int] = []
 
@@ -478,7 +577,11 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
 
     flame = SimpleNamespace(model=SimpleNamespace(v_template=neutral, masks={"teeth": [0]}))
     capture = replace(
-        painted(), timesteps=tuple(range(500)), neutral=neutral, expression_mesh=expression_mesh, flame=flame
+        painted(),
+        timesteps=tuple(range(500)),
+        neutral=neutral,
+        expression_mesh=expression_mesh,
+        flame=flame,
     )
     facts = CaptureFacts(capture, make_settings(iterations=1))
     assert facts.selected_share == 1
@@ -488,13 +591,17 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
 
 
 def test_lips_that_part(painted, shared_data):
-    """Catches lips that are not those of FLAME's mesh, and a head that turns taken for lips that part."""
+    """Catches lips that are not those of FLAME's mesh, and a head that turns taken for lips that
+    part."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, faces = data["v_template"].astype(float), data["faces"]
     closed = np.concatenate([template, np.zeros((TEETH_VERTICES, 3))])
     faces = np.concatenate([faces, teeth_faces(TEMPLATE_VERTICES)])
-    model = SimpleNamespace(v_template=closed, faces=faces, masks={"teeth": [0]}, expression_names=())
-    opened = closed - [0, 0.01, 0] * (closed[:, 1:2] < -0.047)  # a cut through the mouth, below its corners
+    model = SimpleNamespace(
+        v_template=closed, faces=faces, masks={"teeth": [0]}, expression_names=()
+    )
+    # a cut through the mouth, below its corners
+    opened = closed - [0, 0.01, 0] * (closed[:, 1:2] < -0.047)
     meshes = [closed, closed @ [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], opened]
     capture = replace(
         painted(),
@@ -505,13 +612,20 @@ def test_lips_that_part(painted, shared_data):
     )
     settings = make_settings(iterations=1)
     assert CaptureFacts(capture, settings).lip_gap_mm == pytest.approx(0, abs=1e-9)
-    assert CaptureFacts(replace(capture, timesteps=(0, 2)), settings).lip_gap_mm == pytest.approx(10, abs=0.2)
+    assert CaptureFacts(replace(capture, timesteps=(0, 2)), settings).lip_gap_mm == pytest.approx(
+        10, abs=0.2
+    )
 
 
 def test_a_sample_without_motion_does_not_forbid_selection(painted):
-    """Catches a choice that is refused because the few timesteps that were posed happen not to move."""
+    """Catches a choice that is refused because the few timesteps that were posed happen not to
+    move."""
     capture = painted()
-    still = replace(capture, timesteps=tuple(range(500)), expression_mesh=lambda timestep, zero_pose: capture.neutral)
+    still = replace(
+        capture,
+        timesteps=tuple(range(500)),
+        expression_mesh=lambda timestep, zero_pose: capture.neutral,
+    )
     verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
     assert (verdict.on, verdict.fixed) == (False, False)
     assert "any of 64 frames" in verdict.reason
