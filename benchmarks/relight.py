@@ -140,7 +140,7 @@ class Bench:
         relighter: Relighter | None,
         pictures: Path | None = None,
         **options: object,
-    ) -> np.ndarray:
+    ) -> tuple[float, ...]:
         """Mean PSNR in the mask, LPIPS, PSNR of eyes and mouth."""
         found = []
         for view, image in self.images(name, relighter, **options):
