@@ -23,23 +23,23 @@ from stga_addon import __version__
 
 HEADER = """# Results
 
-Written by `python benchmarks/results.py {capture}`, on {machine}. RUN is a
-new folder. Compare figures within a table.
+Written by `python benchmarks/results.py {capture}`, on {machine}.
+RUN is a new folder. Compare figures within a table.
 
-PSNR in dB, higher is better; LPIPS, lower is better; means over views. *val*: the camera held out of training. *test*:
-expressions held out of training, all cameras. *head*: pixels inside the head mask. *moving*: pixels of the triangles
-that the default selection rule (2 mm) picks in that frame. ± is the standard deviation over seeds. The avatar of a run
-is the sharpest one on *val*, which favors *val* slightly; *test* is not used in training. `studio_head` is development
-data outside this repository: a path-traced head with 12 training timesteps, 15 training cameras at 275×401 and a
-tracked mesh of 10,696 triangles. Choices behind the settings are measured in [experiments](experiments.md), stages of
-an iteration in [performance](performance.md).
+PSNR in dB; LPIPS, lower is better; means over views. *val*: the camera held out of training, which
+chooses the run's avatar. *test*: expressions held out of training, all cameras. *head*: pixels
+inside the head mask. *moving*: pixels of the triangles that the default selection rule (2 mm) picks
+in that frame. ± is the standard deviation over seeds. `studio_head` is development data outside this
+repository: a path-traced head with 12 training timesteps, 15 training cameras at 275×401 and a
+tracked mesh of 10,696 triangles.
 """
 EXTENDING = """
-The training timesteps become two takes; *before* is an avatar of the first, which the arms continue for the same time:
-*all-in-turn* trains all splats in views of both takes, *anew* trains another avatar on both, three times as long.
-*take_1*: the old take, *take_2*: the new one. *refine* trains the mouth (*region*) alone, *all* everything. PSNR of
-*val*. *s to same*: seconds until the moving region of the new take (or the region) is as good as *all-in-turn* (or
-*all*) leaves it; *s to 98 %*: until both takes have 98 % of the PSNR that *anew* ends with.
+The training timesteps become two takes. *before* is an avatar of the first, which the arms continue
+for the same time: *all-in-turn* trains all splats in views of both takes; *anew* trains another
+avatar on both, three times as long; *refine* trains the mouth (*region*) alone, *all* everything.
+*s to same*: seconds until the moving region of the new take (or the region) is as good as
+*all-in-turn* (or *all*) leaves it; *s to 98 %*: until both takes have 98 % of the PSNR
+of *anew*.
 """
 PARTS = (("whole image", ""), ("head", "_mask"), ("moving", "_moving"))
 """Row of the table, and suffix of the metrics as `stga eval` writes them."""
@@ -63,8 +63,9 @@ def sections(capture: str, share: float) -> dict[str, Section]:
         return f"{budget * share:g}"
 
     extend = (
-        f"python benchmarks/extend.py {capture} --base {round(1200 * share)} --seconds {seconds(20)} --seeds 0 1"
-        " --refine mouth --arms extend all-in-turn anew refine all --folder RUN --report RUN/report.txt"
+        f"python benchmarks/extend.py {capture} --base {round(1200 * share)}"
+        f" --seconds {seconds(20)} --seeds 0 1 --refine mouth"
+        " --arms extend all-in-turn anew refine all --folder RUN --report RUN/report.txt"
     )
     return {
         "default": Section(
@@ -124,7 +125,8 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{os.cpu_count()} cores of {[*names, platform.machine()][0]}, Python {platform.python_version()}"
+    name, python = [*names, platform.machine()][0], platform.python_version()
+    return f"{os.cpu_count()} cores of {name}, Python {python}"
 
 
 def main() -> None:
