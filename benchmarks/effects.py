@@ -195,7 +195,7 @@ def _outcome(runs: Sequence[tuple[dict[str, float], float, str]]) -> Outcome:
 
 def cell(value: Spread, decimals: int) -> str:
     return f"{value.mean:.{decimals}f}" + (
-        f" ± {value.spread:.{decimals}f}" if value.count > 1 else ""
+        f"±{value.spread:.{decimals}f}" if value.count > 1 else ""
     )
 
 

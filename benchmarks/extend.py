@@ -410,7 +410,7 @@ def spread(values: list[float], digits: int = 2, signed: bool = False) -> str:
         return ""
     if not np.isfinite(values).all():
         return "–"
-    deviation = f" ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else ""
+    deviation = f"±{np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else ""
     return f"{np.mean(values):{'+' if signed else ''}.{digits}f}{deviation}"
 
 

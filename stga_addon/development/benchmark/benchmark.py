@@ -174,7 +174,7 @@ def table_lines(table: Mapping[str, Mapping[str, Spread]]) -> list[str]:
 def _cell(value: Spread | None, decimals: int) -> str:
     if value is None:
         return ""
-    spread = "" if decimals < 2 or np.isnan(value.spread) else f" ± {value.spread:.{decimals}f}"
+    spread = "" if decimals < 2 or np.isnan(value.spread) else f"±{value.spread:.{decimals}f}"
     return f"{value.mean:,.{decimals}f}{spread}"
 
 

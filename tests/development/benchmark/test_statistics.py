@@ -127,7 +127,7 @@ def test_the_table() -> None:
     assert len({len(text) for text in lines}) == 1
     cells = [[cell.strip() for cell in text.strip("|").split("|")] for text in lines]
     assert cells[0] == ["variant", "iterations", "ms/it", "splats", "val", "SSIM", "Δ val"]
-    assert cells[2] == ["standard", "100", "100.0", "7", "30.50 ± 0.71", "0.9000 ± 0.0000", "+0.00"]
+    assert cells[2] == ["standard", "100", "100.0", "7", "30.50±0.71", "0.9000±0.0000", "+0.00"]
     assert cells[3][-1] == "-3.00"
 
 
