@@ -8,7 +8,7 @@ PARALLEL := -n auto --dist worksteal
 # assertions, anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo demo-footage test kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-complete repository clean
+.PHONY: demo demo-footage test test-all kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-complete repository clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -17,7 +17,13 @@ demo: .venv/ready
 demo-footage: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo --footage
 
+# What a commit needs
 test: .venv/ready
+	$(MAKE) --jobs 2 --output-sync lint kernels
+	$(BIN)/python -m pytest $(PARALLEL) -m "not nightly"
+
+# Clusters, kills, long runs, other versions of Blender, comparisons with Cycles as well
+test-all: .venv/ready
 	$(MAKE) --jobs 2 --output-sync lint kernels
 	$(BIN)/python -m pytest $(PARALLEL)
 
@@ -26,11 +32,11 @@ kernels: .venv/ready
 	$(BIN)/python tests/kernels.py
 
 test-fast: .venv/ready
-	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow and not nightly"
 
 # What `make test` skips on a machine without a graphics driver, a browser, Node.js or SLURM
 test-tools: .venv/ready
-	$(BIN)/python -m pytest $(PARALLEL) -m needs
+	$(BIN)/python -m pytest $(PARALLEL) -m "needs and not nightly"
 
 # STGA_BLENDER: the command that starts a Blender with a window (docs/blender.md)
 test-gui: .venv/ready

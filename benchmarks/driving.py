@@ -95,9 +95,8 @@ def mean_distance(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def combinations(heads: list[Head], poses: int) -> None:
-    print(
-        "## Combinations\n\n| identity | motion mm | map mm | free fit mm | map / free fit | max coefficient |"
-    )
+    print("## Combinations\n")
+    print("| identity | motion mm | map mm | free fit mm | map / free fit | max coefficient |")
     print("|---|---|---|---|---|---|")
     for number, head in enumerate(heads):
         weights = random_poses(poses // len(heads), np.random.default_rng(100 + number))
@@ -109,10 +108,8 @@ def combinations(heads: list[Head], poses: int) -> None:
             rows.append([mean_distance(p, wanted) for p in (head.rest, head.points(values), free)])
         motion, missed, best = np.mean(rows, axis=0)
         largest = np.abs(found[:, : head.count]).max()
-        print(
-            f"| {number} | {motion:.3f} | {missed:.3f} | {best:.3f} | {missed / best:.3f} | {largest:.1f} |",
-            flush=True,
-        )
+        figures = f"{motion:.3f} | {missed:.3f} | {best:.3f} | {missed / best:.3f} | {largest:.1f}"
+        print(f"| {number} | {figures} |", flush=True)
 
 
 def leaks(driver: Head, driven: Head, poses: int) -> None:
@@ -149,9 +146,8 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
         "this head's own coefficients": own,
         "best of this model": _fitted(driven, true, own),
     }
-    print(
-        "\n## Another person's motion\n\n| way | from ICT-FaceKit mm | less % | from own coefficients mm | less % |"
-    )
+    print("\n## Another person's motion\n")
+    print("| way | from ICT-FaceKit mm | less % | from own coefficients mm | less % |")
     print("|---|---|---|---|---|")
     first: np.ndarray | None = None
     for name, values in ways.items():
@@ -219,9 +215,8 @@ def main() -> None:
     combinations(heads, options.poses)
     leaks(heads[1], heads[2], options.leak_poses)
     errors = there_and_back(heads[0])
-    print(
-        f"\n## Per shape\n\n{(errors < 0.01).sum()} of {len(errors)} weights come back within 0.01\n"
-    )
+    print(f"\n## Per shape\n\n{(errors < 0.01).sum()} of {len(errors)} weights", end=" ")
+    print("come back within 0.01\n")
     print("| shape | reach % | error there and back |\n|---|---|---|")
     reach = np.mean([head.map.reach for head in heads], axis=0)
     for name, share, error in zip(ARKIT_SHAPES, reach, errors, strict=True):

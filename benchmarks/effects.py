@@ -249,9 +249,10 @@ def auto_and_all(opened: Mapping[str, Capture], options: argparse.Namespace) -> 
         more = [effect for effect in every.on.split(", ") if effect not in auto.on.split(", ")]
         right = not more or (difference > -MAX_LOSS_DB and auto.pace.mean < every.pace.mean)
         row(
-            name, cell(auto.psnr["val"], 2), cell(every.psnr["val"], 2), f"{difference:+.2f}", cell(auto.pace, 1),
-            cell(every.pace, 1), "yes" if right else "no", ", ".join(more) or "nothing",
-        )  # fmt: skip
+            *(name, cell(auto.psnr["val"], 2), cell(every.psnr["val"], 2), f"{difference:+.2f}"),
+            *(cell(auto.pace, 1), cell(every.pace, 1), "yes" if right else "no"),
+            ", ".join(more) or "nothing",
+        )
 
 
 def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:

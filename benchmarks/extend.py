@@ -324,7 +324,8 @@ def describe(line: dict[str, float]) -> str:
     figures = "  ".join(
         f"{name} {line[f'psnr_{name}']:.2f}" for name in FIGURES if f"psnr_{name}" in line
     )
-    return f"{line['arm']:20} {line['seconds']:6.1f} s {line['iterations']:5d} it  all {line['psnr']:.2f}  {figures}"
+    spent = f"{line['arm']:20} {line['seconds']:6.1f} s {line['iterations']:5d} it"
+    return f"{spent}  all {line['psnr']:.2f}  {figures}"
 
 
 def table(runs: dict[str, list[list[Line]]]) -> list[str]:
@@ -376,9 +377,8 @@ def differences(runs: dict[str, list[list[Line]]]) -> list[str]:
             time_to(lines, "psnr", 0.98 * anew[-1]["psnr"]) / anew[-1]["seconds"]
             for lines, anew in pairs
         ]
-        found.append(
-            f"- 98 % of the PSNR of anew: after {spread([100 * share for share in shares], 1)} % of its time"
-        )
+        percent = spread([100 * share for share in shares], 1)
+        found.append(f"- 98 % of the PSNR of anew: after {percent} % of its time")
     for name, of_seeds in runs.items():
         if "refine" in name and "psnr_region" in of_seeds[0][-1]:
             gains = [lines[-1]["psnr_region"] - lines[0]["psnr_region"] for lines in of_seeds]

@@ -1,17 +1,13 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
-    python benchmarks/iteration.py [--head ellipsoid] [--device gpu] [--splats 60000] [--width 802]
-    [--height 550]
-                                   [--repeats 30] [--opensplat FOLDER] [--processor-time] [--out
-                                   FILE.json]
+    python benchmarks/iteration.py [--head ellipsoid] [--splats 60000] [--width 802] [--height 550]
+        [--repeats 30] [--opensplat FOLDER] [--processor-time] [--out FILE.json]
 
 Splats of SH degree 3 on the bundled head (23,400 triangles, denser at eyes and mouth, as heads
-are), or on an evenly covered ellipsoid, for which a selection costs most. On the CPU: the
+are), or on an evenly covered ellipsoid, for which a selection costs most. Prints the
 instruction set, and medians over repeats in one process; beside each stage the bytes it must at
 least move and the time that takes at this machine's measured copy bandwidth, and for the image loss
-its arithmetic at the measured rate of multiply-adds. On a GPU, whose queue is never waited for:
-means over all repeats, the same table by kernel, the dispatches, submits, waits and milliseconds
-that an iteration takes of the host, and the device's memory. --opensplat: a checkout of OpenSplat,
+its arithmetic at the measured rate of multiply-adds. --opensplat: a checkout of OpenSplat,
 whose CPU rasterizer is compiled and run on the same splats. Run it on an idle machine, or with
 --processor-time: instead of time that passes, that of the processor, of ours divided by its
 threads.
@@ -22,7 +18,6 @@ import json
 import statistics
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
 
@@ -58,7 +53,6 @@ from stga_addon.raster.cpu.tiles import (
     fill_pairs,
     sum_tiles,
 )
-from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.backend import Backend, Batch
 from stga_addon.training.optimize.frames import FrameStore
@@ -208,18 +202,24 @@ def stages(
     pair_gradients = np.empty((count, PROJECTED), np.float32)
     work = {
         "project": (
-            lambda: project_forward(everything, everywhere, parameters, face, frames, 3, False, False, r.projection),
+            lambda: project_forward(
+                everything, everywhere, parameters, face, frames, 3, False, False, r.projection
+            ),
             n * (59 + 16) * 4,
         ),
         "sort by depth": (lambda: sort_by_depth(r.projection, buffers), n * 36 + len(rows) * 44),
         "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts), n * 20),
         "arrange tiles": (lambda: arrange_tiles(counts.copy(), r.tile_rows), 2 * counts.nbytes),
         "fill pairs": (
-            lambda: fill_pairs(rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat),
+            lambda: fill_pairs(
+                rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat
+            ),
             count * 8 + n * 24,
         ),
         "blend": (
-            lambda: blend_forward(r.tiles, tiles_x, r.tile_rows, lists, r.projection, background, r.blended),
+            lambda: blend_forward(
+                r.tiles, tiles_x, r.tile_rows, lists, r.projection, background, r.blended
+            ),
             count * 42 + pixels * 20,
         ),
         "L1 + SSIM, both ways": (
@@ -228,14 +228,15 @@ def stages(
         ),
         "blend backward": (
             lambda: blend_backward(
-                r.tiles, tiles_x, lists, r.blended, wanted, columns, background, v_image, zero, pair_gradients
+                r.tiles, tiles_x, lists, r.blended, wanted, columns, background, v_image, zero,
+                pair_gradients,
             ),
             count * (46 + 36) + pixels * 24,
         ),
         "project backward": (
             lambda: project_backward(
-                rows, parameters, face, frames, 3, False, False, columns, lists, pair_gradients, gradients,
-                screen_gradient,
+                rows, parameters, face, frames, 3, False, False, columns, lists, pair_gradients,
+                gradients, screen_gradient,
             ),
             count * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),
@@ -244,31 +245,16 @@ def stages(
     return {name: (median_ms(call, repeats, clock), moved) for name, (call, moved) in work.items()}
 
 
-def device_step(
-    device: str,
-    splats: Splats,
-    mesh: np.ndarray,
-    faces: np.ndarray,
-    camera: Camera,
-    target: np.ndarray,
+def global_step(
+    splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
 ) -> tuple[Backend, Batch]:
-    """A whole iteration on a device of `choose_device`, from the posed mesh's frames on, and its
-    global batch."""
-    capture = Capture(
-        Path(),
-        "",
-        faces,
-        mesh,
-        {},
-        (0,),
-        {},
-        lambda timestep: mesh,
-        lambda timestep, zero_pose: mesh,
-    )
+    """A whole iteration on the CPU, from the posed mesh's frames on, and its global batch."""
+    poses = lambda timestep: mesh, lambda timestep, zero_pose: mesh
+    capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, *poses)
     given = make_settings(iterations=1), FrameStore(capture, "stga"), new_state(splats)
-    backend = make_backend(device, *given)
     view = View(0, 0, camera, "benchmark", Path())
-    return backend, Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
+    batch = Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
+    return make_backend("cpu", *given), batch
 
 
 def two_regions(
@@ -285,7 +271,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--device", default="cpu", metavar="{cpu,gpu,gpu:NAME}")
     parser.add_argument("--head", choices=tuple(REGIONS), default="bundled")
     parser.add_argument("--splats", type=int, default=60_000)
     parser.add_argument("--width", type=int, default=802)
@@ -297,33 +282,21 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    if options.opensplat and options.device != "cpu":
-        parser.error("--opensplat is compared with the CPU's rasterizer, not with --device")
     rng = np.random.default_rng(0)
     make_head = {"bundled": bundled_head, "ellipsoid": ellipsoid}[options.head]
     splats, mesh, faces = make_head(options.splats, rng)
     camera = front_camera(options.width, options.height)
     target = rng.integers(0, 256, (options.height, options.width, 3)).astype(np.uint8)
-    chosen, why = choose_device(options.device)
-    print(why)
-    backend, batch = device_step(chosen, splats, mesh, faces, camera, target)
+    backend, batch = global_step(splats, mesh, faces, camera, target)
     clock = time_of_a_thread if options.processor_time else perf_counter
-    if chosen == "cpu":
-        measure = partial(cpu_ms, backend, options.repeats, clock)
-        frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
-        found = cpu_table(splats, frames, target, options.repeats, clock)
-        if options.opensplat:
-            compare_opensplat(
-                options.opensplat, splats, frames, target, found, options.repeats, clock
-            )
-    else:
-        import gpu_kernels  # needs wgpu
+    frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
+    found = cpu_table(splats, frames, target, options.repeats, clock)
+    if options.opensplat:
+        compare_opensplat(options.opensplat, splats, frames, target, found, options.repeats, clock)
 
-        from stga_addon.training.optimize.gpu_backend import GpuBackend
+    def measure(batch: Batch) -> float:
+        return median_ms(lambda: backend.step(batch), options.repeats, clock)
 
-        assert isinstance(backend, GpuBackend)
-        measure = partial(gpu_kernels.queued_ms, backend, options.repeats)
-        found = gpu_kernels.kernel_table(backend, batch, options.repeats)
     whole = measure(batch)
     print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
     print(f"{'whole iteration':<22}{whole:8.2f}")
@@ -332,17 +305,11 @@ def main() -> None:
         parts[share] = measure(
             replace(batch, selected=two_regions(splats, mesh, faces, share, options.head))
         )
-        print(
-            f"local, {share:4.0%} selected   {parts[share]:8.2f}   {parts[share] / whole:.2f} of a global one"
-        )
+        ratio = parts[share] / whole
+        print(f"local, {share:4.0%} selected   {parts[share]:8.2f}   {ratio:.2f} of a global one")
     if options.out:
         result = {"stages_ms": found, "global_ms": whole, "local_ms": parts}
         options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-
-
-def cpu_ms(backend: Backend, repeats: int, clock: Callable[[], float], batch: Batch) -> float:
-    """Median time in milliseconds of an iteration on the CPU."""
-    return median_ms(lambda: backend.step(batch), repeats, clock)
 
 
 def instruction_set() -> str:
@@ -367,9 +334,8 @@ def cpu_table(
         print(f"{name:<22}{ms:8.2f}{moved / 1e6:8.1f}{floor:10.2f}{ms / floor:7.1f}")
     rate, ms = arithmetic_rate(clock), found["L1 + SSIM, both ways"][0]
     floor = 1e3 * target.shape[0] * target.shape[1] * LOSS_OPERATIONS / rate
-    print(
-        f"{rate / 1e9:.0f} billion multiply-adds a second: L1 + SSIM at least {floor:.2f} ms, ratio {ms / floor:.1f}"
-    )
+    print(f"{rate / 1e9:.0f} billion multiply-adds a second:", end=" ")
+    print(f"L1 + SSIM at least {floor:.2f} ms, ratio {ms / floor:.1f}")
     return {name: ms for name, (ms, _) in found.items()}
 
 
@@ -395,18 +361,19 @@ def compare_opensplat(
     v_image = np.empty_like(output.image)
     image_gradient(output.image, target, whole_image(*target.shape[:2]), 0.2, v_image)
     peer = opensplat.both_ways_ms(
-        folder, output.projection, output.lists.visible, output.image.copy(), v_image, min(repeats, 5),
+        folder,
+        output.projection,
+        output.lists.visible,
+        output.image.copy(),
+        v_image,
+        min(repeats, 5),
         perf_counter if clock is perf_counter else process_time,
-    )  # fmt: skip
-    blending = found["blend"] + found["blend backward"]
-    print(
-        f"{'OpenSplat, both ways':<22}{peer[1]:8.2f}   forward {peer[0]:.2f}, on one thread, without projection"
     )
+    blending = found["blend"] + found["blend backward"]
+    print(f"{'OpenSplat, both ways':<22}{peer[1]:8.2f}   forward {peer[0]:.2f}, on one thread")
     print(f"{'blending, both ways':<22}{blending:8.2f}   {peer[1] / blending:.1f} times as fast")
     ours = median_ms(both_ways, repeats, clock)
-    print(
-        f"{'rendering, both ways':<22}{ours:8.2f}   {peer[1] / ours:.1f} times as fast, with projection and sorting"
-    )
+    print(f"{'with projection, sorting':<22}{ours:8.2f}   {peer[1] / ours:.1f} times as fast")
 
 
 if __name__ == "__main__":

@@ -21,16 +21,18 @@ BINDING = """
 #include "SOURCE_FILE"
 
 std::vector<torch::Tensor> both_ways(
-    int64_t width, int64_t height, std::vector<torch::Tensor> splats, torch::Tensor background, torch::Tensor v_image
+    int64_t width, int64_t height, std::vector<torch::Tensor> splats, torch::Tensor background,
+    torch::Tensor v_image
 ) {
-    auto &xy = splats[0], &conic = splats[1], &color = splats[2], &opacity = splats[3], &cov = splats[4];
+    auto &xy = splats[0], &conic = splats[1], &color = splats[2], &opacity = splats[3];
+    auto &cov = splats[4];
     auto [image, left, lists] = rasterize_forward_tensor_cpu(
         width, height, xy, conic, color, opacity, background, cov, splats[5]);
     std::vector<torch::Tensor> out = {image};
     if (v_image.numel()) {
         auto gradients = rasterize_backward_tensor_cpu(
-            height, width, xy, conic, color, opacity, background, cov, splats[5], left, lists, v_image,
-            torch::zeros_like(left));
+            height, width, xy, conic, color, opacity, background, cov, splats[5], left, lists,
+            v_image, torch::zeros_like(left));
         out.push_back(std::get<0>(gradients));
     }
     delete[] lists;
@@ -47,8 +49,8 @@ def build(folder: Path) -> Any:
 
 
 def both_ways_ms(
-    folder: Path, projection: layout.Projection, rows: np.ndarray, image: np.ndarray, v_image: np.ndarray, repeats: int,
-    clock: Callable[[], float],
+    folder: Path, projection: layout.Projection, rows: np.ndarray, image: np.ndarray,
+    v_image: np.ndarray, repeats: int, clock: Callable[[], float],
 ) -> tuple[float, float]:  # fmt: skip
     """Median milliseconds of its forward pass, and of forward and backward pass together, over a
     white background.

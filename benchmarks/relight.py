@@ -209,9 +209,8 @@ def measure(folder: Path, run: Path, seconds: str, pictures: Path | None) -> Non
     ball = gray_ball(bench.specs["A"])
     light = estimate_light(capture, Known(card=ball, toward=BALL))
     even = estimate_light(capture, Known(radiance=uniform(ball.mean(0) / CARD_REFLECTANCE)))
-    print(
-        f"{folder.name}: {len(avatar.splats)} splats; residual {light.residual:.3f}, damping {light.damping:.2f}"
-    )
+    print(f"{folder.name}: {len(avatar.splats)} splats;", end=" ")
+    print(f"residual {light.residual:.3f}, damping {light.damping:.2f}")
     relighter = Relighter(replace(avatar, light=light))
     rows: dict[str, tuple[Relighter | None, dict[str, Any]]] = {
         "as trained": (None, {}),

@@ -31,7 +31,7 @@ from unittest.mock import patch
 
 import matplotlib
 import numpy as np
-from iteration import bundled_head, device_step, front_camera, median_ms, two_regions
+from iteration import bundled_head, front_camera, global_step, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
 from stga_addon.raster.cpu import kernel_jit
@@ -71,7 +71,7 @@ def measure(
     head, mesh, faces = bundled_head(splats, rng)
     camera = front_camera(round(zoom * WIDTH), round(zoom * HEIGHT))
     target = rng.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)
-    step, batch = device_step("cpu", head, mesh, faces, camera, target)
+    step, batch = global_step(head, mesh, faces, camera, target)
     if share is not None:
         batch = replace(batch, selected=two_regions(head, mesh, faces, share))
     arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
@@ -262,7 +262,7 @@ def model(splats: int, repeats: int) -> None:
     head, mesh, faces = bundled_head(splats, rng)
     camera = front_camera(WIDTH, HEIGHT)
     target = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    backend, batch = device_step("cpu", head, mesh, faces, camera, target)
+    backend, batch = global_step(head, mesh, faces, camera, target)
     arrays = Parameters(*(getattr(head, name) for name in Parameters._fields))
     pairs = len(
         render_forward(
@@ -272,8 +272,8 @@ def model(splats: int, repeats: int) -> None:
     moved = splats * BYTES_PER_SPLAT + pairs * BYTES_PER_PAIR + WIDTH * HEIGHT * BYTES_PER_PIXEL
     latency = measure_latency(20 * repeats)
     print(
-        f"a thread joins after {1e3 * latency.awake:.1f} µs, each further one {1e3 * latency.further:.2f} µs later, "
-        f"one that sleeps after {1e3 * latency.asleep:.0f} µs"
+        f"a thread joins after {1e3 * latency.awake:.1f} µs, each further one "
+        f"{1e3 * latency.further:.2f} µs later, one that sleeps after {1e3 * latency.asleep:.0f} µs"
     )
     runs: dict[int, list[tuple[list[Kernel], float]]] = {count: [] for count in MODELLED_THREADS}
     for _ in range(repeats + 2):
@@ -290,8 +290,9 @@ def model(splats: int, repeats: int) -> None:
         spans = spans_ms(kernels, count, latency)
         work, ms = sum(sum(kernel.pieces) for kernel in kernels), sum(spans) + between
         single = single or ms
+        efficiency, bandwidth = single / ms / count, moved / ms / 1e6
         print(
-            f"{count:>7}{work:>8.2f}{between:>9.2f}{ms:>8.2f}{single / ms / count:>12.2f}{moved / ms / 1e6:>7.0f}"
+            f"{count:>7}{work:>8.2f}{between:>9.2f}{ms:>8.2f}{efficiency:>12.2f}{bandwidth:>7.0f}"
         )
     for kernel, span in zip(kernels, spans, strict=True):
         share = sum(kernel.pieces) / span / count

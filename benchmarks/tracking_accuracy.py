@@ -106,9 +106,8 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         distance = 1000 * nearest_points(local, found.faces, centers[seen])[1]
         same = len(found.faces) == len(true.faces) or len(mesh) - len(local) == TEETH_VERTICES
         shift = 1000 * np.linalg.norm(local[face] - mesh[face], axis=1).mean() if same else np.nan
-        print(
-            f"| {timestep} | {np.median(distance):.2f} | {np.percentile(distance, 90):.2f} | {shift:.2f} |"
-        )
+        median, most = np.median(distance), np.percentile(distance, 90)
+        print(f"| {timestep} | {median:.2f} | {most:.2f} | {shift:.2f} |")
     print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
     print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")
 

@@ -27,9 +27,15 @@ MANIFEST = "blender_manifest.toml"
 # Pure Python: one wheel serves every platform and Blender version. The manifest names the same
 # files.
 WHEELS = {
-    "filelock-4.2.11-py3-none-any.whl": "020e229e4bb9d410fc799c07ddf45fa217cba970278f40b30751d94f309b69e2",
-    "trimesh-5.2.0-py3-none-any.whl": "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29",
-    "tqdm-4.70.1-py3-none-any.whl": "c293e525e6fef9c20e8728fd4612df02a0aa31bb5fe91ecd93e123b1b7bffa73",
+    "filelock-4.2.11-py3-none-any.whl": (
+        "020e229e4bb9d410fc799c07ddf45fa217cba970278f40b30751d94f309b69e2"
+    ),
+    "trimesh-5.2.0-py3-none-any.whl": (
+        "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29"
+    ),
+    "tqdm-4.70.1-py3-none-any.whl": (
+        "c293e525e6fef9c20e8728fd4612df02a0aa31bb5fe91ecd93e123b1b7bffa73"
+    ),
 }
 KERNELS_FOLDER = "stga_addon/raster/cpu/compiled"
 """In the zip; `raster.cpu.bundled.BUNDLE`."""
@@ -199,7 +205,8 @@ def target_of(blender: Sequence[str]) -> Target:
     )
     if answer is None:
         raise StgaError(
-            f"{shlex.join(blender)}: did not say which Python it has (exit status {done.returncode})"
+            f"{shlex.join(blender)}: did not say which Python it has "
+            f"(exit status {done.returncode})"
         )
     python, (major, minor) = ".".join(answer[:2]), map(int, answer[2:])
     return Target(this_platform(), python, (f"{major}.{minor}.0", f"{major}.{minor + 1}.0"))
@@ -221,9 +228,8 @@ def build_editions(options: argparse.Namespace) -> Iterator[Path]:
         unpack_capture(demo)
         kernels = compile_kernels(target, wheel_folder(target), shlex.split(options.blender))
         if not kernels:
-            print(
-                f"{target.name}: no Python of it is here; kernels are compiled when they are first used"
-            )
+            print(f"{target.name}: no Python of it is here;", end=" ")
+            print("kernels are compiled when they are first used")
         yield build_zip(options.out, edition=complete(target), demo=demo, kernels=kernels)
 
 

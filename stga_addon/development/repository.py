@@ -24,9 +24,9 @@ TEXT = """<!DOCTYPE html>
 <meta charset="utf-8">
 <title>STGA Head Avatars for Blender</title>
 <h1>STGA Head Avatars for Blender</h1>
-<p>In Blender: Edit → Preferences → Get Extensions → Repositories → Add Remote Repository, with the address of
-<a href="index.json">index.json</a> on this server. Updates then come from here. Or download a zip and choose
-Install from Disk.</p>
+<p>In Blender: Edit → Preferences → Get Extensions → Repositories → Add Remote Repository, with the
+address of <a href="index.json">index.json</a> on this server. Updates then come from here. Or
+download a zip and choose Install from Disk.</p>
 <table>
 <tr><th>File</th><th>Version</th><th>Platform</th><th>Blender</th><th>Size</th></tr>
 {rows}
@@ -44,7 +44,8 @@ def write_repository(zips: Sequence[Path], out: Path, blender: Sequence[str]) ->
     """
     if not zips:
         raise StgaError(
-            "no zips for the repository; build one with `make extension` or `make extension-complete`"
+            "no zips for the repository; "
+            "build one with `make extension` or `make extension-complete`"
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent) as scratch:
@@ -94,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "zips",
         type=Path,
-        help="folder of the built zips: those of the complete edition where there are, else the small",
+        help="folder of the built zips: the complete edition's where there are, else the small",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the repository")
     parser.add_argument("--blender", default="blender", help="command that starts a Blender")

@@ -45,13 +45,16 @@ PLATFORM_TAGS = {
 newer."""
 MARKERS = {
     "linux-x64": {
-        "sys_platform": "linux", "platform_system": "Linux", "platform_machine": "x86_64", "os_name": "posix",
+        "sys_platform": "linux", "platform_system": "Linux", "platform_machine": "x86_64",
+        "os_name": "posix",
     },
     "windows-x64": {
-        "sys_platform": "win32", "platform_system": "Windows", "platform_machine": "AMD64", "os_name": "nt",
+        "sys_platform": "win32", "platform_system": "Windows", "platform_machine": "AMD64",
+        "os_name": "nt",
     },
     "macos-arm64": {
-        "sys_platform": "darwin", "platform_system": "Darwin", "platform_machine": "arm64", "os_name": "posix",
+        "sys_platform": "darwin", "platform_system": "Darwin", "platform_machine": "arm64",
+        "os_name": "posix",
     },
 }  # fmt: skip
 """Values of environment markers on each platform."""
@@ -61,8 +64,8 @@ PROVIDED = frozenset({"numpy"})
 """Packages that Blender brings."""
 PINS = {
     "": (
-        "filelock==4.2.11", "trimesh==5.2.0", "tqdm==4.70.1", "torch==2.13.0", "numba==0.68.1", "llvmlite==0.50.0",
-        "pillow==13.0.0", "platformdirs==4.14.7", "av==18.1.0", "wgpu==0.32.0",
+        "filelock==4.2.11", "trimesh==5.2.0", "tqdm==4.70.1", "torch==2.13.0", "numba==0.68.1",
+        "llvmlite==0.50.0", "pillow==13.0.0", "platformdirs==4.14.7", "av==18.1.0", "wgpu==0.32.0",
         "opencv-python-headless==4.14.0.94",
     ),
     # The last that run with numpy 1.24, which Blender 4.2 and 4.3 bring.
@@ -247,8 +250,9 @@ def _download(folder: Path, requirement: Requirement, target: Target) -> Path:
     if target.cuda:
         return _pip_download(folder, bare, target)
     raise StgaError(
-        f"{failure}; expected {build} where pip is configured to look, at {TORCH_CPU_INDEX}, or in {folder}; "
-        "with --allow-cuda (make: CUDA=1) the zip has the CUDA build, and gigabytes that nothing uses"
+        f"{failure}; expected {build} where pip is configured to look, at {TORCH_CPU_INDEX}, or in "
+        f"{folder}; with --allow-cuda (make: CUDA=1) the zip has the CUDA build, and gigabytes "
+        "that nothing uses"
     )
 
 

@@ -135,8 +135,8 @@ def test_markers_are_those_of_the_target(tmp_path: Path) -> None:
     """Catches dependencies of this computer in the zip of another system: pip evaluates markers
     where it runs."""
     wheel = make_wheel(
-        tmp_path, "torch", "2.13.0", "py3-none-any", 'cuda; platform_system == "Linux"', 'dll; os_name == "nt"',
-        'old; python_version < "3.12"', 'more; extra == "more"',
+        tmp_path, "torch", "2.13.0", "py3-none-any", 'cuda; platform_system == "Linux"',
+        'dll; os_name == "nt"', 'old; python_version < "3.12"', 'more; extra == "more"',
     )  # fmt: skip
     assert needs(wheel, LINUX) == ["cuda", "old"]
     assert needs(wheel, WINDOWS, {"more"}) == ["dll", "more"]

@@ -1,8 +1,5 @@
 """The WebGPU device: buffers, uploads, dispatches and what is said when something fails."""
 
-import importlib
-from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 import pytest
@@ -171,41 +168,3 @@ def test_adapters_have_names_of_their_own() -> None:
     """Catches two equal cards of which only one can be chosen."""
     assert len(adapters()) == len(set(adapters()))
     assert all(name.strip() for name in adapters())
-
-
-def count_up(device: Device, count: int, repeats: int) -> None:
-    """Dispatch a kernel of `count` threads in one recording."""
-    buffer = device.buffer("counted", count)
-    with device.record() as work:
-        for _ in range(repeats):
-            work.dispatch("numbers.main", count, {"numbers": buffer})
-
-
-def test_every_dispatch_is_timed(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches stamps of another dispatch or recording, lost beyond the first, in another unit, or
-    read twice."""
-    if "timestamp-query" not in device.gpu.features:
-        pytest.skip(f"{device.name} has no timestamp queries")
-    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "benchmarks")
-    gpu_kernels = importlib.import_module("gpu_kernels")
-    monkeypatch.setattr(gpu_kernels, "MAX_DISPATCHES", 90)
-    count = 500_000
-    count_up(device, count, 1)
-    device.kernel_times = times = gpu_kernels.KernelTimes(device.gpu)
-    try:
-        begin = perf_counter()
-        for repeats in (1, 50, 7):
-            count_up(device, count, repeats)
-        found = times.read()
-        elapsed_ms = 1e3 * (perf_counter() - begin)
-        assert list(found) == ["numbers.main"]
-        assert 0.2 * elapsed_ms < found["numbers.main"] <= elapsed_ms
-        assert times.read() == {}
-        count_up(device, 10, 1)
-        assert 0 < times.read()["numbers.main"] < found["numbers.main"] / 20
-        count_up(device, 10, 100)  # more than there is room for
-        assert times.read()["numbers.main"] > 0
-    finally:
-        device.kernel_times = None
-    count_up(device, 10, 1)
-    assert times.read() == {}

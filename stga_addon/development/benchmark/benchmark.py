@@ -134,7 +134,8 @@ def report_text(
     hit, checked = count_forecasts(runs)
     if any("val_psnr_unmatched" in row for row in table.values()):
         lines.append(
-            "The exposure of held-out cameras is fitted for all variants, but not in columns called unfitted."
+            "The exposure of held-out cameras is fitted for all variants, "
+            "but not in columns called unfitted."
         )
     lines += [f"Pareto front of PSNR over time: {', '.join(spans)}."] if spans else []
     lines += (

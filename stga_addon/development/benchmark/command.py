@@ -60,6 +60,9 @@ def run(options: Namespace, head: object) -> None:
 
 
 COMMAND = Command(
-    "Compare accuracy and training time of strategies and presets on the CPU. Variants train in turns.",
-    run, (BenchmarkOptions, EngineOptions), uses_head=True,
-)  # fmt: skip
+    "Compare accuracy and training time of strategies and presets on the CPU. "
+    "Variants train in turns.",
+    run,
+    (BenchmarkOptions, EngineOptions),
+    uses_head=True,
+)

@@ -56,15 +56,27 @@ CONVERGENCE_DEG = 2.5
 """By which each eye turns to the nose."""
 TRAIN_ACTS = (
     Act({}),
-    Act({"mouthSmile": 0.85, "cheekSquint": 0.6, "eyeSquint": 0.3, "mouthDimple": 0.3}, turn=(4, 0)),
     Act(
-        {"browInnerUp": 0.9, "browOuterUp": 0.8, "eyeWide": 0.6, "jawOpen": 0.5, "eyeBlink": 0, "mouthSmile": 0},
+        {"mouthSmile": 0.85, "cheekSquint": 0.6, "eyeSquint": 0.3, "mouthDimple": 0.3},
+        turn=(4, 0),
+    ),
+    Act(
+        {
+            "browInnerUp": 0.9, "browOuterUp": 0.8, "eyeWide": 0.6, "jawOpen": 0.5, "eyeBlink": 0,
+            "mouthSmile": 0,
+        },
         neck=(0, -4),
     ),
     Act({"eyeBlink": 1.0, "mouthPucker": 0.8, "mouthSmile": 0}, turn=(-3, 2)),
-    Act({"browDown": 0.8, "noseSneer": 0.5, "mouthFrown": 0.5, "mouthSmile": 0}, neck=(-6, 0), gaze=(13, 0)),
     Act(
-        {"mouthSmile": 0.7, "mouthUpperUp": 0.5, "mouthLowerDown": 0.45, "jawOpen": 0.12, "cheekSquint": 0.5},
+        {"browDown": 0.8, "noseSneer": 0.5, "mouthFrown": 0.5, "mouthSmile": 0},
+        neck=(-6, 0), gaze=(13, 0),
+    ),
+    Act(
+        {
+            "mouthSmile": 0.7, "mouthUpperUp": 0.5, "mouthLowerDown": 0.45, "jawOpen": 0.12,
+            "cheekSquint": 0.5,
+        },
         neck=(4, 2), gaze=(-12, 3),
     ),
 )  # fmt: skip

@@ -410,10 +410,13 @@ def _all_strands(paint: _Paint, neutral: np.ndarray) -> tuple[Strands, ...]:
     hair = _Growth(
         combed,
         lambda root: 0.022 + 0.048 * top(root),
-        rise=(44, -24), disorder=0.14, lift=lambda root: 0.25 + 0.75 * top(root), clump=0.75, clearance=0.005,
+        rise=(44, -24), disorder=0.14, lift=lambda root: 0.25 + 0.75 * top(root), clump=0.75,
+        clearance=0.005,
     )  # fmt: skip
     brow = _Growth(
-        lambda root, normal: np.stack([np.sign(root[:, 0]), 0.75 - 0.22 * (abs(root[:, 0]) - 1.2), 0 * root[:, 0]], 1),
+        lambda root, normal: np.stack(
+            [np.sign(root[:, 0]), 0.75 - 0.22 * (abs(root[:, 0]) - 1.2), 0 * root[:, 0]], 1
+        ),
         lambda root: np.full(len(root), 0.008),
         rise=(24, 4), disorder=0.15,
     )  # fmt: skip

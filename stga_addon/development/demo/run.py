@@ -77,9 +77,8 @@ def run_demo(out: Path, budget: Mapping[str, Any], device: str = "cpu") -> None:
         )
         print(f"{split}: PSNR {values['psnr']:.2f} dB{fitted}, SSIM {values['ssim']:.4f}")
     print(f"Blender places the splats within {error:.1e} m of numpy")
-    print(
-        f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png ({perf_counter() - begin:.0f} s)"
-    )
+    print(f"{out}: avatar.npz, avatar.html, demo.blend, comparison.png, selection.png", end=" ")
+    print(f"({perf_counter() - begin:.0f} s)")
 
 
 def avatar_from_footage(out: Path, seconds: float, device: str = "cpu") -> None:
@@ -155,7 +154,8 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
         worst = max(worst, float(np.abs(evaluated_splats(object_named(name))[0] - expected).max()))
     if worst > MAX_POSITION_ERROR_M:
         raise StgaError(
-            f"{path}: a splat is {worst:.1e} m from its position in numpy, more than {MAX_POSITION_ERROR_M:g} m"
+            f"{path}: a splat is {worst:.1e} m from its position in numpy, "
+            f"more than {MAX_POSITION_ERROR_M:g} m"
         )
     return worst
 

@@ -58,8 +58,6 @@ class Device:
     kernels.
 
     dispatches, submits, waits  how often work was dispatched, submitted and waited for by `read`
-    kernel_times                times the kernels while it is set (`KernelTimes` of
-                                benchmarks/gpu_kernels.py)
     failures                    what the driver raised while results were awaited
     """
 
@@ -82,7 +80,6 @@ class Device:
             self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"]
         )
         self.dispatches = self.submits = self.waits = 0
-        self.kernel_times: Any = None
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, list[Any]]] = {}
 
@@ -257,7 +254,7 @@ class Recording:
         indirect = not isinstance(groups[0], int)
         if not indirect and 0 in groups:
             return
-        compute = self._compute_pass(kernel)
+        compute = self._compute_pass()
         compute.set_pipeline(kernel.pipeline)
         compute.set_bind_group(0, self.device.bind(kernel, tables))
         if indirect:
@@ -280,8 +277,6 @@ class Recording:
         """Hand the work to the device and return without waiting for it."""
         with self.device.errors():
             self._end_pass()
-            if self.device.kernel_times is not None:
-                self.device.kernel_times.resolve(self._encoder)
             self.device.gpu.queue.submit([self._encoder.finish()])
             self.device.submits += 1
 
@@ -297,14 +292,8 @@ class Recording:
         if error is None:
             self.submit()
 
-    def _compute_pass(self, kernel: Kernel) -> Any:
-        times = self.device.kernel_times
-        if times is not None:
-            self._end_pass()
-            self._pass = self._encoder.begin_compute_pass(
-                timestamp_writes=times.writes(kernel.name)
-            )
-        elif self._pass is None:
+    def _compute_pass(self) -> Any:
+        if self._pass is None:
             self._pass = self._encoder.begin_compute_pass()
         return self._pass
 
@@ -371,7 +360,6 @@ def _open(name: str) -> tuple[Any, dict[tuple, Kernel], list[Exception]]:
     failures."""
     adapter = adapters()[name]
     device = adapter.request_device_sync(
-        required_features=sorted({"timestamp-query"} & adapter.features),
         required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
     )
     failures: list[Exception] = []
