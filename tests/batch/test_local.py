@@ -68,6 +68,7 @@ def killer(
             resumable += [name] if (folders[name].parent / CHECKPOINT).exists() else []
 
 
+@pytest.mark.nightly
 def test_killed_workers_resume_to_the_same_bits(
     tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -100,7 +100,7 @@ def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: TrainedHere) -> None:
     """Catches a cluster with a token that cannot be used, jobs that are lost with a node or train
     something else, and two workers on one."""
@@ -134,7 +134,7 @@ def test_a_cluster_of_this_machine_is_its_users(tmp_path: Path) -> None:
     assert run_script(BATCH, tmp_path)[-1] == str([("look", "finished", "")])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ctrl_c_through_ray(tmp_path: Path) -> None:
     """Catches Ctrl-C that Ray's tasks do not hear, or that takes the cluster away before they have
     saved."""

@@ -68,6 +68,7 @@ def test_same_results_through_slurm(
         )
 
 
+@pytest.mark.nightly
 @pytest.mark.needs("slurm")
 def test_jobs_of_a_dead_node_resume_elsewhere(
     on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
@@ -116,6 +117,7 @@ def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Pat
     assert (states[name], states["evaluate-seed1"]) == (JobState.FAILED, JobState.BLOCKED)
 
 
+@pytest.mark.nightly
 @pytest.mark.needs("slurm")
 def test_ctrl_c_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
     """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they have

@@ -37,7 +37,7 @@ BLENDERS = [
     if command.strip()
 ]
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.nightly,
     pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender"),
 ]
 SCRIPT = Path(__file__).with_name("complete_script.py")

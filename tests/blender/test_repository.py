@@ -72,7 +72,7 @@ def extension(blender: list[str], profile: Path, *arguments: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("blender", BLENDERS, ids=lambda command: "-".join(command[-2:]))
 def test_install_and_update(
     blender: list[str], zips: tuple[Path, Path], served: tuple[Path, str], tmp_path

@@ -43,7 +43,10 @@ def python_of(version: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize(
+    "version",
+    ["this", *(pytest.param(v, marks=pytest.mark.nightly) for v in VERSIONS if v != "this")],
+)
 @pytest.mark.usefixtures("zip_file")  # whose wheels are needed
 def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_path: Path) -> None:
     """Catches what works in the checkout, or in one Blender, and not in the zip, or in another."""

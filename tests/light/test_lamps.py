@@ -120,7 +120,7 @@ def blender_light(light: Light) -> dict:
     return {"kind": light.kind, "settings": settings, **vectors}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_irradiance_is_the_path_tracers(tmp_path):
     """Catches a light whose fall-off, cone or area differs from what Cycles shows, beyond 2 %."""
     pytest.importorskip("bpy")

@@ -18,7 +18,7 @@ from stga_addon.raster.cpu.threads import set_threads, threads
 from stga_addon.training.optimize.precompile import precompile_kernels
 from stga_addon.training.optimize.trainer import Trainer
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 ITERATIONS = int(os.environ.get("STGA_SOAK", 1500))
 STRAYS, DENSITY = 30, 40
 MARK = 250  # iterations between fingerprints

@@ -66,7 +66,7 @@ def test_demo_writes_its_files(demo):
     assert gray.sum() > 50, "no frozen splat is shown gray"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.needs("adapter")
 def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, capsys):
     """Catches `stga demo --device gpu` that trains on the CPU, or whose files need it."""

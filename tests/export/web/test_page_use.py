@@ -222,7 +222,7 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
     assert browser.errors == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
     """Catches textures, buffers and objects that pile up with the frames (ten minutes on an
     accelerated clock)."""
