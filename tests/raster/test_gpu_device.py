@@ -1,6 +1,5 @@
 """The WebGPU device: buffers, uploads, dispatches and what is said when something fails."""
 
-
 import numpy as np
 import pytest
 
