@@ -18,7 +18,7 @@ import bpy
 
 RESULT, WAIT, BUDGET = sys.argv[sys.argv.index("--") + 1 :]
 module = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-own_python = sys.modules[f"{module}.stga_addon.worker.own_python"].own_python
+own_python = sys.modules[f"{module}.stga_addon.worker.training_python"].own_python
 seen: dict[str, object] = {"version": bpy.app.version_string, "python": sys.version.split()[0]}
 
 
