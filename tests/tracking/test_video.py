@@ -88,10 +88,10 @@ def write_numbered(path, codec, options, frames=FRAMES, rate=25, durations=None)
         container.mux(stream.encode())
 
 
-def copy_packets(source, path, shift=0, first=0, last=None):
+def copy_packets(source, path, shift=0, first=0, last=None, options=None):
     """Copy the packets from number `first` to before `last`, in the order of decoding, `shift`
     frames earlier."""
-    with av.open(str(source)) as container, av.open(str(path), "w") as out:
+    with av.open(str(source)) as container, av.open(str(path), "w", options=options) as out:
         stream = container.streams.video[0]
         copied = out.add_stream_from_template(stream)
         per_frame = int(1 / (stream.average_rate * stream.time_base))
@@ -315,6 +315,27 @@ def test_constant_frame_rate(tmp_path, name, rate):
         copy_packets(tmp_path / name, tmp_path / "trimmed.mp4", shift=9)
         footage = open_footage(tmp_path / "trimmed.mp4")
         assert (footage.fps, footage.warnings) == (rate, ())
+
+
+def test_file_that_is_cut_off(tmp_path):
+    """Catches a download that ended early, and is refused for its last frame, or lacks those that
+    the decoder holds back."""
+    write_numbered(tmp_path / "a.mp4", "libx264", X264)
+    path = tmp_path / "cut.mp4"
+    copy_packets(tmp_path / "a.mp4", path, options={"movflags": "faststart"})
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        last = packets[33]
+        expected = sorted(packet.pts for packet in packets[:33])
+        numbers = [sorted(packet.pts for packet in packets).index(time) for time in expected]
+    path.write_bytes(path.read_bytes()[: last.pos + last.size // 2])
+    footage = open_footage(path)
+    assert f"{path}: is cut off; it ends after 33 frames" in footage.warnings
+    camera = footage.cameras[0]
+    for order in orders(33).values():
+        assert [shown(camera.image(camera.timesteps[n])) for n in order] == [
+            numbers[n] for n in order
+        ]
 
 
 def test_frame_that_the_decoder_leaves_out(tmp_path):

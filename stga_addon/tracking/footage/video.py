@@ -71,7 +71,8 @@ def read_video(path: Path) -> Video:
     all are.
     """
     size, first = _first_frames(path)
-    times: Sequence[int | None] | None = _packet_times(path)
+    times: Sequence[int | None] | None
+    times, is_cut_off = _packet_times(path)
     left_out = 0 if times is None or first[0] not in times else times.index(first[0])
     if times is None or times[left_out : left_out + len(first)] != first:
         times, left_out = _decoded_times(path), 0
@@ -91,6 +92,8 @@ def read_video(path: Path) -> Video:
         warnings += (
             f"{path}: its first {left_out} frames cannot be decoded; they are left out, and not counted",
         )
+    if is_cut_off:
+        warnings += (f"{path}: is cut off; it ends after {len(shown)} frames",)
     return Video(path, shown, timesteps, fps, size, warnings=warnings)
 
 
@@ -188,7 +191,8 @@ class VideoFrames:
                     self._container.seek(self.video.times[number - back], stream=stream)
                 except FFmpegError:
                     break
-                yield _from_key_frame(self._container.decode(stream), self.video.times[number])
+                frames = _decoded_frames(self._container)
+                yield _from_key_frame(frames, self.video.times[number])
         self.close()
         self._open()
         yield _decoded_frames(self._container)
@@ -238,9 +242,9 @@ def opened_video(path: Path) -> Iterator[Any]:
         raise StgaError(f"{path}: is not a readable video ({_reason(error)})") from error
 
 
-def _packet_times(path: Path) -> list[int] | None:
+def _packet_times(path: Path) -> tuple[list[int] | None, bool]:
     """When packets are shown, ascending; None where they do not say it, so that all frames must be
-    decoded.
+    decoded. And whether the file was found to end within a packet, which is left out.
 
     Packets that an edit list hides are decoded, but not shown.
     """
@@ -251,14 +255,21 @@ def _packet_times(path: Path) -> list[int] | None:
             and stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
         )
         if not (timed or _is_intra_only(stream)):
-            return None
-        packets = [
-            packet.pts
-            for packet in container.demux(stream)
-            if packet.size and not packet.is_discard
-        ]
+            return None, False
+        packets, is_cut_off = [], False
+        for packet in container.demux(stream):
+            if _is_cut_off(container, packet):
+                is_cut_off = True
+                break
+            if packet.size and not packet.is_discard:
+                packets.append(packet.pts)
     times = sorted(time for time in packets if time is not None)
-    return times if len(times) == len(packets) and _ascending(times) else None
+    return times if len(times) == len(packets) and _ascending(times) else None, is_cut_off
+
+
+def _is_cut_off(container: Any, packet: Any) -> bool:
+    """Other containers have corrupt packets in the middle, which decoders conceal."""
+    return packet.is_corrupt and _is_of(container, TIMED_CONTAINERS)
 
 
 def _decoded_times(path: Path) -> Sequence[int | None]:
@@ -275,6 +286,9 @@ def _decoded_frames(container: Any) -> Iterator[Any]:
 
     stream, may_fail = container.streams.video[0], _is_of(container, ("mpegts",))
     for packet in container.demux(stream):
+        if _is_cut_off(container, packet):
+            yield from stream.decode(None)  # what the decoder still holds
+            return
         try:
             frames = packet.decode()
         except InvalidDataError:
