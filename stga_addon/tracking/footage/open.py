@@ -118,7 +118,7 @@ def _sources(path: Path) -> tuple[Sources, Path]:
         return find_sources(root), root
     if isfile(path) and is_video(path):
         return Sources(root.parent, videos={root.stem: [root]}), root.parent
-    raise StgaError(f"{path}: is neither a folder nor a video; expected footage")
+    raise StgaError(f"{path}: is neither a folder nor a video; put photos into a folder")
 
 
 def _footage(
