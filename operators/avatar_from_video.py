@@ -20,7 +20,7 @@ from ..stga_addon.jobs.track import (
 from ..stga_addon.jobs.train import Train as TrainRequest
 from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
 from ..stga_addon.training.settings import make_settings
-from . import ids
+from . import ids, monitor
 from .common import FileImport, file_filter, file_path, path_property, reporting
 from .options import option_property
 from .request import needs_idle, start
@@ -95,6 +95,7 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
         settings = make_settings("global", seconds=round(60 * self.minutes, DIGITS), effects={})
         train = TrainRequest(capture.parent / RUN_FOLDER, capture, settings)
         request = MakeAvatar(self._tracking(video, capture), train)
+        monitor.show_panel()  # where it can be watched and cancelled, also after a drop
         if start(context.scene, request, python):
             self.report({"INFO"}, f"Made {request.out}")
         return {"FINISHED"}

@@ -464,11 +464,16 @@ def _adopt(scene: Any) -> None:
     shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
     if settings.head is None and len(heads) == 1:
         settings.head = heads[0]
-        if has_timer():
-            bpy.app.timers.register(_Sidebar(), first_interval=CHECK_INTERVAL_S)
+        show_panel()
         if settings.splats is None and len(shown) == 1:
             settings.splats = shown[0]
             settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
+
+
+def show_panel() -> None:
+    """Open the sidebar at the add-on's tab, where there is a window."""
+    if has_timer():
+        bpy.app.timers.register(_Sidebar(), first_interval=CHECK_INTERVAL_S)
 
 
 class _Sidebar:

@@ -91,6 +91,20 @@ def test_what_was_begun_is_continued_by_its_folder(asked, video, tmp_path):
     assert asked[1] == asked[0]
 
 
+def test_the_panel_is_opened(extension, asked, video, monkeypatch):
+    """Catches a dropped video that nothing tells of until its head arrives, minutes later."""
+    opened: list[bool] = []
+
+    def sidebar():
+        opened.append(True)
+        return lambda: None
+
+    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
+    monkeypatch.setattr(extension.operators.monitor, "_Sidebar", sidebar)
+    assert bpy.ops.stga.avatar_from_video(filepath=str(video)) == {"FINISHED"}
+    assert opened == [True]
+
+
 def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
     """Catches a worker that is started for nothing, and the request of another video in a
     folder."""
