@@ -51,7 +51,6 @@ from .folder import (
     is_written,
 )
 from .footage.model import Footage, FootageCamera
-from .footage.stored import StoredFrames, with_stored
 from .head_model import HeadModel, read_head_model
 from .landmarks import (
     CameraLandmarks,
@@ -244,7 +243,7 @@ def _given(head: HeadModel, footage: Footage, folder: Path) -> _Seen:
     _check_faces(footage, detected)
     seen = _Seen(*read_places(folder / PLACES_FILE, len(head.model.faces)), detected)
     for timestep, camera in footage.views():
-        if isinstance(camera.frames, StoredFrames):
+        if camera.kept:
             camera.image(timestep)  # in order, before helping processes ask for some
     return seen
 
@@ -433,12 +432,15 @@ def _begin(out: Path, source: dict[str, Any]) -> None:
 
 
 def _stored(footage: Footage, out: Path) -> Footage:
-    """The footage whose videos are decoded once: their frames are kept as the capture's images."""
-    images = {
-        camera.name: {t: out / image_name(t, number) for t in camera.timesteps}
-        for number, camera in enumerate(footage.cameras)
-    }
-    return with_stored(footage, images)
+    """The footage whose undistorted frames that are no files yet are decoded once: they are kept as
+    the capture's images. A file that exists is that of the frame."""
+    cameras = []
+    for number, camera in enumerate(footage.cameras):
+        if camera.undistortion is None and camera.file(camera.timesteps[0]) is None:
+            kept = {t: out / image_name(t, number) for t in camera.timesteps}
+            camera = replace(camera, kept=kept)
+        cameras.append(camera)
+    return replace(footage, cameras=tuple(cameras))
 
 
 def _recording(camera: FootageCamera) -> list[Any]:

@@ -43,18 +43,17 @@ from stga_addon.export.ply import PROPERTIES, read_ply, splat_columns, write_ply
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
+from stga_addon.tracking.footage.calibrations import read_nerfstudio
 from stga_addon.tracking.footage.colmap import read_colmap
-from stga_addon.tracking.footage.image_frames import ImageFrames
-from stga_addon.tracking.footage.metashape import read_metashape
-from stga_addon.tracking.footage.model import FootageCamera
-from stga_addon.tracking.footage.nerfstudio import read_nerfstudio
-from stga_addon.tracking.footage.realitycapture import (
+from stga_addon.tracking.footage.lens import undistortion
+from stga_addon.tracking.footage.model import FootageCamera, ImageFrames
+from stga_addon.tracking.footage.photogrammetry import (
+    read_metashape,
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
 from stga_addon.tracking.footage.shots import Shot
 from stga_addon.tracking.footage.sources import Sources, sequence_names
-from stga_addon.tracking.footage.undistort import undistortion
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_camera, read_places
 from stga_addon.training.run import checkpoint as checkpoints

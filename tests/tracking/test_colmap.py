@@ -19,7 +19,7 @@ def reconstruction():
     """One image for each camera model of `LENSES`, with random pose and points."""
     pycolmap = pytest.importorskip("pycolmap")
     found = pycolmap.Reconstruction()
-    for number, (name, (count, _)) in enumerate(LENSES.items(), start=1):
+    for number, (name, (_, _, count, _)) in enumerate(LENSES.items(), start=1):
         camera = pycolmap.Camera.create_from_model_name(number, name, 500.0, 640, 480)
         values = np.array(camera.params)
         values[len(values) - count :] = PARAMETERS.get(name, 0.05 * RANDOM.standard_normal(count))

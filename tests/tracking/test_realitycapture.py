@@ -5,7 +5,7 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.realitycapture import (
+from stga_addon.tracking.footage.photogrammetry import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
