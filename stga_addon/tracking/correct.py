@@ -15,7 +15,7 @@ from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
-from .contact_sheet import write_contact_sheet
+from .pictures import write_contact_sheet
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
 from .footage.model import Footage
 from .footage.open import open_footage

@@ -22,8 +22,6 @@ from ..flame.forward import RIGID_SIZE
 from ..flame.model import BUNDLED_HEAD
 from ..schema import to_json
 from ..worker.helpers import Helpers
-from .camera_scale import scale_warnings
-from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .dense import fit_dense
 from .dense_head import REGIONS
@@ -40,7 +38,7 @@ from .fit import (
     is_face,
     is_metric,
 )
-from .focal_length import solved_focal
+from .focal_length import scale_warnings, solved_focal
 from .folder import (
     KEPT_FOLDER,
     LANDMARKS_FOLDER,
@@ -63,7 +61,7 @@ from .landmarks import (
     write_places,
 )
 from .mattes import with_mattes
-from .pictures import Show, picture_of_first_frame, picture_of_fit
+from .pictures import Show, picture_of_first_frame, picture_of_fit, write_contact_sheet
 from .posed_points import PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
