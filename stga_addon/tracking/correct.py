@@ -15,11 +15,11 @@ from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
-from .pictures import write_contact_sheet
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
 from .footage.model import Footage
 from .footage.open import open_footage
 from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
+from .pictures import write_contact_sheet
 from .posed_points import PosedPoints, SurfacePoints
 from .solve import LANDMARK_SIGMA_M, acceleration_precision
 from .write_capture import moving_arrays

@@ -45,8 +45,11 @@ from .folder import (
     PLACES_FILE,
     REPORT_FILE,
     SHEET_FILE,
+    TORSO_KEY,
+    TorsoMotion,
     image_name,
     is_written,
+    write_torso_points,
 )
 from .footage.model import Footage, FootageCamera
 from .head_model import HeadModel, read_head_model
@@ -66,7 +69,6 @@ from .posed_points import PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
 from .torso import follow_torso
-from .torso_motion import TORSO_KEY, TorsoMotion, write_torso_points
 from .write_capture import posed_mesh, write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03

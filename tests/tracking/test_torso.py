@@ -24,7 +24,14 @@ from stga_addon.flame.forward import (
 from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
 from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit
-from stga_addon.tracking.folder import PLACES_FILE, REPORT_FILE
+from stga_addon.tracking.folder import (
+    PLACES_FILE,
+    REPORT_FILE,
+    TorsoMotion,
+    TorsoPoints,
+    read_torso_motion,
+    read_torso_points,
+)
 from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
@@ -33,14 +40,7 @@ from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
-from stga_addon.tracking.torso_cloth import Bending, found_bending
-from stga_addon.tracking.torso_drape import draped, torso_sheet
-from stga_addon.tracking.torso_motion import (
-    TorsoMotion,
-    TorsoPoints,
-    read_torso_motion,
-    read_torso_points,
-)
+from stga_addon.tracking.torso_cloth import Bending, draped, found_bending, torso_sheet
 from stga_addon.tracking.torso_take import (
     NECK,
     ROOT,
