@@ -83,15 +83,8 @@ class Camera:
         pixel)."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         x, y = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fl_x=self.fl_x * x,
-            fl_y=self.fl_y * y,
-            cx=self.cx * x,
-            cy=self.cy * y,
-        )
+        intrinsics = self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y
+        return Camera(width, height, *intrinsics, self.world_to_camera)
 
 
 def orbited(camera: Camera, center: np.ndarray, up: Sequence[float], angle: float) -> Camera:
@@ -117,27 +110,10 @@ def most_central(directions: np.ndarray) -> int:
     return int((directions @ directions.mean(0)).argmax())
 
 
-def azimuths(
-    cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float]
-) -> np.ndarray:
-    """Angle of each camera about the axis `up` (3,) through `center` (3,), in radians from that of
-    `start`, -π to π: what `orbited` turns `start` by to get to its side."""
-    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
-    arms = np.array([camera.position for camera in (start, *cameras)]) - center
-    first = arms[0] - arms[0] @ axis * axis
-    angles: np.ndarray = np.arctan2(arms[1:] @ np.cross(axis, first), arms[1:] @ first)
-    return angles
-
-
 def camera_from_gl(
-    camera_to_world: np.ndarray,
-    width: int,
-    height: int,
-    fl_x: float,
-    fl_y: float,
-    cx: float,
+    camera_to_world: np.ndarray, width: int, height: int, fl_x: float, fl_y: float, cx: float,
     cy: float,
-) -> Camera:
+) -> Camera:  # fmt: skip
     """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
     world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
     return Camera(width, height, fl_x, fl_y, cx, cy, world_to_camera)
@@ -209,7 +185,11 @@ def covered_angles(
     Of what no camera saw, training has nothing to show. A full turn where they leave no gap of
     MAX_GAP_RAD.
     """
-    seen = np.sort(np.append(azimuths(cameras, start, center, up), 0.0))
+    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+    arms = np.array([camera.position for camera in (start, *cameras)]) - center
+    first = arms[0] - arms[0] @ axis * axis
+    azimuths = np.arctan2(arms[1:] @ np.cross(axis, first), arms[1:] @ first)
+    seen = np.sort(np.append(azimuths, 0.0))
     gaps = np.diff(np.append(seen, seen[0] + 2 * np.pi))
     if gaps.max() < MAX_GAP_RAD:
         return -np.pi, np.pi

@@ -40,7 +40,8 @@ def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
     if is_srgb(primaries, transfer):
         return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
     table = _linear(transfer, np.iinfo(pixels.dtype).max + 1)
-    matrix = _to_bt709(primaries if primaries in CHROMATICITIES else SRGB)
+    known = primaries if primaries in CHROMATICITIES else SRGB
+    matrix = np.asarray(np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(known), np.float32)
     found = np.empty(pixels.shape, np.uint8)
     step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))
     for start in range(0, len(pixels), step):
@@ -58,11 +59,8 @@ def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     """Linear light to sRGB, both 0…1 (IEC 61966-2-1)."""
-    return np.where(
-        linear <= 0.0031308,
-        linear * 12.92,
-        1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
-    )
+    curve = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, linear * 12.92, curve)
 
 
 def with_gamma(pixels: np.ndarray, gamma: float) -> np.ndarray:
@@ -99,12 +97,6 @@ def _displayed(scene: np.ndarray) -> np.ndarray:
     luminance = np.maximum(scene @ BT2020_LUMINANCE.astype(scene.dtype), 1e-6)
     gain = HLG_PEAK_CD_M2 / REFERENCE_WHITE_CD_M2 * luminance ** (HLG_SYSTEM_GAMMA - 1)
     return np.asarray(gain[..., None] * scene)
-
-
-@lru_cache(maxsize=8)
-def _to_bt709(primaries: int) -> np.ndarray:
-    """(3, 3) from linear light of these primaries to that of BT.709."""
-    return np.asarray(np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(primaries), np.float32)
 
 
 def _to_xyz(primaries: int) -> np.ndarray:

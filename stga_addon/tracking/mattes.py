@@ -9,6 +9,7 @@ the pixel's color lies at; where both colors are alike, the band is a smooth edg
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +93,7 @@ def with_mattes(
         parts = [part for part in parts_of(left, PART_TIMESTEPS) if part]
         work = [(camera, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
-        found = helpers.map(
-            _write_mattes, work, lambda n, done=done: report("Mattes", done + n, total)
-        )
+        found = helpers.map(_write_mattes, work, partial(_count, report, done, total))
         done += len(left)
         report("Mattes", done, total)
         known = {t: is_seen for part in found for t, is_seen in part.items()}
@@ -107,6 +106,10 @@ def with_mattes(
         f"whose mattes follow the head alone: {listed}"
     )
     return replace(footage, cameras=tuple(cameras)), (warning,) if unseen else ()
+
+
+def _count(report: Report, done: int, total: int, number: int) -> None:
+    report("Mattes", done + number, total)
 
 
 def _write_mattes(
@@ -122,8 +125,8 @@ def _write_mattes(
             )
             seen = float(np.median(is_person[head])) if head.any() else 1.0
             recognized[timestep] = seen >= MIN_HEAD_PROBABILITY
-            with replacing(file) as partial:
-                Image.fromarray(find_matte(image, is_person, head)).save(partial, format="PNG")
+            with replacing(file) as new:
+                Image.fromarray(find_matte(image, is_person, head)).save(new, format="PNG")
         step()
     return recognized
 

@@ -196,8 +196,8 @@ def _tile(
 
 def _cropped(camera: Camera, left: int, top: int, width: int, height: int, scale: float) -> Camera:
     """The camera of a part of its image, scaled."""
-    center = {"cx": camera.cx - left, "cy": camera.cy - top}
-    return replace(camera, width=width, height=height, **center).scaled(scale)
+    cx, cy = camera.cx - left, camera.cy - top
+    return replace(camera, width=width, height=height, cx=cx, cy=cy).scaled(scale)
 
 
 def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:

@@ -364,8 +364,8 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
             values += sampled([level.channels], level.camera.project(own)[0])
         numbers[number] = count + np.arange(len(own))
         count += len(own)
-    every = tuple(np.concatenate(part) for part in (at, rays, fitted))
-    return SeenPoints(timestep, numbers, *every, [np.concatenate(own) for own in reference])
+    every, ray, use = np.concatenate(at), np.concatenate(rays), np.concatenate(fitted)
+    return SeenPoints(timestep, numbers, every, ray, use, list(map(np.concatenate, reference)))
 
 
 class Carrier:

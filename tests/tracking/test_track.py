@@ -23,9 +23,9 @@ from stga_addon.flame.forward import RIGID_SIZE, flame_forward
 from stga_addon.flame.teeth import flame_model
 from stga_addon.jobs.perform import perform
 from stga_addon.jobs.track import STAGES, Track
-from stga_addon.tracking.focal_length import scale_warnings
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import HeadFit
+from stga_addon.tracking.focal_length import scale_warnings
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage

@@ -47,8 +47,8 @@ def clock_offsets(
         lag, correlation, distinction = best_lag(reference, signal, rate)
         if correlation < MIN_CORRELATION or distinction < MIN_DISTINCTION:
             raise StgaError(
-                f"{videos[name].path}: its {by} does not say when camera {first} recorded the same; "
-                "give --offset"
+                f"{videos[name].path}: its {by} does not say when camera {first} recorded the "
+                "same; give --offset"
             )
         offsets[name] = round((lag / rate + begins - start) * fps)
         frames = f"{abs(offsets[name])} frames {'later' if offsets[name] >= 0 else 'earlier'}"
@@ -99,10 +99,11 @@ def _loudness(video: Video) -> tuple[np.ndarray, float]:
             raise StgaError(f"{video.path}: has no sound; expected it for --sync sound")
         stream, pictures = container.streams.audio[0], container.streams.video[0]
         resampler = AudioResampler(format="flt", layout="mono", rate=SOUND_RATE_HZ)
-        parts, begin = [np.zeros(0, np.float32)], None
+        parts: list[np.ndarray] = [np.zeros(0, np.float32)]
+        begin = None
         for frame in chain(container.decode(stream), [None]):  # which ends the sound
             begin = float(frame.time or 0) if frame and begin is None else begin
-            parts += [each.to_ndarray().ravel() for each in resampler.resample(frame)]
+            parts += [np.ravel(each.to_ndarray()) for each in resampler.resample(frame)]
         first_picture = video.times[0] * float(pictures.time_base) if video.seekable else 0.0
     sound = np.concatenate(parts).astype(np.float64)
     blocks = sound[: len(sound) // SOUND_HOP * SOUND_HOP].reshape(-1, SOUND_HOP)
@@ -117,8 +118,8 @@ def _motion(video: Video) -> tuple[np.ndarray, float]:
     frames = VideoFrames(video, dict(enumerate(range(len(video.times)))))
     changes, last = [0.0], None
     for number in frames.timesteps:
-        gray = Image.fromarray(frames.image(number)).convert("L")
-        gray = np.asarray(gray.resize((MOTION_SIZE,) * 2, Image.Resampling.BOX), np.float64)
+        image = Image.fromarray(frames.image(number)).convert("L")
+        gray = np.asarray(image.resize((MOTION_SIZE,) * 2, Image.Resampling.BOX), np.float64)
         if last is not None:
             changes.append(float(np.abs(gray - last).mean()))
         last = gray

@@ -155,11 +155,12 @@ def _maps(
     """OpenCV's fixed-point maps; its pixel centers are whole numbers, ours lie at .5."""
     import cv2
 
+    opencv: Any = cv2  # whose type stubs lack the second map's None
     width, height, fl_x, fl_y, cx, cy = ideal
     maps = np.empty((height, width, 2), np.float32)
     x = (np.arange(width) + 0.5 - cx) / fl_x
     for row in range(height):
         points = np.stack([x, np.full(width, (row + 0.5 - cy) / fl_y)], axis=-1)
         maps[row] = lens.distort(points) * recorded[2:4] + np.array(recorded[4:]) - 0.5
-    coarse, fine = cv2.convertMaps(maps, None, cv2.CV_16SC2)
+    coarse, fine = opencv.convertMaps(maps, None, cv2.CV_16SC2)
     return coarse, fine

@@ -72,7 +72,7 @@ def synchronized(
     no frame are left out. Raises StgaError where a camera has fewer frames than another, lacks one
     in between, is of another size or has another rate, and where clocks cannot be compared.
     """
-    fps, sentences = _frames_per_second(sequences), ()
+    fps, sentences = _frames_per_second(sequences), tuple[str, ...]()
     if frames.sync != "none":
         videos = {name: own for name, own in sequences.items() if isinstance(own, Video)}
         if len(videos) < max(2, len(sequences)) or fps is None:
@@ -87,8 +87,8 @@ def synchronized(
         raise StgaError(f"Offset for camera {min(unknown)}: expected one of {', '.join(sequences)}")
     recorded, offsets = {}, {name: frames.offsets.get(name, 0) for name in sequences}
     for name, own in sequences.items():  # timestep -> number of the frame, the first of several
-        timesteps = own.timesteps if isinstance(own, Video) else range(len(own))
-        pairs = reversed(list(enumerate(timesteps)))
+        shown = own.timesteps if isinstance(own, Video) else range(len(own))
+        pairs = reversed(list(enumerate(shown)))
         recorded[name] = {timestep - offsets[name]: number for number, timestep in pairs}
     first, last = _common_range(sequences, frames, offsets)
     shared = sorted(set.intersection(*(set(own) for own in recorded.values())))
