@@ -225,17 +225,6 @@ def test_malformed_fields(tmp_path: Path, field: str, value: Any) -> None:
         read_one(tmp_path, {**factory.frame(0, 0), field: value})
 
 
-@pytest.mark.parametrize(
-    "document",
-    ["", "[]", "3", "{", '{"frames": {}}', '{"frames": [3]}', '{"frame": []}', "[" * 100000],
-)
-def test_malformed_documents(tmp_path: Path, document: str) -> None:
-    """Catches a transforms file that is no object with frames ending in a traceback."""
-    (tmp_path / "transforms.json").write_text(document)
-    with pytest.raises(StgaError, match=r"transforms\.json: "):
-        read_splits(tmp_path)
-
-
 def test_missing_intrinsics_name_the_field(tmp_path: Path) -> None:
     """Catches a frame without focal length, or without size and image, read as zeros."""
     entry = factory.frame(0, 0)

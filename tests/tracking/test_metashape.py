@@ -126,62 +126,6 @@ def test_labels_are_image_names_or_paths(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("</document>", "", r"cameras.xml: is not valid XML"),
-        (
-            "<document ",
-            "<!DOCTYPE a [<!ENTITY b 'c'>]><document ",
-            r"cameras.xml: declares a document type",
-        ),
-        ("<f>50.0</f>", "", r"sensor '0': has no calibration with f"),
-        ("<f>50.0</f>", "<f>wide</f>", r"sensor '0': f: expected 1 finite number, not 'wide'"),
-        (
-            'type="frame"',
-            'type="spherical"',
-            r"sensor '0': type 'spherical' is not one of frame, fisheye",
-        ),
-        (
-            'sensor_id="0" component',
-            'sensor_id="3" component',
-            r"camera 'a': sensor_id '3' is no sensor of the file",
-        ),
-        ("<p1>", "<p3>0.1</p3><p1>", r"sensor '0': p3 and p4 are not supported"),
-        (
-            'component_id="0" label="b"',
-            'component_id="1" label="b"',
-            r"its cameras are in 2 components",
-        ),
-        ('label="b"', 'label="a"', r"camera 'a': two cameras are named a"),
-        (
-            "<transform>",
-            "<transform>-",
-            r"camera 'a': expected a rotation without scale|its axes are mirrored",
-        ),
-        (
-            "<f>50.0</f>",
-            "<f>0</f>",
-            r"sensor '0': f: expected a focal length of 1 to 1e7 pixels, not 0",
-        ),
-        ("<p1>", "<k1>1e308</k1><p1>", r"camera 'a': the distortion of its lens folds the image"),
-        ("<p1>", "<b1>1e308</b1><p1>", r"camera 'a': the distortion of its lens folds the image"),
-        ("<transform>", "<transform>1 ", r"camera 'a': transform: expected 16 finite numbers, not"),
-    ],
-)
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_damaged_exports_are_named(tmp_path, old, new, message):
-    """Catches a traceback, or a message without file and field."""
-    write_export(tmp_path / "cameras.xml", rig(2), ["a", "b"], intrinsics={"f": 50.0, "p1": 0.0})
-    for name in ("a", "b"):
-        write_image(tmp_path / f"{name}.png")
-    text = (tmp_path / "cameras.xml").read_text(encoding="utf-8")
-    assert old in text
-    (tmp_path / "cameras.xml").write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(StgaError, match=message):
-        open_footage(tmp_path, cameras=tmp_path / "cameras.xml")
-
-
 def test_mirrored_axes(tmp_path):
     """Catches an export whose world was mirrored, in which left and right of the face would be
     swapped."""
