@@ -228,8 +228,8 @@ def require_same_scale(first: Capture, other: Capture) -> None:
     factor = float(np.median(posed)) / _extent(other.neutral)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
         raise StgaError(
-            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral mesh; "
-            "expected meters"
+            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral "
+            "mesh; expected meters"
         )
     factor = _share_of_images(first) / _share_of_images(other)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:

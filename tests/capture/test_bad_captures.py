@@ -35,13 +35,10 @@ def test_mesh_collapsed_to_a_point(tmp_path, name):
         open_capture(root).expression_mesh(1, "head")
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "expected"),
-    [
-        ("translation", 9e5, "timestep 1: the mesh reaches farther than"),
-        ("expr", 1e300, r"00001\.npz: expr holds values"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "expected"), [
+    ("translation", 9e5, "timestep 1: the mesh reaches farther than"),
+    ("expr", 1e300, r"00001\.npz: expr holds values"),
+])  # fmt: skip
 def test_flame_mesh_out_of_reach(tmp_path, field, value, expected):
     """Catches FLAME parameters with which vertices overflow."""
     root, model = factory.write_flame_capture(tmp_path / "capture")

@@ -34,16 +34,11 @@ def test_orbit() -> None:
         assert_same_pose(orbited(camera(20), CENTER, UP, np.radians(degrees)), camera(20 + degrees))
 
 
-@pytest.mark.parametrize(
-    ("angles", "start", "expected"),
-    [
-        ((-70, -30, 0, 40, 80), 0, (-70, 80)),  # around the face
-        ((-70, -30, 0, 40, 80), -70, (0, 150)),  # the same from the outermost camera
-        ((110, 150, 180, 220, 250), 180, (-70, 70)),  # beyond ±180°
-        ((0, 90, 180, 270), 0, (-180, 180)),  # all around
-        ((30,), 30, (0, 0)),
-    ],
-)
+@pytest.mark.parametrize(("angles", "start", "expected"), [
+    ((-70, -30, 0, 40, 80), 0, (-70, 80)), ((-70, -30, 0, 40, 80), -70, (0, 150)),
+    ((110, 150, 180, 220, 250), 180, (-70, 70)), ((0, 90, 180, 270), 0, (-180, 180)),
+    ((30,), 30, (0, 0)),
+])  # fmt: skip
 def test_covered_angles(
     angles: tuple[float, ...], start: float, expected: tuple[float, float]
 ) -> None:

@@ -181,10 +181,8 @@ def test_procrustes_as_scipy_has_it() -> None:
     align_vectors."""
     random = np.random.default_rng(1)
     source, target, weights = (
-        random.normal(size=(30, 3)),
-        random.normal(size=(30, 3)),
-        random.random(30),
-    )
+        random.normal(size=(30, 3)), random.normal(size=(30, 3)), random.random(30),
+    )  # fmt: skip
     rotation, translation = weighted_procrustes(source, target, weights)
     centers = np.average(source, 0, weights), np.average(target, 0, weights)
     expected = Rotation.align_vectors(target - centers[1], source - centers[0], weights)[

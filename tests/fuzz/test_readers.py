@@ -192,7 +192,8 @@ JUNK = {
     "empty": b"", "zeros": bytes(10_000), "not utf-8": b'{"format": "\xff\xfe"}',
     "utf-16": '{"a": 1}'.encode("utf-16"), "byte order mark": b"\xef\xbb\xbf{}",
     "brackets": b"[" * 100_000, "objects": b'{"a":' * 100_000, "digits": b"9" * 100_000,
-    "nan": b"NaN", "string": b'"text"', "zip": b"PK\x05\x06" + bytes(18), "pickle": pickle.dumps({"a": 1}),
+    "nan": b"NaN", "string": b'"text"', "zip": b"PK\x05\x06" + bytes(18),
+    "pickle": pickle.dumps({"a": 1}),
     "zip of millions": b"PK\x05\x06" + struct.pack("<4H2LH", 0, 0, 65535, 65535, 2**31, 0, 0),
 }  # fmt: skip
 
@@ -697,8 +698,8 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
     "landmarks": LANDMARK_ROWS, "places": PLACE_ROWS, "head model npz": HEAD_ROWS,
     "flame frame": FRAME_ROWS, "flame motion": MOTION_ROWS, "flame npz": MODEL_ROWS,
     "run": [
-        (('"lattice": null', '"lattice": 1000000000'), "run.json: "),
-        (('"views_per_visit": ', '"views_per_visit": -'), "run.json: "),
+        (('"lattice": null', '"lattice": 1000000000'), "settings.lattice: expected"),
+        (('"views_per_visit": ', '"views_per_visit": -'), "settings.views_per_visit: expected"),
     ],
 }  # fmt: skip
 

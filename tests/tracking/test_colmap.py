@@ -80,8 +80,8 @@ NO_IMAGE = "has no image, folder or video of the name"
 
 
 @pytest.mark.parametrize(("file", "old", "new", "message"), [
-    ("cameras", "50.0", "0", "image 'left.png': expected a focal length of 1 to 1e7 pixels, not 0, 0"),
-    ("cameras", f" {WIDTH} {HEIGHT} ", " 0 30 ", "'left.png': expected an image size in pixels, not 0"),
+    ("cameras", "50.0", "0", "image 'left.png': expected a focal length of 1 to 1e7 pixels, not"),
+    ("cameras", f" {WIDTH} {HEIGHT} ", " 0 30 ", "'left.png': expected an image size in pixels"),
     ("cameras", " 20.0", " 1e308", r"'left.png': expected a principal point within 1e\+07 pixels"),
     ("images", DEPTH, "1e308", r"image 'left.png': expected a camera within 1e\+12 units"),
     ("images", " 2 right.png", " 2 left.png", "image 'left.png': two cameras are named left"),

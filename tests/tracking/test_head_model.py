@@ -145,11 +145,9 @@ def test_seams_are_merged_and_kept_where_a_target_parts_them(tmp_path):
     primitive = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}
     meshes = [{"primitives": [primitive], "extras": {"targetNames": ["part"]}}]
     document = {
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": meshes,
+        "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": meshes,
         "accessors": accessors,
-    }
+    }  # fmt: skip
     (tmp_path / "a.glb").write_bytes(
         glb(document | {"bufferViews": views, "buffers": [{"byteLength": 144}]}, data)
     )

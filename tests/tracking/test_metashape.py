@@ -12,13 +12,8 @@ from stga_addon.tracking.footage.photogrammetry import read_metashape
 from .scenes import HEIGHT, WIDTH, rig, write_image
 
 COEFFICIENTS = {
-    "k1": -0.0919,
-    "k2": -0.0763,
-    "k3": 0.1163,
-    "k4": -0.0761,
-    "p1": -0.0031,
-    "p2": 0.0012,
-}
+    "k1": -0.0919, "k2": -0.0763, "k3": 0.1163, "k4": -0.0761, "p1": -0.0031, "p2": 0.0012,
+}  # fmt: skip
 INTRINSICS = {"f": 50.0, "cx": 1.25, "cy": -2.5, "b1": 0.53, "b2": -0.31, **COEFFICIENTS}
 EXPORT = """<?xml version="1.0" encoding="UTF-8"?>
 <document version="2.0.0">
@@ -28,7 +23,8 @@ EXPORT = """<?xml version="1.0" encoding="UTF-8"?>
         <resolution width="{width}" height="{height}"/>
         <property name="layer_index" value="0"/>
         <bands><band label="Red"/></bands>
-        <calibration type="{kind}" class="initial"><resolution width="9" height="9"/><f>7</f></calibration>
+        <calibration type="{kind}" class="initial"><resolution width="9" height="9"/><f>7</f>
+        </calibration>
         <calibration type="{kind}" class="adjusted">
           <resolution width="{width}" height="{height}"/>
           {intrinsics}
@@ -38,7 +34,8 @@ EXPORT = """<?xml version="1.0" encoding="UTF-8"?>
     </sensors>
     <components next_id="1" active_id="0">
       <component id="0" label="Component 1">
-        <transform><rotation locked="false">1 0 0 0 1 0 0 0 1</rotation><scale>12.3</scale></transform>
+        <transform><rotation locked="false">1 0 0 0 1 0 0 0 1</rotation><scale>12.3</scale>
+        </transform>
       </component>
     </components>
     <cameras next_id="9" next_group_id="1">

@@ -145,10 +145,9 @@ def take(head, heads, torsos, size=SIZE, shifts=None):
         zip(np.radians(heads), np.radians(torsos), strict=True)
     ):
         zero = np.zeros(3)
-        frame = FlameFrame(
-            np.zeros(one.model.n_expression), np.array([0, carried, 0]), np.array([0, turned - carried, 0]),
-            zero, np.array([0.002 * timestep, 0, 0]), np.zeros(6),
-        )  # fmt: skip
+        expr, moved = np.zeros(one.model.n_expression), np.array([0.002 * timestep, 0, 0])
+        root, neck = np.array([0, carried, 0]), np.array([0, turned - carried, 0])
+        frame = FlameFrame(expr, root, neck, zero, moved, np.zeros(6))
         turn = axis_angle_matrices(frame.rotation[None])[0]
         shoulders = (cloth - joints[ROOT]) @ turn.T + joints[ROOT] + frame.translation
         shoulders += 0 if shifts is None else shifts[timestep]
@@ -322,9 +321,9 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
 def test_turning_the_root_leaves_the_head_in_its_place(head):
     """Catches a neck that turns about another point than the model's."""
     one, rng = person(head, np.zeros(head.model.n_identity)), np.random.default_rng(0)
-    zero = np.zeros(3)
-    frame = FlameFrame(rng.normal(0, 0.3, one.model.n_expression), rng.normal(0, 0.4, 3), rng.normal(0, 0.2, 3),
-                       zero, rng.normal(0, 1, 3), np.zeros(6))  # fmt: skip
+    expr = rng.normal(0, 0.3, one.model.n_expression)
+    root, neck = rng.normal(0, 0.4, 3), rng.normal(0, 0.2, 3)
+    frame = FlameFrame(expr, root, neck, np.zeros(3), rng.normal(0, 1, 3), np.zeros(6))
     # the throat's correctives are another thing
     model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))
     joints = joint_positions(model, model.v_template + model.shapedirs @ frame.expr)
