@@ -1,5 +1,4 @@
-"""Calibrated pinhole cameras, and paths of them: an orbit around a head, as far as its cameras saw
-it."""
+"""Calibrated pinhole cameras, and orbits around a head, as far as its cameras saw it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,23 +6,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 MAX_IMAGE_PIXELS = 1 << 26
-"""The largest machine-vision sensors have 65 million pixels; a small file that claims more could
-fill the memory."""
+"""Of the largest machine-vision sensors; a small file that claims more could fill the memory."""
 MAX_FOCAL_PIXELS = 1e7
 MAX_COORDINATE_M = 1e5
 """Bound of camera positions and vertices: generous even for a scene in millimeters, and no product
 of them with focal lengths overflows an integer pixel position."""
 MIN_PROJECTION_DEPTH = 1e-6
-"""Meters: points nearer to the camera's plane, or behind it, are projected as if they were at this
-depth."""
+"""Meters: points that are nearer, or behind the camera, are projected as if at this depth."""
 # Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks
 # along +z).
 GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_image_size(width: float, height: float) -> bool:
-    """Whether an image may have this size: whole numbers of at least one pixel, within the
-    limit."""
+    """Whether an image may have this size: whole numbers from one pixel up, within the limit."""
     whole = width % 1 == 0 and height % 1 == 0
     return bool(whole and min(width, height) >= 1) and width * height <= MAX_IMAGE_PIXELS
 
@@ -79,8 +75,7 @@ class Camera:
         return np.asarray((local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3])
 
     def scaled(self, factor: float) -> "Camera":
-        """The same camera with an image `factor` times as large (sizes rounded, at least one
-        pixel)."""
+        """The camera with an image `factor` times as large (sizes rounded, at least one pixel)."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         x, y = width / self.width, height / self.height
         intrinsics = self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y

@@ -22,8 +22,7 @@ WHITE_LEVEL = 247
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 BAND_PIXELS = 1 << 20
-"""Pixels that are converted at a time: wide intermediate numbers of a large image would fill the
-memory."""
+"""Converted at a time: wide intermediate numbers of a large image would fill the memory."""
 
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
@@ -37,8 +36,7 @@ warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) as displayed, from the file's header. Raises StgaError where it is no image
-    or larger than images may be."""
+    """(width, height) as displayed. Raises StgaError where it is no image, or too large a one."""
     try:
         _require_regular(path)
         with Image.open(path, formats=FORMATS) as image:
@@ -191,8 +189,7 @@ def _displayed_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF's, 1 where there is none. Pillow turns TIFF by itself; a PNG's is not looked for behind
-    its pixels."""
+    """EXIF's, 1 where there is none, as in TIFF, which Pillow turns, and behind a PNG's pixels."""
     if image.format == "TIFF" or "exif" not in image.info:
         return 1
     try:
@@ -203,8 +200,7 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _conversion(image: Image.Image, path: Path) -> Callable[[Image.Image], Image.Image] | None:
-    """How the image's colors become sRGB, None where they are: by cICP, else its profile, else
-    gAMA."""
+    """How the image's colors become sRGB, None where they are: by cICP, profile, or gAMA."""
     if image.mode not in ("RGB", "RGBA", "CMYK"):
         return None
     codes = _cicp(path) if image.format == "PNG" else None
@@ -249,8 +245,7 @@ def _by_profile(data: bytes) -> Callable[[Image.Image], Image.Image] | None:
 
 
 def _cicp(path: Path) -> tuple[int, int] | None:
-    """Codes of primaries and transfer in a PNG's cICP chunk, which stands before the pixels; None
-    without."""
+    """Codes of primaries and transfer in a PNG's cICP chunk, before the pixels; None without."""
     with path.open("rb") as stream:
         if stream.read(8) != PNG_SIGNATURE:
             return None

@@ -18,8 +18,7 @@ Preparation = Callable[[View, np.ndarray, np.ndarray | None], tuple[np.ndarray, 
 
 
 class LoadedView(NamedTuple):
-    """A view with its image (H, W, 3) uint8, mask (H, W) uint8 and mesh (V, 3), which are None if
-    there is none."""
+    """A view with image (H, W, 3) uint8, and mask (H, W) uint8 and mesh (V, 3) where there are."""
 
     view: View
     image: np.ndarray

@@ -1,5 +1,4 @@
-"""Geometry of triangle meshes: normals, connected parts, rigid alignment, and which triangle a
-camera's pixels show."""
+"""Triangle meshes: normals, parts, rigid alignment, and which triangle a camera's pixels show."""
 
 from dataclasses import dataclass, replace
 
@@ -165,8 +164,7 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
 
 
 def _whole(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first pixel with its center from `low` to `high`, inside an image of this size, and how
-    many there are."""
+    """The first pixel with its center from `low` to `high` in an image of this size; how many."""
     first = np.ceil(np.clip(low, 0, size + 1) - 0.5).astype(np.int64)
     last = np.floor(np.clip(high, -1, size) - 0.5).astype(np.int64)
     return first, np.maximum(np.minimum(last, size - 1) - first + 1, 0)

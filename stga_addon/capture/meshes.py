@@ -1,5 +1,4 @@
-"""Tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles; regions of
-triangles."""
+"""Tracked meshes (OBJ, PLY, GLB, STL) in the file's order; regions of triangles."""
 
 import io
 import re
@@ -46,8 +45,7 @@ MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
 MIN_EXTENT_M = 1e-9
-"""A mesh smaller than this is a point: it has no shape to train on, and no scale to compare motion
-with."""
+"""A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -70,8 +68,7 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def checked_mesh(
     path: Path, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same arrays as float64 and int32. Raises StgaError where they are no mesh
-    (`read_mesh`)."""
+    """The arrays as float64 and int32. Raises StgaError where they are no mesh (`read_mesh`)."""
     triples = all(own.ndim == 2 and own.shape[1] == 3 for own in (vertices, faces))
     if not triples or not len(faces):
         raise StgaError(
@@ -89,8 +86,7 @@ def checked_mesh(
 
 
 def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
-    """The same vertices (V, 3). Raises StgaError, beginning with `source`, for a point and for what
-    lies far away."""
+    """The same vertices (V, 3). Raises StgaError for a point, and for what lies far away."""
     if not np.abs(vertices).max() <= MAX_COORDINATE_M:  # also where it is not a number
         raise StgaError(
             f"{source}: the mesh reaches farther than {MAX_COORDINATE_M:g} m from the origin"
@@ -138,8 +134,7 @@ def tracked_meshes(
 
 
 def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
-    """The same function with its latest results kept, read-only, within 8 MiB; `vertices` says how
-    large one is."""
+    """The function with its latest results kept, read-only, within CACHE_BYTES."""
 
     @lru_cache(maxsize=max(2, CACHE_BYTES // (24 * max(1, vertices))))
     def kept(timestep: int) -> np.ndarray:
@@ -223,8 +218,7 @@ def _check_glb(data: bytes) -> None:
 
 
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Own parser, because trimesh regroups and splits the vertices of an OBJ with several materials
-    or objects."""
+    """An own parser: trimesh regroups the vertices of an OBJ with several materials or objects."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     points = [n for n, line in enumerate(lines) if line.startswith((b"v ", b"v\t"))]
     polygons = [n for n, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]

@@ -1,5 +1,4 @@
-"""Data model of a capture, independent of its layout on disk; its summary in text; several takes as
-one capture."""
+"""A capture in memory, whatever its layout on disk; its summary; several takes as one capture."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
@@ -33,8 +32,7 @@ class View:
 
 
 ViewExposure = Callable[[View], np.ndarray | None]
-"""View -> gain and offset (2, 3), in levels, of red, green and blue in its image; None where they
-are not known."""
+"""View -> gain and offset (2, 3), in levels, of red, green and blue; None where not known."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,7 @@ class Capture:
 
 
 def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
-    """At most `limit` of the items, such as views or timesteps: the first, the last, and those
-    evenly between."""
+    """At most `limit` of the items: the first, the last, and those evenly between."""
     if len(items) <= limit:
         return list(items)
     return [items[n] for n in np.linspace(0, len(items) - 1, limit).round().astype(int)]
@@ -142,11 +139,9 @@ def _span(first: int, last: int) -> str:
 
 
 MAX_NEUTRAL_DIFFERENCE_M = 1e-4
-"""Largest distance between the neutral meshes of two takes of one head: trackers write rounded
-shape coefficients."""
+"""Between neutral meshes of takes of one head: trackers write rounded shape coefficients."""
 MAX_SCALE_FACTOR = 5.0
-"""Largest ratio of the head's sizes in two takes; another unit than the meter makes it 10 or
-more."""
+"""Largest ratio of the head's sizes in two takes; another unit makes it 10 or more."""
 COMPARED = 8
 """Views, and timesteps, of a take whose scale is looked at."""
 
@@ -271,8 +266,7 @@ def _first_free_index(
 
 
 def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
-    """The views at the joined timesteps; `free` is added to indices of cameras that the first take
-    does not have."""
+    """The views at the joined timesteps; `free`: added to indices that the first take lacks."""
     known = [view for members in first.views.values() for view in members]
     poses = {view.camera_index: view.camera.world_to_camera for view in known}
     shifted = []
@@ -287,8 +281,7 @@ def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> li
 def _dispatch(
     functions: Sequence[Callable[..., Item]], starts: Sequence[int]
 ) -> Callable[..., Item]:
-    """timestep of the joined capture -> what the function of its take says about its own
-    timestep."""
+    """timestep of the joined capture -> what its take's function says about its own."""
 
     def of(timestep: int, *rest: str) -> Item:
         take = bisect_right(starts, timestep) - 1

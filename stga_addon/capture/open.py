@@ -359,8 +359,7 @@ def sequence_capture(
     model_file: Path | None,
     views: Mapping[str, tuple[View, ...]],
 ) -> Capture:
-    """The capture of layout "flame" whose meshes a sequence makes; `root` and `model_file` say
-    where it is from."""
+    """The capture of layout "flame" whose meshes a sequence makes; where both are from."""
     model = sequence.model
     regions = key_regions(model)
     missing = (
@@ -395,8 +394,7 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
 
 
 def _model_file(root: Path, given: Path | None) -> Path:
-    """The capture's bundled head, else the FLAME model file that is given, else the one in the
-    capture's folder."""
+    """The capture's bundled head, else the given FLAME model file, else the one in its folder."""
     if (root / BUNDLED_MODEL).is_file():
         return root / BUNDLED_MODEL
     beside = (root / name for name in OWN_MODELS)

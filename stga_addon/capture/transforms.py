@@ -47,8 +47,7 @@ class Frame:
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
-    """A camera as an entry of a transforms file has it; cy is counted from the bottom, as VHAP
-    writes it."""
+    """A camera as a transforms file's entry; cy is counted from the bottom, as VHAP writes it."""
     return {
         "transform_matrix": camera.camera_to_world_gl.tolist(),
         "w": camera.width,
@@ -62,8 +61,7 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames of a capture by split, and what the top level says (None where it is missing):
-    files, frame rate."""
+    """All frames by split, and what the top level says, None where it is missing."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
@@ -129,15 +127,13 @@ def _first(values: Iterable[Item | None]) -> Item | None:
 
 
 def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
-    """`fps` at the top level of a transforms file; None where it is missing. Raises StgaError
-    naming the file."""
+    """`fps` at the top level of a transforms file; None without. Raises StgaError."""
     record = _Record(path, path.parent, "", values)
     return record.number("fps", low=0, high=FPS_LIMIT) if record.has("fps") else None
 
 
 def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:
-    """The camera with the principal point that the file's (cx, cy) mean under the convention
-    (`read_transforms`)."""
+    """The camera with the principal point that the file's (cx, cy) mean (`read_transforms`)."""
     if convention not in PRINCIPAL_POINTS:
         raise StgaError(
             f"principal point convention {convention!r} is not one of {', '.join(PRINCIPAL_POINTS)}"
@@ -193,8 +189,7 @@ def inside(root: Path, relative: str, where: str) -> Path:
 
 @dataclass(frozen=True)
 class _Record:
-    """A JSON object, its file, that file's folder without symbolic links, and its place in the file
-    for messages."""
+    """A JSON object, its file, that file's resolved folder, and its place in it for messages."""
 
     path: Path
     folder: Path
@@ -260,8 +255,7 @@ def _frame(
     principal_point: str,
     cameras: dict[tuple[bytes | float, ...], Camera],
 ) -> Frame:
-    """cameras: those of earlier frames by their numbers in the file, because most frames share
-    theirs."""
+    """cameras: those of earlier frames by their numbers in the file; most frames share theirs."""
     image = record.path_of("file_path")
     if image is None:
         raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
@@ -369,8 +363,7 @@ def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
 
 
 def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
-    """Frames whose cameras all have an index: that of the same camera elsewhere, or the next free
-    number."""
+    """Frames with an index for each camera: that of the same one elsewhere, or the next free."""
     known = {_camera_key(f): f.view.camera_index for f in frames if f.view.camera_index >= 0}
     taken = set(known.values())
     free = (number for number in itertools.count() if number not in taken)

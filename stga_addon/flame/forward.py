@@ -8,8 +8,7 @@ from .model import FlameModel
 from .quaternions import from_axis_angle, to_matrices
 
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
-"""The last numbers of a frame's parameters: axis-angles of five joints, and the translation.
-Expression comes first."""
+"""At the end of a frame's parameters, after the expression: five joints' axis-angles; a shift."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
 SMALL_ANGLE = 1e-4
 """Radians, below which a quotient by the squared angle is its limit."""
@@ -72,8 +71,7 @@ def cross_matrices(vectors: np.ndarray) -> np.ndarray:
 
 
 def left_jacobian(angles: np.ndarray) -> np.ndarray:
-    """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of
-    it amounts to."""
+    """(3, 3): the small rotation, before that of an axis-angle (3,), that its change amounts to."""
     angle = float(np.linalg.norm(angles))
     cross = cross_matrices(angles[None])[0]
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
@@ -84,8 +82,7 @@ def left_jacobian(angles: np.ndarray) -> np.ndarray:
 def shaped_vertices(
     model: FlameModel, shape: np.ndarray, expr: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """Template with identity (I,), expression (E,) and vertex offset (V, 3) added, before posing:
-    (V, 3) meters."""
+    """Template (V, 3) in meters with identity (I,), expression (E,) and offset (V, 3), unposed."""
     shaped = model.v_template + model.shapedirs @ np.concatenate([shape, expr])
     return np.asarray(shaped if offset is None else shaped + offset)
 

@@ -1,5 +1,4 @@
-"""FLAME head models: template, blend shapes, a skeleton of five joints, and regions of
-triangles."""
+"""FLAME head models: template, blend shapes, skeleton of five joints, regions of triangles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,8 +23,7 @@ Creative Technologies) in FLAME's form, made by `development/bundled_head.py`.""
 EXPRESSION_NAMES = "expression_names"
 """Key of the names in model files, and in motions of the bundled head."""
 SHAPE_STEP_M = 1e-5
-"""Step of `shape_steps` (K, V, 3), displacements in whole numbers, which a file may have in place
-of shapedirs."""
+"""Of `shape_steps` (K, V, 3), whole numbers, which a file may have in place of shapedirs."""
 # Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
 KEY_MASKS = {
     "left_eye": ("left_eye_region", "left_eyeball"),
@@ -36,8 +34,7 @@ KEY_MASKS = {
 EYEBALL_WEIGHT = 0.9
 """Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
 MIN_TORSO_WEIGHT = 0.7
-"""Skinning weight of the root joint at the torso's vertices; the published FLAME's last ring has
-0.9."""
+"""Skinning weight of the root joint at the torso; the published FLAME's last ring has 0.9."""
 
 
 @dataclass(frozen=True)
@@ -197,8 +194,7 @@ def torso_faces(model: FlameModel) -> np.ndarray:
 
 
 def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
-    """left_eye, right_eye, mouth and nose as (F,) bool; a region none of whose masks the model has
-    is left out."""
+    """left_eye, right_eye, mouth, nose as (F,) bool; those without any mask are left out."""
     regions = {}
     for region, names in KEY_MASKS.items():
         present = [model.masks[name] for name in names if name in model.masks]

@@ -10,8 +10,7 @@ def from_axis_angle(vectors: np.ndarray) -> np.ndarray:
 
 
 def to_matrices(quaternions: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length; of zero ones, the
-    identity."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length; zero: the identity."""
     length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(quaternions / np.maximum(length, 1e-12), -1, 0)
     rows = [
@@ -32,8 +31,7 @@ def to_axis_angle(quaternions: np.ndarray) -> np.ndarray:
 
 
 def continuous(quaternions: np.ndarray) -> np.ndarray:
-    """(T, 4) with signs changed so that consecutive quaternions are close; q and -q are the same
-    rotation."""
+    """(T, 4) with signs changed so that consecutive ones are close; q and -q are one rotation."""
     flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(1))
     signs = np.cumprod(np.where(flips < 0, -1.0, 1.0))
     return np.concatenate([quaternions[:1], quaternions[1:] * signs[:, None]])

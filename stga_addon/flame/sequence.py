@@ -1,5 +1,4 @@
-"""Tracked FLAME sequences: reading of parameter files, meshes; retargeting to another person, speed
-or strength."""
+"""Tracked FLAME sequences: files, meshes; retargeting to another person, speed or strength."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -81,8 +80,7 @@ def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> n
 
 
 def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
-    """The canonical mesh (V, 3): expression, pose and translation zero, with the person's shape and
-    static offset."""
+    """The canonical mesh (V, 3): the person's shape and static offset, everything else zero."""
     return _mesh(sequence, neutral_frame(sequence.model))
 
 
@@ -101,8 +99,7 @@ def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np
 
 
 def with_identity(sequence: FlameSequence) -> FlameSequence:
-    """The same motion with shape and static offset baked into the template, so that a mesh needs a
-    quarter of the blend shapes."""
+    """The motion with the identity in the template: a mesh needs a quarter of the blend shapes."""
     model = sequence.model
     shapes = model.shapedirs[:, :, model.n_identity :]
     none, offset = np.zeros(shapes.shape[2]), sequence.static_offset
@@ -138,8 +135,7 @@ def read_frame(path: Path, model: FlameModel) -> FlameFrame:
 
 
 def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
-    """Shape coefficients (I,) and static offset (V, 3) or None from a parameter file. Errors as in
-    `read_frame`."""
+    """Shape (I,) and static offset (V, 3) or None of a file. Errors as in `read_frame`."""
     return _identity(path, read_npz(path), model)
 
 
@@ -245,8 +241,7 @@ def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) -> np.ndarray:
-    """(size,) float64 from (size,) or (1, size); absent fields are zero, shorter coefficient
-    vectors padded."""
+    """(size,) float64 from (size,) or (1, size); absent fields are zero, short ones padded."""
     vector = np.zeros(size)
     if name not in arrays:
         return vector
@@ -264,8 +259,7 @@ def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) 
 def _offset(
     path: Path, arrays: Mapping[str, np.ndarray], name: str, vertices: int
 ) -> np.ndarray | None:
-    """(V, 3) float64 or None where it is absent or all zero; rows of the teeth are added or dropped
-    to fit."""
+    """(V, 3) float64, None where absent or all zero; the teeth's rows are added or dropped."""
     if name not in arrays:
         return None
     array = _finite(path, name, arrays[name])

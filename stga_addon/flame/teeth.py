@@ -142,8 +142,7 @@ def teeth_faces(first: int) -> np.ndarray:
 
 
 def _mouth(model: FlameModel) -> _Mouth:
-    """Rings of neighbours from the mesh's foremost hole outwards, up to the one that lies foremost
-    on average."""
+    """Rings of neighbours from the mesh's foremost hole up to the one that lies foremost."""
     faces = model.faces[(model.faces < TEMPLATE_VERTICES).all(axis=1)]
     depth = model.v_template[:, 2]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
@@ -186,8 +185,7 @@ def _holes(edges: np.ndarray) -> list[np.ndarray]:
 
 
 def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """The vertices of a ring in order around it. Raises StgaError where the edges among them are
-    not one ring."""
+    """A ring's vertices in order. Raises StgaError where the edges among them are no ring."""
     inside = edges[np.isin(edges, ring).all(axis=1)]
     beside: dict[int, set[int]] = {vertex: set() for vertex in ring.tolist()}
     for one, other in inside.tolist():

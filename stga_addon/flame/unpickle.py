@@ -94,8 +94,7 @@ class _Refused(Exception):
 
 
 class _Function:
-    """A function that a pickle may call but not change: BUILD would write into the `__dict__` of a
-    plain one."""
+    """A function that a pickle may call but not change: BUILD would write into its `__dict__`."""
 
     __slots__ = ("_call",)
 

@@ -1,5 +1,4 @@
-"""Appearance of a head's surface points: sampled in pyramids of calibrated images, freed of
-lighting, averaged."""
+"""Appearance of a head's surface points: sampled in image pyramids, freed of lighting, averaged."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +11,9 @@ from ..capture.camera import Camera
 LEVELS_M = (0.0012, 0.0024, 0.0048, 0.0096)
 """Pixel sizes of the pyramid at the head."""
 BLUR_PX = 0.8
-"""Standard deviation of the blur at every level, so that differences of neighboring pixels are
-derivatives."""
+"""Standard deviation of the blur, so that differences of neighboring pixels are derivatives."""
 DETAIL_PX = 2.5
-"""Standard deviation of the neighborhood whose mean is taken off the luma: what is left hardly
-depends on lighting."""
+"""Of the neighborhood whose mean is taken off the luma: the rest hardly depends on lighting."""
 COLORS = np.array([[0.299, 0.587, 0.114], [0.8, -0.8, 0.0]], np.float32)
 """Luma, and redness, in which lips differ from skin."""
 CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
@@ -24,8 +21,7 @@ CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
 NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
-"""Weight of the camera's usual lighting in that of a view, as a share of the information of all
-points."""
+"""Weight of the camera's usual lighting in a view's, as a share of the points' information."""
 LIGHT_ITERATIONS, TEXTURE_ITERATIONS, MEAN_ITERATIONS = 2, 4, 3
 ALBEDO_SCALE, TEXTURE_SCALE = 6 * NOISE_LEVELS, 4 * NOISE_LEVELS
 LIGHT_SCALE, MEAN_SCALE = 2 * NOISE_LEVELS, 3 * NOISE_LEVELS
@@ -33,8 +29,7 @@ LIGHT_SCALE, MEAN_SCALE = 2 * NOISE_LEVELS, 3 * NOISE_LEVELS
 as it is found, the texture, and the mean."""
 MIN_SHADING, MAX_SHADING = 0.2, 4.0
 OWN_VIEW_PRIOR = 6.0
-"""Observations of all cameras that count beside a camera's own in its texture: skin shines
-differently to each side."""
+"""Observations of all cameras beside a camera's own: skin shines differently to each side."""
 MAX_DEVIATION_LEVELS = 60.0
 MAX_SAMPLES = 1 << 14
 """Of an image at a time: OpenCV takes less than 2^15."""
@@ -44,8 +39,7 @@ MIN_OBSERVATIONS = 1.0
 
 @dataclass(frozen=True)
 class Level:
-    """An image of the pyramid: camera, channels (H, W, 3), and their derivatives by x and y (2, H,
-    W, 3), float32."""
+    """An image: camera, channels (H, W, 3), derivatives by x and y (2, H, W, 3); float32."""
 
     camera: Camera
     channels: np.ndarray
@@ -79,8 +73,7 @@ class Texture:
 
 
 def pyramid(camera: Camera, image: np.ndarray, center: np.ndarray) -> list[Level]:
-    """Levels of an image (H, W, 3) uint8 with pixels of LEVELS_M at `center` (3,), or its own where
-    they are larger."""
+    """Levels of an image (H, W, 3) uint8: pixels of LEVELS_M at `center` (3,), or larger ones."""
     import cv2
 
     pixel = float(camera.project(center[None])[1][0]) / camera.fl_x

@@ -152,8 +152,7 @@ def _are_parameters(values: np.ndarray | None, shape: tuple[int, ...]) -> bool:
 def _rows(
     out: Path, timesteps: list[int], keys: Mapping[int, np.ndarray], size: int
 ) -> dict[int, np.ndarray]:
-    """The keys by row instead of timestep. Raises StgaError for one of no timestep, or that poses
-    no head."""
+    """The keys by row. Raises StgaError for one of no timestep, or that poses no head."""
     unknown = sorted(set(keys) - set(timesteps))
     if unknown:
         raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
@@ -166,8 +165,7 @@ def _rows(
 
 
 def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
-    """Region -> timestep -> share of the images that is not explained, of a report; empty where it
-    has none."""
+    """Region -> timestep -> share of the images not explained, of a report that has one."""
     return {
         name: {int(t): float(value) for t, value in own.items()}
         for name, own in report.get("image_misfit", {}).items()

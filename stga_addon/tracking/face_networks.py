@@ -30,8 +30,7 @@ CROP_SCALE = 1.5
 """Side of the landmarks' crop, in sides of the detected box."""
 DETECTOR_SIZE_PX, CROP_SIZE_PX, PERSON_SIZE_PX = 128, 256, 256
 ANCHOR_GRIDS = ((16, 2), (8, 6))
-"""Cells along a side of the detector's grids, and anchors of a cell; an anchor is its cell's
-center."""
+"""Cells along a side of the detector's grids, and anchors of each, which are its center."""
 IRIS_CENTERS = (468, 473)
 FIRST_IRIS_POINT, MESH_POINTS = 468, 478
 """Landmarks: 468 of the skin, and five an iris of which the first is its center."""
@@ -64,8 +63,7 @@ class Detector(Protocol):
     """Finds faces in an image; every face has the same N landmarks."""
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
-        """Landmarks (N, 2) in pixels of each face in an image (H, W, 3) uint8; centers lie at
-        .5."""
+        """Landmarks (N, 2) of each face in an image (H, W, 3) uint8; pixel centers lie at .5."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,7 @@ class FaceScores:
 
 @dataclass(frozen=True)
 class _Crop:
-    """A square of an image: center (2,) and side in pixels, turned by an angle, clockwise as
-    seen."""
+    """A square of an image: center (2,) and side in pixels, turned clockwise by an angle."""
 
     center: np.ndarray
     side: float
@@ -156,8 +153,7 @@ class PersonNetwork:
     """Segmentation of people, in 256×256 pixels of the whole image."""
 
     def probability(self, image: np.ndarray) -> np.ndarray:
-        """(H, W) float32 in 0…1 of an image (H, W, 3) uint8: how likely each pixel shows a
-        person."""
+        """(H, W) float32, 0…1, of an image (H, W, 3) uint8: how likely a pixel shows a person."""
         import cv2
 
         size = PERSON_SIZE_PX, PERSON_SIZE_PX

@@ -24,16 +24,13 @@ from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
 
 CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
-"""Timesteps among which those of the most different turns are chosen, and how many; landmarks that
-are used."""
+"""Timesteps of which the most differently turned are chosen, and how many; landmarks used."""
 MIN_TURN_DEG = 20.0
-"""Between two timesteps, below which the head does not turn: what lies nearer cannot be told from
-what is larger."""
+"""Between two timesteps; below it, what lies nearer cannot be told from what is larger."""
 USUAL_SIGMA = 0.35
 """Standard deviation of the inverse focal length about that of a phone, relative."""
 NEAREST, FARTHEST = 2.0, 0.2
-"""Largest and smallest inverse focal length, relative to that of a phone: 104° and 15° over the
-diagonal."""
+"""Largest and smallest inverse, relative to that of a phone: 104° and 15° over the diagonal."""
 OWN_SIGMA_M, NOISE_SIGMA_M = LANDMARK_SIGMA_M, 0.0006
 """Standard deviations of what a landmark misses the head by in all timesteps alike, which says
 nothing of focal lengths, and beyond that in one of them."""
@@ -48,8 +45,7 @@ path-traced head, scales of single views have a standard deviation of 0.01 up to
 beyond, with a mean of −0.02."""
 MIN_CAMERAS = 4
 MIN_VISIBILITY = 0.1
-"""Squared cosine of the angle at which a camera sees a landmark's surface, below which the landmark
-is not used."""
+"""Squared cosine of the angle between a landmark's surface and a camera that may use it."""
 MAX_COMPARED_TIMESTEPS = 40
 SCALE_ITERATIONS, OUTLIER_SCALE = 8, 1.5
 HERE = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -100,8 +96,7 @@ def solved_focal(
 
 
 def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
-    """The head at its landmarks alone, with components of identity that move each of them by
-    OWN_SIGMA_M."""
+    """The head at its landmarks alone, and an identity that moves each by OWN_SIGMA_M."""
     model, count = head.model, len(places)
     corners = model.faces[places.face].ravel()
     own = OWN_SIGMA_M * np.eye(3 * count).reshape(count, 1, 3, 3 * count).repeat(3, axis=1)
@@ -142,8 +137,7 @@ def _turned(
 def _observed(
     head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
 ) -> tuple[list[Observation], np.ndarray]:
-    """Landmarks in the camera's world at the depth of the head, and the poses (T, 18) that bring it
-    there."""
+    """Landmarks in the camera's world at the head's depth, and poses (T, 18) that lead there."""
     neutral, used = places.on(head.model.v_template, head.model.faces), np.ones(len(places), bool)
     points = (triangulated(view, used, neutral, 1.0) for view in views)
     found = [observed_landmarks(own, HERE, used) for own in points]
@@ -233,8 +227,7 @@ def scale_warnings(
 
 
 def _scale(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> float:
-    """The scale with which points (N, 2) fit others, after the mean shift; outliers count
-    little."""
+    """The scale from points (N, 2) to others, after the mean shift; outliers count little."""
     scale, used = 1.0, weights
     for _ in range(SCALE_ITERATIONS):
         a = source - (used[:, None] * source).sum(0) / used.sum()

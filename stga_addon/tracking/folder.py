@@ -14,8 +14,7 @@ from ..schema import from_json, setting
 REPORT_FILE, SHEET_FILE, MATTES_FILE = "tracking.json", "contact_sheet.png", "mattes.json"
 LANDMARKS_FOLDER, PLACES_FILE = "landmarks", "head_model.npz"
 KEPT_FOLDER = "unfinished"
-"""Of results of parts, with which an interrupted tracking goes on; removed once the capture is
-written."""
+"""Of results of parts, with which an interrupted tracking goes on; removed at its end."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
 TORSO_KEY = "torso"
@@ -118,8 +117,7 @@ def write_torso_points(capture: Path, points: TorsoPoints) -> None:
 
 
 def read_torso_points(capture: Path) -> TorsoPoints | None:
-    """The points in a capture's folder; None where it has none. Raises StgaError where their file
-    is damaged."""
+    """The points in a capture's folder; None without. Raises StgaError where damaged."""
     path = capture / POINTS_FILE
     if not path.is_file():
         return None

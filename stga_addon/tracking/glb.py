@@ -30,8 +30,7 @@ READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_text
 
 @dataclass(frozen=True)
 class MorphMesh:
-    """positions (V, 3) in meters, y up; faces (F, 3); names of K morph targets and their
-    displacements (V, 3, K)."""
+    """positions (V, 3) meters, y up; faces (F, 3); names and displacements (V, 3, K) of targets."""
 
     positions: np.ndarray
     faces: np.ndarray
@@ -72,8 +71,7 @@ def read_glb(path: Path) -> MorphMesh:
 def _require_bounded(
     path: Path, document: dict[str, Any], nodes: list[tuple[dict[str, Any], np.ndarray]], size: int
 ) -> None:
-    """Raise StgaError where the joined mesh of all nodes would hold more numbers than a file of
-    this size may."""
+    """Raise StgaError where the joined mesh would hold more numbers than such a file may."""
     allowed = MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
     vertices, corners, accessors, names = 0, 0, document["accessors"], set[str]()
     for primitive, targets in (own for node, _ in nodes for own in _primitives(document, node)):
@@ -160,8 +158,7 @@ def _count(accessor: dict[str, Any]) -> int:
 def _accessor(
     document: dict[str, Any], data: bytes, number: int, expected: int | None = None, width: int = 3
 ) -> np.ndarray:
-    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where that is
-    given."""
+    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where given."""
     accessor = document["accessors"][number]
     count = _count(accessor)
     if WIDTHS[accessor["type"]] != width or count != (expected or count):
@@ -213,8 +210,7 @@ def _joined(parts: list[MorphMesh]) -> MorphMesh:
 
 
 def _merged(mesh: MorphMesh) -> MorphMesh:
-    """The mesh with vertices merged that no target parts, and without triangles that collapse by
-    it."""
+    """The mesh with vertices merged that no target parts, without triangles that collapse."""
     rows = np.column_stack([mesh.positions, mesh.targets.reshape(len(mesh.positions), -1)])
     rows = np.ascontiguousarray(rows + 0.0)  # no -0
     keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1])))[:, 0]

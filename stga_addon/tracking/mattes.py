@@ -32,39 +32,30 @@ MIN_HEAD_PROBABILITY = 0.5
 LIKELY, SURE, UNLIKELY = 0.5, 0.9, 0.1
 """Probabilities of a person."""
 MAX_CUT_SIDE_PX = 400
-"""GrabCut works on images of at most this size, since its time grows with the pixels; the band is
-of full size."""
+"""Of the images that GrabCut works on, whose time grows with the pixels; the band's is full."""
 CUT_ITERATIONS = 2
 CUT_MARGIN_SHARE = 0.04
 """Error of the network's outline, as a share of the head's size (root of its area in the image)."""
 HEAD_MARGIN_SHARE = 0.06
-"""Error of the tracked head's outline, as a share of the head's size: that far inside it, pixels
-are surely the person's."""
+"""Error of the tracked head's outline, of the head's size: further inside are surely persons."""
 BAND_SHARE = 0.018
 """Half of the soft band's width, as a share of the head's size."""
 NEIGHBORHOOD_SHARES = (0.03, 0.12)
-"""Standard deviations of the neighborhoods that the colors on both sides are means of, as shares of
-the head's size."""
+"""Standard deviations of the neighborhoods that colors are means of, of the head's size."""
 FAR_WEIGHT = 0.02
 MIN_NEIGHBORHOOD_PX = 2.0
-"""Standard deviation of the smaller neighborhood, in pixels of the image that means are taken
-of."""
+"""Standard deviation of the smaller neighborhood, in pixels of the image of the means."""
 REACH_SHARE = 1.0
-"""Distance from the head, as a share of its size, beyond which there is no hair; clothes reach
-farther, but below."""
+"""Distance from the head, of its size, that hair reaches; clothes reach farther, below."""
 SIMILAR_COLORS_LEVELS = 30.0
-"""Difference of the colors on both sides, at which half of the coverage is that of a smooth
-edge."""
+"""Difference of both sides' colors at which half of the coverage is a smooth edge's."""
 PLATE_NOISE_LEVELS, PLATE_SURE_LEVELS = 10.0, 40.0
-"""Differences from a clean plate, in levels of 255, that noise makes, and that only a person
-does."""
+"""Differences from a clean plate, of 255, that noise makes, and that only a person does."""
 MAX_HOLE_SHARE = 0.01
-"""Area of a hole in the person, as a share of the head's, up to which it is filled: highlights and
-patterned cloth."""
+"""Area of a hole in the person, of the head's, that is filled: highlights, patterned cloth."""
 
 HeadPixels = Callable[[int, FootageCamera], np.ndarray]
-"""(timestep, camera) -> (H, W) bool: the pixels of the tracked head; can be handed to helping
-processes."""
+"""(timestep, camera) -> (H, W) bool: the tracked head's pixels; helping processes take it."""
 
 
 def with_mattes(
@@ -150,8 +141,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
 
 
 def probability_by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
-    """Probability (H, W) float32 of a person, from the difference of an image from a clean plate,
-    (H, W, 3) uint8."""
+    """Probability (H, W) float32 of a person: the difference from a clean plate (H, W, 3) uint8."""
     import cv2
 
     smooth, backdrop = (cv2.GaussianBlur(each, (0, 0), 1.0) for each in (image, plate))
@@ -209,8 +199,7 @@ def _soft_edge(cv2: Any, image: np.ndarray, person: np.ndarray, size: float) -> 
 
 
 def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) -> np.ndarray:
-    """(H, W, 3) float32 mean of the known pixels around each pixel; those far away count where none
-    is near."""
+    """(H, W, 3) float32 mean of known pixels around each; those far away where none is near."""
     # wide neighborhoods need few pixels
     scale = min(1.0, MIN_NEIGHBORHOOD_PX / (NEIGHBORHOOD_SHARES[0] * size))
     small = tuple(max(1, round(scale * side)) for side in image.shape[1::-1])
@@ -227,8 +216,7 @@ def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) ->
 
 
 def _shrunk(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:
-    """(H, W) bool: the pixels farther than so many from the outside; the image's border is not
-    outside."""
+    """(H, W) bool: pixels farther than so many from the outside, which the border is not."""
     distance = cv2.distanceTransform(where.astype(np.uint8), cv2.DIST_L2, 3)
     return np.asarray(distance > pixels)
 

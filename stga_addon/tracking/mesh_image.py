@@ -15,8 +15,7 @@ AMBIENT = 0.38
 def shaded_image(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray | None = None
 ) -> np.ndarray:
-    """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3) from 0 to 1, by default those
-    of skin."""
+    """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3), 0 to 1; None: skin's."""
     triangle, weights = rasterize(vertices, faces, camera)
     seen = triangle >= 0
     corners, inside = faces[triangle[seen]], weights[seen][..., None]

@@ -1,5 +1,4 @@
-"""Where a surface lies along its normals, from patches of calibrated images that agree (multi-view
-stereo)."""
+"""Where a surface lies along its normals, from image patches that agree (multi-view stereo)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,12 +13,10 @@ PATCH_SAMPLES = 9
 MAX_CAMERAS = 6
 """Cameras that a patch is compared in: those that see it most squarely."""
 MIN_COSINE = 0.35
-"""Of the angle between normal and camera: 70°, beyond which a patch is too foreshortened to
-compare."""
+"""Of the angle between normal and camera: beyond 70°, a patch is too foreshortened."""
 MIN_CORRELATION = 0.5
 NOISE_LEVELS = 2.0
-"""Standard deviation of image noise, of 255: patches with less contrast than this do not
-correlate."""
+"""Standard deviation of image noise, of 255: patches of less contrast do not correlate."""
 OCCLUSION_M = 0.004
 """A point this far behind the nearest surface is hidden."""
 DEPTH_IMAGE_SIDE = 300
@@ -28,8 +25,7 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 @dataclass(frozen=True)
 class Sweep:
-    """Offsets to try, in meters: from −reach to +reach, a step apart; samples of a patch are
-    `spacing` apart."""
+    """Offsets in meters, −reach to +reach, a step apart; a patch's samples are `spacing` apart."""
 
     reach: float
     step: float
@@ -72,8 +68,7 @@ def facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarra
 def in_sight(
     camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """(N,) bool: points (N, 3) that the mesh does not hide, tested in a depth image of reduced
-    size."""
+    """(N,) bool: points (N, 3) that the mesh does not hide, by a depth image of reduced size."""
     small = camera.scaled(min(1.0, DEPTH_IMAGE_SIDE / max(camera.width, camera.height)))
     triangle, inside = rasterize(vertices, faces, small)
     covered = triangle >= 0
@@ -136,8 +131,7 @@ def surface_offsets(
 def _patches(
     points: np.ndarray, normals: np.ndarray, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample positions (N, P, 3) in the tangent planes, and weights (P,) that fall off from the
-    center."""
+    """Sample positions (N, P, 3) in the tangent planes; weights (P,), largest at the center."""
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(axis, normals)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
@@ -152,8 +146,7 @@ def _patches(
 def _sampled(
     view: GrayView, patches: np.ndarray, normals: np.ndarray, offsets: np.ndarray
 ) -> np.ndarray:
-    """Levels (M, D, P) of the patches (M, P, 3) moved along their normals by each of the offsets
-    (D,)."""
+    """Levels (M, D, P) of patches (M, P, 3) moved along their normals by offsets (D,)."""
     import cv2
 
     camera, turn = view.camera, view.camera.world_to_camera[:3, :3]

@@ -58,8 +58,7 @@ def picture_of_first_frame(
     places: SurfacePoints,
     reliable: np.ndarray,
 ) -> np.ndarray | None:
-    """The head on the first frame, found within seconds; None where no face, or several, are seen
-    there."""
+    """The head on the first frame, within seconds; None where no face, or several, are seen."""
     timestep = footage.timesteps[0]
     seeing = [camera for camera in footage.cameras if timestep in camera.timesteps]
     seeing = evenly_spread(seeing, FIRST_CAMERAS)
@@ -201,8 +200,7 @@ def _cropped(camera: Camera, left: int, top: int, width: int, height: int, scale
 
 
 def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the head in the image; the whole image where it lies
-    outside."""
+    """Left, top, right, bottom of the head in the image; the whole image where it is outside."""
     pixels, depth = camera.project(vertices)
     whole = 0, 0, camera.width, camera.height
     if not (depth > 0).all():

@@ -19,8 +19,7 @@ from .write_capture import posed_mesh
 POINT_SHARE = 0.25
 """Weight of a surface point: patches of neighboring points share most of their pixels."""
 DIRECTIONS = 6
-"""Steps of a direction's coordinates, about 10°: from within one step, a head hides the same of
-itself."""
+"""Steps of a direction's coordinates, about 10°: in one step, a head hides the same of itself."""
 MIN_PART_SHARE = 0.33
 """Connected parts smaller than this share of the head (eyeballs, teeth) have no surface points."""
 
@@ -91,8 +90,7 @@ def excerpt(
 
 
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:
-    """Centers of about `count` triangles, spread evenly over the area of the head's large connected
-    parts."""
+    """Centers of about `count` triangles, spread evenly over the area of the large parts."""
     vertices, faces = head.model.v_template, head.model.faces
     large = large_parts(head.model)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -151,8 +149,7 @@ def with_outlines(
     near: np.ndarray,
     reach: float,
 ) -> SeenSurface:
-    """The surface with what masks say about points at the head's outline; near (N,) bool: points
-    that this is for."""
+    """The surface with what masks say about points at the outline; near (N,) bool: of which."""
     vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
     at = points.on(vertices, faces)
     total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
@@ -169,8 +166,7 @@ def with_outlines(
 def outlines_agree(
     fit: HeadFit, take: RecordedTake, points: SurfacePoints, near: np.ndarray, reach: float
 ) -> bool:
-    """Whether the masks end where the surface in the images does; False without masks. reach:
-    meters searched."""
+    """Whether masks, if any, end where the surface in the images does; reach: meters searched."""
     model, distances = fit.head.model, [np.zeros(0)]
     for timestep, parameters in fit.parameters.items():
         vertices = posed_mesh(fit, parameters)
@@ -235,8 +231,7 @@ def outline_offsets(
 def _rim(
     camera: Camera, vertices: np.ndarray, faces: np.ndarray, around: np.ndarray, pixels: float
 ) -> np.ndarray:
-    """The triangles (R, 3) of the outline near the pixels `around` (N, 2): most of the mesh need
-    not be drawn."""
+    """Triangles (R, 3) of the outline near pixels `around` (N, 2): few of the mesh's are drawn."""
     from scipy.spatial import cKDTree
 
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -251,16 +246,14 @@ def _rim(
 
 
 def _edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Step (N,) at which lines of pixels `at` (N, S, 2) leave a mask (H, W) from 0 to 1; NaN unless
-    they do so once."""
+    """Step (N,) at which lines `at` (N, S, 2) leave a mask (H, W), 0 to 1, once; else NaN."""
     level = _sampled(mask, at)
     crossings = (level[:, :-1] > 0) != (level[:, 1:] > 0)
     return _crossed(level, crossings.argmax(1), steps, (crossings.sum(1) == 1) & (level[:, 0] > 0))
 
 
 def _last_edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """As `_edge`, of a mask with holes: the last step at which a line leaves it; NaN where it ends
-    inside."""
+    """As `_edge`, of a mask with holes: the last step; NaN where a line ends inside."""
     level = _sampled(mask, at)
     leaves = (level[:, :-1] > 0) & (level[:, 1:] <= 0)
     last = leaves.shape[1] - 1 - leaves[:, ::-1].argmax(1)
@@ -278,8 +271,7 @@ def _sampled(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _crossed(
     level: np.ndarray, last: np.ndarray, steps: np.ndarray, valid: np.ndarray
 ) -> np.ndarray:
-    """Step (N,) at which levels (N, S) pass zero between `last` (N,) and the next; NaN where not
-    valid."""
+    """Step (N,) at which levels (N, S) pass zero after `last` (N,); NaN where not valid."""
     row = np.arange(len(level))
     before, after = level[row, last], level[row, last + 1]
     share = before / np.where(valid, before - after, 1)

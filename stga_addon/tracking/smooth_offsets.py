@@ -1,5 +1,4 @@
-"""Smooth offsets of a mesh's vertices along its normals, from where cameras see points of its
-surface."""
+"""Smooth offsets of vertices along their normals, from where cameras see points of the surface."""
 
 from typing import Any
 

@@ -53,8 +53,7 @@ from .torso_take import (
 )
 
 MIN_TIMESTEPS, MAX_CAMERAS = 4, 4
-"""Below it, there is no motion to tell apart; cameras, spread over the rig, whose images are
-compared."""
+"""Below it, there is no motion to tell apart; cameras over the rig, whose images are compared."""
 TIE = 1e-3
 """Difference in the trace of rotations that time decides."""
 MIN_POINTS = 200
@@ -171,8 +170,7 @@ def _followed(
 def _motions(
     take: TorsoTake, seen: SeenPoints, some: Sequence[int], walk: BothWays
 ) -> dict[str, Motion]:
-    """The motions that the torso may have; some: timesteps at which it is followed first, to find
-    the points' depth."""
+    """The motions that a torso may have; some: first followed to find the points' depth."""
     everything = sorted(take.parameters)
     seen = at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [(take, seen, False)], some)
@@ -188,8 +186,7 @@ def _motions(
 
 
 def _middle_timestep(parameters: Mapping[int, np.ndarray]) -> int:
-    """The timestep at which the head is turned most nearly as on average: there the torso is taken
-    to be straight."""
+    """The timestep with the head's most average turn, where the torso is taken to be straight."""
     timesteps = sorted(parameters)
     turns = np.stack([head_turn(parameters[timestep]) for timestep in timesteps])
     # of a head that does not turn, the middle of the take
@@ -298,8 +295,7 @@ class _Follower:
         return found
 
     def _visible(self, shot: TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
-        """Number of each camera that sees any of its points that are fitted, and the rows of
-        these."""
+        """Number of each camera that sees any of its fitted points, and the rows of these."""
         fitted = self._seen.fitted
         chosen = [
             (number, rows[fitted[rows] & shot.shows(number, at[rows])])

@@ -34,8 +34,7 @@ from .torso_take import (
 )
 
 BLOCK_PX = 12
-"""Side of the blocks of pixels of which one in HELD_OUT is not fitted, and tells whether bending is
-right."""
+"""Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether bending is right."""
 ROUGHNESS_M, BEND_SIGMA_M = 0.0005, 0.02
 """Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
 FLOW_SIGMA_PX, FLOW_SHARE = 0.5, 0.15
@@ -51,8 +50,7 @@ STEPS = 4
 HELD = 1e10
 """Precision that holds a vertex."""
 DEPTH_SIGMA_M, MIN_WEIGHT = 0.02, 0.5
-"""Over which points' depths are averaged; sum of their weights, below which the surface is not
-seen."""
+"""Over which points' depths are averaged; sum of weights from which the surface is seen."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
 """From the base of the neck, as seen from the front: from straight down to the person's left."""
 SLOPE = 0.8
@@ -60,11 +58,9 @@ SLOPE = 0.8
 REACH_RAD, DIRECTION_SIGMA = np.radians(10), 1.0
 """Of a direction to both sides; smoothing of what is found in them, in steps."""
 MIN_POINTS, FARTHEST_SHARE, BEYOND_M = 5, 0.98, 0.015
-"""In a direction: points below which it is not seen, the share of them that the mesh reaches, and
-how far beyond."""
+"""Of a direction: points from which it is seen, share that the mesh reaches, how far beyond."""
 FULL_HEIGHT = 0.5
-"""Height (see `TorsoSheet`) from which vertices lie on the surface, not between it and the
-model's."""
+"""Height (see `TorsoSheet`) from which vertices lie on the surface alone."""
 
 
 @dataclass(frozen=True)
@@ -176,8 +172,7 @@ def found_bending(
     some: Sequence[int],
     walk: BothWays,
 ) -> Bending | None:
-    """How a torso with a rigid motion bends; None where the images of some timesteps are not
-    explained better by it."""
+    """How a torso with a rigid motion bends; None where images are not explained better so."""
     sheet = torso_sheet(take.model)
     if sheet is None:
         return None
@@ -248,8 +243,7 @@ def _bend(cloth: "_Cloth", way: Sequence[int], step: Step) -> dict[str, np.ndarr
 
 
 class _Cloth:
-    """How the sheet bends over a take, as (N, 3) offsets of its vertices in the torso's axes, in
-    meters."""
+    """How the sheet bends: (N, 3) offsets of its vertices in the torso's axes, in meters."""
 
     def __init__(
         self,
@@ -286,8 +280,7 @@ class _Cloth:
     def misfit(
         self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]
     ) -> tuple[float, float]:
-        """Share, from 0 to 1, of the pixels that were not fitted that images do not explain: rigid,
-        and bent."""
+        """Share, 0 to 1, of pixels that were not fitted that is not explained: rigid, and bent."""
         total, count, rigid = np.zeros(2), 0, np.zeros_like(self._drape)
         for timestep in timesteps:
             shot = self._take.shot(timestep)
@@ -303,8 +296,7 @@ class _Cloth:
         return float(total[0] / max(count, 1)), float(total[1] / max(count, 1))
 
     def _numbers(self, shot: TorsoShot) -> list[int]:
-        """Of the cameras that see the sheet at the first timestep and now, in images of one
-        size."""
+        """Of the cameras that see the sheet at first and now, in images of one size."""
         known = [(n, self._references[n]) for n in shot.views if n in self._references]
         return [
             number
@@ -395,8 +387,7 @@ def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:
 
 
 def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarray]:
-    """By how many pixels (P, 2) the images show points beside where they are, and weights (P,) from
-    0 to 1."""
+    """Pixels (P, 2) from points to where the images show them, and weights (P,), 0 to 1."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS

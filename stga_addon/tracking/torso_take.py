@@ -35,16 +35,13 @@ EVIDENCE_LEVEL = 1
 POINT_STEP_M, MAX_POINTS = 0.005, 800
 """Distance between points at the torso, and how many of them a camera has at most."""
 BLOCK_POINTS, HELD_OUT = 4, 3
-"""Blocks of so many points by so many; one of so many blocks is not fitted, and tells which motion
-is right."""
+"""Side of blocks in points; one of so many is not fitted, and tells which motion is right."""
 MASK_MARGIN = 0.01
 """Around the mask, whose edge is compared as well; share of the image's height."""
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
-"""Along a point's ray, from the depth of the mesh beside it, that are tried: a chest is before the
-neck."""
+"""Along a ray, from the mesh's depth beside it, that are tried: a chest is before the neck."""
 DEPTH_TIMESTEPS, NEIGHBORS, UNSEEN_COST = 8, 25, 0.5
-"""Timesteps at which depths are compared; points whose evidence counts for each other; cost where a
-point is not in sight."""
+"""Timesteps at which depths are compared; points that count for each other; cost unseen."""
 ALONG_CAMERAS = CHANNEL_WEIGHTS * [0, 1, 1]
 """Weights of channels between cameras, from which surfaces are not equally bright."""
 
@@ -67,8 +64,7 @@ Motion = Mapping[int, PosedTorso]
 
 @dataclass(frozen=True)
 class TorsoPose:
-    """Orientation (3, 3) of the torso in the world, and its shift (3,) in meters, 0 where it is
-    only turned."""
+    """Orientation (3, 3) of the torso in the world, and shift (3,) in meters, 0 if only turned."""
 
     turn: np.ndarray
     shift: np.ndarray
@@ -84,8 +80,7 @@ class TorsoShot:
     heads: Mapping[int, np.ndarray]
 
     def shows(self, number: int, at: np.ndarray) -> np.ndarray:
-        """(N,) bool: points (N, 3) that lie in the camera's image, and not behind or before the
-        head."""
+        """(N,) bool: points (N, 3) in the camera's image, not behind or before the head."""
         camera, head = self.views[number].levels[EVIDENCE_LEVEL].camera, self.heads[number]
         pixels, depth = camera.project(at)
         x, y = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
@@ -93,8 +88,7 @@ class TorsoShot:
 
 
 class TorsoTake:
-    """The tracked take: images by timestep, and the head's parameters with any orientation of the
-    torso."""
+    """The take: images by timestep, and the head's parameters with any turn of the torso."""
 
     def __init__(
         self,
@@ -214,8 +208,7 @@ class BothWays:
         first: int,
         timesteps: Sequence[int],
     ) -> list[dict[int, dict[str, np.ndarray]]]:
-        """For each part, by timestep, the rows of the arrays that work(*part, way, step) gives for
-        both ways."""
+        """For each part, by timestep, rows of the arrays that work(*part, way, step) gives."""
         later = [first, *(t for t in timesteps if t > first)]
         earlier = [first, *(t for t in reversed(timesteps) if t < first)]
         every, done = [(*part, way) for part in parts for way in (later, earlier)], self._done
@@ -318,24 +311,21 @@ class SeenPoints:
         level: int,
         weights: np.ndarray = CHANNEL_WEIGHTS,
     ) -> np.ndarray:
-        """(M,) from 0 to 1: how little a camera's image at points (M, 3) looks like the reference
-        of the rows."""
+        """(M,), 0 to 1: how little a camera's image at points (M, 3) looks like the reference."""
         squared = self.residual(shot, number, rows, at, level) ** 2 @ weights
         return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
 
     def residual(
         self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int
     ) -> np.ndarray:
-        """Channels (M, 3) of a camera's image at points, minus those of the reference, in
-        NOISE_LEVELS."""
+        """Channels (M, 3) of a camera's image at points less the reference's, in NOISE_LEVELS."""
         own = shot.views[number].levels[level]
         values = sampled([own.channels], own.camera.project(at)[0])[0]
         return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
 
 
 def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
-    """What the cameras see below the head at a timestep: on the rays of their pixels, as deep as
-    the mesh beside them."""
+    """What cameras see below the head: points on pixels' rays, as deep as the mesh beside."""
     from scipy.spatial import cKDTree
 
     shot, mesh = take.shot(timestep), take.mesh(take.parameters[timestep])
@@ -386,8 +376,7 @@ class Carrier:
         self._first = self._frames(first)
 
     def carried(self, torso: PosedTorso) -> Callable[[np.ndarray], np.ndarray]:
-        """What brings the points (N, 3) from where they are at first to where this torso has
-        them."""
+        """What brings points (N, 3) from where they are at first to where this torso has them."""
         before, after, face = self._first, self._frames(torso), self._face
         size = (after.scale / before.scale)[:, None, None]
         turn = (size * after.rotation @ before.rotation.swapaxes(1, 2))[face]
@@ -409,8 +398,7 @@ def compared(
     motions: Mapping[str, Motion],
     timesteps: Sequence[int],
 ) -> dict[str, float]:
-    """Motion -> mean misfit of the points that were not fitted, where all motions leave them in
-    sight."""
+    """Motion -> mean misfit of held-out points, where all motions leave them in sight."""
     first, total, count = seen["head"], dict.fromkeys(motions, 0.0), 0
     start = first.timestep
     carriers = {name: Carrier(take, own[start], seen[name].at) for name, own in motions.items()}
@@ -451,8 +439,7 @@ def at_depth(
 
 
 def _moved_in_depth(seen: SeenPoints, cost: np.ndarray) -> SeenPoints:
-    """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least; where it tells
-    nothing, as they are."""
+    """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least, if it tells."""
     from scipy.spatial import cKDTree
 
     moved = seen.at.copy()

@@ -80,8 +80,7 @@ demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 
 
 LONG_TAKE = 50
-"""Timesteps from which the fit to landmarks is worth a helping process: its small matrices are
-slower in threads."""
+"""From which the fit is worth a helping process: its small matrices are slower in threads."""
 
 
 @dataclass(frozen=True)
@@ -262,8 +261,7 @@ def track(
 
 @dataclass(frozen=True)
 class _Seen:
-    """Landmarks: their places on the head model, which are reliable, and by camera, as detected and
-    as used."""
+    """Landmarks: places on the head model, which are reliable, and by camera as detected."""
 
     places: SurfacePoints
     reliable: np.ndarray
@@ -271,8 +269,7 @@ class _Seen:
 
     @cached_property
     def found(self) -> dict[str, CameraLandmarks]:
-        """With confidence 0 for those that are not reliable; cameras without a face have none at
-        all."""
+        """Confidence 0 for those that are not reliable; cameras without a face have none."""
         return {
             name: replace(own, confidence=own.confidence * self.reliable)
             if own.confidence.any()
@@ -348,8 +345,7 @@ def _median_px(errors: Mapping[str, Mapping[int, float | tuple[float, float]]]) 
 def interpolated(
     parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]
 ) -> dict[int, np.ndarray]:
-    """Parameters of all timesteps: linear between the known ones, constant before the first and
-    after the last."""
+    """Parameters of all timesteps: linear between the known ones, constant before and after."""
     known = sorted(parameters)
     values = np.stack([parameters[timestep] for timestep in known]).T
     columns = np.stack([np.interp(timesteps, known, column) for column in values], axis=1)
@@ -364,8 +360,7 @@ def reprojection_errors(
     footage: Footage,
     found: Mapping[str, CameraLandmarks],
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Camera -> timestep -> median distance of its landmarks from the fitted head's, in pixels and
-    in face sizes."""
+    """Camera -> timestep -> landmarks' median distance from the head's: pixels, face sizes."""
     points = PosedPoints(fit.head.model, places)
     errors: dict[str, dict[int, tuple[float, float]]]
     errors = {camera.name: {} for camera in footage.cameras}
@@ -398,8 +393,7 @@ def _source(
 
 
 def _begin(out: Path, source: dict[str, Any]) -> None:
-    """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other
-    footage."""
+    """Record what the landmarks in `out` are of. Raises StgaError for other footage's."""
     path = out / LANDMARKS_FOLDER / "footage.json"
     if path.exists() and read_json(path) != source:
         raise StgaError(
@@ -421,8 +415,7 @@ def _stored(footage: Footage, out: Path) -> Footage:
 
 
 def _recording(camera: FootageCamera) -> list[Any]:
-    """The first frame, the state of all files, and how frames are undistorted; it changes with
-    offset and lens."""
+    """The first frame, the state of all files, and the undistortion; offsets change it."""
     pinhole = camera.camera
     first = [camera.source(camera.timesteps[0]), _state(camera.frames.files)]
     if camera.undistortion is None:
@@ -498,8 +491,7 @@ def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
 def _check_cameras(
     footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]
 ) -> None:
-    """Raise StgaError for a camera whose landmarks do not fit the head that the others see, or
-    where none fits."""
+    """Raise StgaError for a camera that does not fit what others see, or where none fits."""
     shares = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
     share = {name: float(np.median(own)) for name, own in shares.items()}
 

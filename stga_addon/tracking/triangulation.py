@@ -9,11 +9,9 @@ from ..capture.camera import Camera
 
 ITERATIONS = 15
 OUTLIER_SCALE = 1.5
-"""Distances from a ray, in medians of the landmark's rays, at which its weight has fallen to a
-quarter."""
+"""Distances from a ray, in medians of the landmark's, at which its weight is a quarter."""
 MIN_DISTANCE_SHARE = 1e-5
-"""Smallest scale of outliers, as a share of the distance to the cameras: below it, residuals are
-rounding."""
+"""Of outliers' scale, as a share of the distance to the cameras; below is rounding."""
 RANK_GUARD = 1e-9
 
 

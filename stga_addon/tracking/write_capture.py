@@ -1,5 +1,4 @@
-"""Writing of a tracked take as a capture: VHAP's layout for FLAME, the mesh layout for other
-models."""
+"""Writing of a tracked take: VHAP's layout for FLAME, the mesh layout for other models."""
 
 import shutil
 from collections.abc import Mapping
@@ -85,8 +84,7 @@ def write_capture(
 def posed_mesh(
     fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """The head's vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this
-    timestep."""
+    """Vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this timestep."""
     return flame_forward(fit.head.model, np.zeros(0), frame_of(parameters, offset))
 
 
@@ -128,7 +126,6 @@ def _entry(
 
 
 def moving_arrays(parameters: np.ndarray) -> dict[str, np.ndarray]:
-    """What changes from timestep to timestep of (E + 18,) parameters, as in VHAP's files: (1, …)
-    float32."""
+    """What changes from timestep to timestep of (E + 18,), as in VHAP's files: (1, …) float32."""
     frame = frame_of(parameters)
     return {name: getattr(frame, name)[None].astype(np.float32) for name in FRAME_FIELDS}

@@ -340,7 +340,8 @@ def batch(rng: random.Random, case: Path) -> list[str]:
 
 COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = {
     "info": (3, info), "select": (3, select), "export": (3, export), "drive": (1, drive),
-    "render": (3, render), "eval": (2, evaluate), "train": (1, train), "refine": (0.5, refine), "extend": (0.5, extend),
+    "render": (3, render), "eval": (2, evaluate), "train": (1, train), "refine": (0.5, refine),
+    "extend": (0.5, extend),
     "relight": (0.5, relight), "track": (1, track), "avatar": (0.5, avatar),
     "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{n}" for n in REQUESTS))]),
     "batch": (1, batch), "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),

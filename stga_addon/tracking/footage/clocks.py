@@ -1,5 +1,4 @@
-"""How many frames later one camera's video shows the same moment than another's: from their sound,
-or from motion."""
+"""How many frames later a camera's video shows the same moment: from sound, or from motion."""
 
 from collections.abc import Callable, Mapping
 from itertools import chain
@@ -18,8 +17,7 @@ MOTION_SIZE = 32
 MIN_CORRELATION = 0.2
 """Correlation below which nothing is shared."""
 MIN_DISTINCTION = 1.5
-"""How many times the best lag's score has to exceed that of any that is more than NEIGHBORHOOD_S
-away."""
+"""Times that the best lag's score exceeds that of any farther than NEIGHBORHOOD_S away."""
 NEIGHBORHOOD_S = 0.2
 
 
@@ -90,8 +88,7 @@ def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[in
 
 
 def _loudness(video: Video) -> tuple[np.ndarray, float]:
-    """Rise of the sound's loudness every SOUND_HOP samples, and its begin in seconds after that of
-    the pictures."""
+    """Rise of loudness every SOUND_HOP samples; seconds by which it begins after the pictures."""
     from av import AudioResampler
 
     with opened_video(video.path) as container:

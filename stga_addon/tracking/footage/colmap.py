@@ -111,8 +111,7 @@ def _split(
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """(number from 1, line) without comments; empty lines stay: images.txt has one for an image
-    without points."""
+    """(number from 1, line) without comments; images.txt has empty ones of no points."""
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.startswith("#"):
             yield number, line.strip()

@@ -1,5 +1,4 @@
-"""Focal lengths that recordings state: EXIF of photos, metadata of the tracks of QuickTime and MP4
-files."""
+"""Focal lengths that recordings state: photos' EXIF, metadata of QuickTime's and MP4's tracks."""
 
 import re
 import struct
@@ -12,8 +11,7 @@ from PIL import Image
 from ...capture.images import FORMATS
 
 FULL_FRAME_DIAGONAL_MM = 43.27
-"""Of 36 x 24 mm; equivalent focal lengths have the same angle of view over the diagonal (CIPA
-DCG-001)."""
+"""Of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA DCG-001)."""
 MIN_EQUIVALENT_MM, MAX_EQUIVALENT_MM = 5.0, 2000.0
 EXIF, EQUIVALENT, FOCAL, PER_UNIT, UNIT = 0x8769, 0xA405, 0x920A, 0xA20E, 0xA210
 WIDTH, HEIGHT = 0xA002, 0xA003
@@ -83,8 +81,7 @@ def _movie(path: Path) -> bytes:
 
 
 def _boxes(data: bytes, start: int = 0) -> Iterator[tuple[bytes, int, int]]:
-    """(kind, first byte of the content, end) of the boxes that follow each other from `start`
-    on."""
+    """(kind, first byte of the content, end) of the boxes one after another from `start` on."""
     while start + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, start)
         if size < 8:

@@ -12,8 +12,7 @@ from ...errors import StgaError
 MIN_RADIUS = 1e-9
 """Below it, an angle and its tangent are the same number; and parameters have no effect."""
 ZOOM_RANGE, ZOOM_STEPS = (0.5, 2.0), 30
-"""Of the pinhole's focal length over the lens's: a fisheye's rim would otherwise leave few pixels
-for the middle."""
+"""Of the pinhole's focal length over the lens's: a fisheye's rim leaves few pixels inside."""
 BORDER_POINTS = 33
 """Points along a side of the image at which it is checked that all of it was recorded."""
 CACHED_MAPS = 32
@@ -126,8 +125,7 @@ def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | Non
 
 
 def _is_inside(recorded: Camera, lens: Lens, zoom: float) -> bool:
-    """Whether the pinhole's border lies in the recorded image, and the lens spreads all rays to it
-    outward."""
+    """Whether the pinhole's border was recorded, and the lens spreads all rays to it outward."""
     width, height, *intrinsics = _intrinsics(recorded)
     focal, center = intrinsics[:2], intrinsics[2:]
     along = np.linspace(0, 1, BORDER_POINTS)

@@ -1,5 +1,4 @@
-"""Footage: the cameras of a rig and their synchronized frames, undistorted and decoded on
-request."""
+"""Footage: a rig's cameras and synchronized frames, undistorted and decoded on request."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -30,8 +29,7 @@ class ImageFrames:
         return tuple(self.views)
 
     def require_sizes(self, name: str) -> None:
-        """Read the headers of all images. Raises StgaError for one of another size than camera
-        `name` has."""
+        """Read all headers. Raises StgaError for an image of another size than the camera's."""
         for timestep, view in self.views.items():
             width, height = image_size(view.image)
             expected = view.camera.width, view.camera.height
@@ -110,8 +108,7 @@ class FootageCamera:
         return image
 
     def mask(self, timestep: int) -> np.ndarray | None:
-        """The undistorted foreground mask (H, W) uint8, 255 inside; None where there is none.
-        Raises as `image`."""
+        """The undistorted mask (H, W) uint8, 255 inside; None without. Raises as `image`."""
         if timestep in self.mattes:
             name, matte = self.name, self.mattes[timestep]
             return read_mask(View(timestep, 0, self.camera, name, Path(name), matte))
@@ -119,8 +116,7 @@ class FootageCamera:
         return None if mask is None else self._undistorted(mask)
 
     def clean_plate(self) -> np.ndarray | None:
-        """The undistorted plate (H, W, 3) uint8 sRGB; None where there is none. Raises as
-        `image`."""
+        """The undistorted plate (H, W, 3) uint8 sRGB; None without. Raises as `image`."""
         if self.plate is None:
             return None
         return self._undistorted(read_image(View(0, 0, self.camera, self.name, self.plate)))
@@ -162,8 +158,7 @@ class Footage:
     warnings: tuple[str, ...] = ()
 
     def views(self) -> Iterator[tuple[int, FootageCamera]]:
-        """(timestep, camera) of every frame, camera by camera in order of time: the fast order for
-        videos."""
+        """(timestep, camera) of every frame, camera by camera: the fast order for videos."""
         for camera in self.cameras:
             for timestep in camera.timesteps:
                 yield timestep, camera

@@ -112,8 +112,7 @@ def _footage(
 def _masked(
     camera: FootageCamera, recorded: Sources, given: Sources, single: bool
 ) -> FootageCamera:
-    """The camera with masks of a folder. single: whether it is the only camera, whose masks need no
-    folder of their own."""
+    """The camera with masks of a folder. single: it needs no folder of its own."""
     names, frames, masks = [camera.name, ""] if single else [camera.name], camera.frames, {}
     by_number = {
         frame_number(path): path for name in reversed(names) for path in given.folders.get(name, [])
@@ -142,8 +141,7 @@ def _masked(
 
 
 def _by_name(shots: list[Shot], names: list[str | None], root: Path) -> dict[str, Shot]:
-    """Camera -> its shot. Raises StgaError for a camera without recording, and for two with the
-    same."""
+    """Camera -> its shot. Raises StgaError for one without recording, and two of the same."""
     found: dict[str, Shot] = {}
     for shot, name in zip(shots, names, strict=True):
         if name is None:

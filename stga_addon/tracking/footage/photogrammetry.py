@@ -23,8 +23,7 @@ NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 XMP_MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
 
 ImageSize = Callable[[str], tuple[int, int]]
-"""Label of a camera -> (width, height) of its images, which RealityCapture's files do not hold.
-Raises StgaError."""
+"""Label of a camera -> (width, height), not in RealityCapture's files. Raises StgaError."""
 
 
 # Metashape
@@ -73,8 +72,7 @@ def read_metashape(path: Path) -> tuple[list[Shot], list[str]]:
 def _sensor(
     sensor: Element, where: str
 ) -> tuple[tuple[float, float], float, tuple[float, float], Lens]:
-    """Image size, focal length, principal point and lens, as adjusted by the alignment where it
-    was."""
+    """Image size, focal length, principal point and lens, adjusted by the alignment or not."""
     found = sensor.findall("calibration")
     adjusted = (c for c in found if c.get("class") == "adjusted")
     calibration = next(adjusted, found[-1] if found else None)

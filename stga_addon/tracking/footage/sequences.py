@@ -49,8 +49,7 @@ Sequence = Video | list[Path]
 
 
 def open_sequence(files: Path | list[Path]) -> Sequence:
-    """Index a video; images are taken as they are. Raises StgaError where the video cannot be
-    read."""
+    """Index a video; images are taken as they are. Raises StgaError for an unreadable one."""
     return read_video(files) if isinstance(files, Path) else files
 
 

@@ -48,8 +48,7 @@ class Shot:
 
 
 def read_text(path: Path) -> str:
-    """The whole file, with or without a byte order mark. Raises StgaError as `read_bytes`, and
-    where not UTF-8."""
+    """The file, with or without a byte order mark. Raises StgaError, also where not UTF-8."""
     try:
         return read_bytes(path).decode("utf-8-sig")
     except ValueError as error:
@@ -57,8 +56,7 @@ def read_text(path: Path) -> str:
 
 
 def read_xml(path: Path) -> ElementTree.Element:
-    """The root element. Raises StgaError where it is malformed, or declares entities, which
-    calibrations never do."""
+    """The root element. Raises StgaError where it is malformed, or declares entities."""
     data = read_bytes(path)
     if b"<!DOCTYPE" in data:
         raise StgaError(f"{path}: declares a document type; expected a calibration")
@@ -69,8 +67,7 @@ def read_xml(path: Path) -> ElementTree.Element:
 
 
 def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[float]:
-    """Finite numbers. Raises StgaError, beginning with `where`, for other words or another
-    count."""
+    """Finite numbers. Raises StgaError, beginning with `where`, for others or another count."""
     words = list(words)
     try:
         values = [float(word) for word in words]

@@ -53,8 +53,7 @@ class Sources:
 
 
 def find_sources(root: Path) -> Sources:
-    """List the footage folder, four levels deep, without hidden files and folders. Raises StgaError
-    for over a million files."""
+    """List the visible files, four levels deep. Raises StgaError for over a million files."""
     sources, count = Sources(root), 0
     for folder, names, files in os.walk(root):
         depth = len(Path(folder).relative_to(root).parts)
@@ -101,8 +100,7 @@ def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
 
 
 def still_image(sources: Sources, label: str, where: str) -> Path:
-    """The image of that name. Raises StgaError, beginning with `where`, where there is none, or
-    more than one."""
+    """The image of that name. Raises StgaError where there is none, or more than one."""
     found = next((sources.images[name] for name in _tails(label) if name in sources.images), [])
     if not found:
         raise StgaError(
@@ -116,8 +114,7 @@ def still_image(sources: Sources, label: str, where: str) -> Path:
 
 
 def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
-    """The video of a camera, or its images in order. Raises StgaError where there are both, or two
-    videos."""
+    """The video of a camera, or its images in order. Raises StgaError for both, or two videos."""
     videos, images = sources.videos.get(name, []), sources.folders.get(name, [])
     if len(videos) > 1 or (videos and images):
         other = videos[1] if len(videos) > 1 else images[0].parent

@@ -31,11 +31,9 @@ DISPLAY_MATRIX_ONE = 1 << 16
 CHECKED_FRAMES = 8
 """Frames at the beginning of a video that are decoded to check the times of its packets."""
 MAX_FRAMES_AHEAD = 100
-"""Frames that are decoded to reach a later one; further ahead, the key frame before it is
-sought."""
+"""Frames that are decoded to reach a later one; further ahead, a key frame is sought."""
 SEEK_BACK_FRAMES = (0, 16, 64, 256)
-"""How far before a frame a seek is tried, one after the other, before all is decoded from the
-beginning."""
+"""How far before a frame a seek is tried, in turn, before all is decoded from the beginning."""
 RATE_TOLERANCE = 0.01
 """Relative difference up to which a stated frame rate is that of the frames' times."""
 VARIABLE_RATE_FACTOR = 1.5
@@ -129,8 +127,7 @@ class VideoFrames:
         return tuple(self.numbers)
 
     def image(self, timestep: int) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB. Raises StgaError that names the file; KeyError for a timestep
-        without a frame."""
+        """(H, W, 3) uint8 sRGB. Raises StgaError naming the file; KeyError without a frame."""
         number = self.numbers[timestep]
         av = _pyav(self.video.path)
         try:
@@ -158,8 +155,7 @@ class VideoFrames:
         return (self.video.path,)
 
     def file(self, timestep: int) -> Path | None:
-        """The image file whose stored pixels are the frame; None where they are turned or
-        converted."""
+        """The image file whose stored pixels are the frame; None where they are converted."""
         return None
 
     def close(self) -> None:
@@ -221,8 +217,7 @@ class VideoFrames:
 
 
 def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
-    """Size (width, height) as displayed and times of the first frames in the order shown. Raises
-    StgaError."""
+    """Size as displayed and times of the first frames in the order shown. Raises StgaError."""
     with opened_video(path) as container:
         frames = _decoded_frames(container)
         first = next(frames, None)
@@ -266,8 +261,7 @@ def _packet_times(path: Path) -> list[int] | None:
 
 
 def _decoded_frames(container: Any) -> Iterator[Any]:
-    """All frames from the beginning; a transport stream may begin with packets that cannot be
-    decoded."""
+    """All frames; the first packets of a transport stream may not be decodable."""
     from av.error import InvalidDataError
 
     stream, may_fail = container.streams.video[0], _is_of(container, ("mpegts",))
