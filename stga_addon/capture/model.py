@@ -91,9 +91,8 @@ def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
     masked = sum(view.mask is not None for view in views)
     splits = []
     for name, split in capture.views.items():
-        timesteps, cameras = (
-            {getattr(v, of) for v in split} for of in ("timestep", "camera_index")
-        )
+        timesteps = {view.timestep for view in split}
+        cameras = {view.camera_index for view in split}
         counts = f"{len(timesteps)} timesteps, {len(cameras)} cameras"
         splits += [f"{name} {len(split)} views ({counts})"] if split else []
     recorded = [

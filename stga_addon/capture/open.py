@@ -199,9 +199,8 @@ def _open_mesh_folder(root: Path) -> Capture:
 
 def mesh_files(folder: Path) -> list[Path]:
     """The meshes directly in a folder, by name."""
-    return sorted(
-        path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES and path.is_file()
-    )
+    files = (path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
+    return sorted(path for path in files if path.is_file())
 
 
 def _mesh_capture(

@@ -159,9 +159,7 @@ def _rows(
     for timestep, values in keys.items():
         if not _are_parameters(values, (size,)):
             raise StgaError(f"key at timestep {timestep}: expected {(size,)} finite numbers")
-    return {
-        timesteps.index(timestep): values.astype(np.float64) for timestep, values in keys.items()
-    }
+    return {timesteps.index(t): values.astype(np.float64) for t, values in keys.items()}
 
 
 def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:

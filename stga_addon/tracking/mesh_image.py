@@ -23,9 +23,8 @@ def shaded_image(
     normal = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T * [1, -1, -1]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
-    brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + (1 - AMBIENT) * np.clip(
-        normal @ light, 0, 1
-    )
+    lit = (1 - AMBIENT) * np.clip(normal @ light, 0, 1)
+    brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + lit
     color = SKIN_RGB if colors is None else (colors[corners] * inside).sum(1)
     image = np.full((camera.height, camera.width, 3), BACKGROUND)
     image[seen] = np.clip(brightness[:, None], 0, 1) * color * 1.15

@@ -104,9 +104,7 @@ def surface_offsets(
     patches, window = _patches(points, normals, sweep.spacing)
     offsets = sweep.offsets.astype(np.float32)
     total = np.zeros((len(points), len(offsets), len(window)), np.float32)
-    own = np.zeros(
-        total.shape[:2], np.float32
-    )  # what patches would add by agreeing with themselves
+    own = np.zeros(total.shape[:2], np.float32)  # what patches add by agreeing with themselves
     for view, cosine in zip(views, usable, strict=True):
         rows = np.flatnonzero(cosine)
         if len(rows):

@@ -170,10 +170,8 @@ def outlines_agree(
     model, distances = fit.head.model, [np.zeros(0)]
     for timestep, parameters in fit.parameters.items():
         vertices = posed_mesh(fit, parameters)
-        at, normals = (
-            points.on(values, model.faces)[near]
-            for values in (vertices, vertex_normals(vertices, model.faces))
-        )
+        both = vertices, vertex_normals(vertices, model.faces)
+        at, normals = (points.on(values, model.faces)[near] for values in both)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         for camera, mask in take.masks(timestep):
             posed = fit.to_capture.camera(camera)

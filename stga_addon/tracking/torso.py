@@ -108,10 +108,8 @@ def follow_torso(
     unchanged, torso = dict(parameters), torso_faces(fit.head.model)
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
         return FollowedTorso(fit, unchanged)
-    middle, some = (
-        _middle_timestep(parameters),
-        evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS),
-    )
+    middle = _middle_timestep(parameters)
+    some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
     present = [camera for camera in footage.cameras if middle in camera.timesteps]
     masked = [camera for camera in present if camera.mask(middle) is not None]
     take = TorsoTake(fit, unchanged, evenly_spread(masked, MAX_CAMERAS), torso)

@@ -198,9 +198,8 @@ def track(
         fit = in_cameras_world(fit) if keep else fit
         errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
         shares = [share for own in misfits.values() for share in own.values()]
-        quality = {"error_px": _median_px(errors)} | (
-            {"unexplained": float(np.mean(shares))} if shares else {}
-        )
+        quality = {"error_px": _median_px(errors)}
+        quality |= {"unexplained": float(np.mean(shares))} if shares else {}
         show(partial(picture_of_fit, fit, footage), quality)
         parameters = interpolated(fit.parameters, footage.timesteps)
         matte_warnings: tuple[str, ...] = ()
@@ -551,7 +550,4 @@ def _warnings(
 
 
 def _rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
-    return {
-        name: {str(timestep): round(value, 3) for timestep, value in own.items()}
-        for name, own in values.items()
-    }
+    return {name: {str(t): round(v, 3) for t, v in own.items()} for name, own in values.items()}

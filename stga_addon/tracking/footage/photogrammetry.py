@@ -64,9 +64,8 @@ def read_metashape(path: Path) -> tuple[list[Shot], list[str]]:
         pose = np.array(transform).reshape(4, 4)  # camera to world, OpenCV axes
         posed = pinhole(size, (focal, focal), center, pose[:3, :3].T, pose[:3, 3], where)
         shots.append(Shot(label, posed, lens, where))
-    return shots, [
-        camera.get("label", "") for camera in cameras if camera.find("transform") is None
-    ]
+    left_out = (camera for camera in cameras if camera.find("transform") is None)
+    return shots, [camera.get("label", "") for camera in left_out]
 
 
 def _sensor(
@@ -168,12 +167,11 @@ def read_realitycapture_xmp(
     """
     shots, without_pose = [], []
     for path in sorted(paths):
-        fields = {}  # which versions of the program write as attributes or as elements
+        fields: dict[str, str] = {}  # as attributes or as elements, by the version
         for element in read_xml(path).iter():
             named = {**element.attrib, element.tag: element.text or ""}
-            fields.update(
-                {k.removeprefix(NAMESPACE): v for k, v in named.items() if k.startswith(NAMESPACE)}
-            )
+            own = {key: text for key, text in named.items() if key.startswith(NAMESPACE)}
+            fields |= {key.removeprefix(NAMESPACE): text for key, text in own.items()}
         if "Rotation" in fields and "Position" in fields:
             shots.append(_xmp_shot(path, fields, image_size(path.stem)))
         else:
