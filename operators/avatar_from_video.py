@@ -18,7 +18,7 @@ from ..stga_addon.jobs.track import (
     read_inputs,
 )
 from ..stga_addon.jobs.train import Train as TrainRequest
-from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
+from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.settings import make_settings
 from . import ids, monitor
 from .common import FileImport, file_filter, file_path, path_property, reporting

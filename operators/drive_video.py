@@ -8,7 +8,7 @@ import bpy
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.convert_motion import ConvertMotion
 from ..stga_addon.jobs.table import Kind
-from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES, is_video
+from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES, is_video
 from . import ids
 from .common import FileImport, file_filter, file_path, needs_rig_or_shapes, reporting
 from .drive import takes_folder

@@ -9,7 +9,7 @@ import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
-from ..stga_addon.tracking.footage.file_types import VIDEO_SUFFIXES
+from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from . import ids
 from .apply_motion import ApplyMotion
 from .common import file_path, is_head, path_property, reporting, scene_settings

@@ -1,5 +1,4 @@
-"""Calibrated pinhole cameras, and paths of them: an orbit around a head, as far as its cameras saw
-it."""
+"""Calibrated pinhole cameras, and orbits around a head, as far as its cameras saw it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,23 +6,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 MAX_IMAGE_PIXELS = 1 << 26
-"""The largest machine-vision sensors have 65 million pixels; a small file that claims more could
-fill the memory."""
+"""Of the largest machine-vision sensors; a small file that claims more could fill the memory."""
 MAX_FOCAL_PIXELS = 1e7
 MAX_COORDINATE_M = 1e5
 """Bound of camera positions and vertices: generous even for a scene in millimeters, and no product
 of them with focal lengths overflows an integer pixel position."""
 MIN_PROJECTION_DEPTH = 1e-6
-"""Meters: points nearer to the camera's plane, or behind it, are projected as if they were at this
-depth."""
+"""Meters: points that are nearer, or behind the camera, are projected as if at this depth."""
 # Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks
 # along +z).
 GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_image_size(width: float, height: float) -> bool:
-    """Whether an image may have this size: whole numbers of at least one pixel, within the
-    limit."""
+    """Whether an image may have this size: whole numbers from one pixel up, within the limit."""
     whole = width % 1 == 0 and height % 1 == 0
     return bool(whole and min(width, height) >= 1) and width * height <= MAX_IMAGE_PIXELS
 
@@ -79,19 +75,11 @@ class Camera:
         return np.asarray((local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3])
 
     def scaled(self, factor: float) -> "Camera":
-        """The same camera with an image `factor` times as large (sizes rounded, at least one
-        pixel)."""
+        """The camera with an image `factor` times as large (sizes rounded, at least one pixel)."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         x, y = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fl_x=self.fl_x * x,
-            fl_y=self.fl_y * y,
-            cx=self.cx * x,
-            cy=self.cy * y,
-        )
+        intrinsics = self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y
+        return Camera(width, height, *intrinsics, self.world_to_camera)
 
 
 def orbited(camera: Camera, center: np.ndarray, up: Sequence[float], angle: float) -> Camera:
@@ -117,27 +105,10 @@ def most_central(directions: np.ndarray) -> int:
     return int((directions @ directions.mean(0)).argmax())
 
 
-def azimuths(
-    cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float]
-) -> np.ndarray:
-    """Angle of each camera about the axis `up` (3,) through `center` (3,), in radians from that of
-    `start`, -π to π: what `orbited` turns `start` by to get to its side."""
-    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
-    arms = np.array([camera.position for camera in (start, *cameras)]) - center
-    first = arms[0] - arms[0] @ axis * axis
-    angles: np.ndarray = np.arctan2(arms[1:] @ np.cross(axis, first), arms[1:] @ first)
-    return angles
-
-
 def camera_from_gl(
-    camera_to_world: np.ndarray,
-    width: int,
-    height: int,
-    fl_x: float,
-    fl_y: float,
-    cx: float,
+    camera_to_world: np.ndarray, width: int, height: int, fl_x: float, fl_y: float, cx: float,
     cy: float,
-) -> Camera:
+) -> Camera:  # fmt: skip
     """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
     world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
     return Camera(width, height, fl_x, fl_y, cx, cy, world_to_camera)
@@ -209,7 +180,11 @@ def covered_angles(
     Of what no camera saw, training has nothing to show. A full turn where they leave no gap of
     MAX_GAP_RAD.
     """
-    seen = np.sort(np.append(azimuths(cameras, start, center, up), 0.0))
+    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+    arms = np.array([camera.position for camera in (start, *cameras)]) - center
+    first = arms[0] - arms[0] @ axis * axis
+    azimuths = np.arctan2(arms[1:] @ np.cross(axis, first), arms[1:] @ first)
+    seen = np.sort(np.append(azimuths, 0.0))
     gaps = np.diff(np.append(seen, seen[0] + 2 * np.pi))
     if gaps.max() < MAX_GAP_RAD:
         return -np.pi, np.pi

@@ -1,5 +1,4 @@
-"""sRGB and linear light, and conversion of recorded colors to sRGB by the codes of ITU-T H.273
-(videos, PNG's cICP)."""
+"""sRGB, linear light, and colors of videos and PNG's cICP by the codes of ITU-T H.273 as sRGB."""
 
 from functools import lru_cache
 
@@ -10,18 +9,15 @@ CHROMATICITIES = {
     9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),  # BT.2020, BT.2100
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),  # Display P3
 }
-"""Code of color primaries -> CIE xy of red, green and blue. White is D65; all other codes are taken
-as sRGB's."""
+"""Code of color primaries -> CIE xy of red, green and blue (white: D65). Others are sRGB's."""
 D65 = (0.3127, 0.3290)
 SRGB = 1
 LINEAR, PQ, HLG = 8, 16, 18
 GAMMAS = {4: 2.2, 5: 2.8}
-"""Code of transfer characteristics -> exponent. Codes that are not named here are taken as sRGB's
-curve."""
+"""Code of transfer characteristics -> exponent. Codes that are not named here are sRGB's curve."""
 
 REFERENCE_WHITE_CD_M2 = 203.0
-"""Luminance of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's white; what is brighter
-is clipped."""
+"""Of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's; what is brighter is clipped."""
 HLG_PEAK_CD_M2, HLG_SYSTEM_GAMMA = 1000.0, 1.2
 BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
 BAND_PIXELS = 1 << 18
@@ -40,7 +36,8 @@ def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
     if is_srgb(primaries, transfer):
         return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
     table = _linear(transfer, np.iinfo(pixels.dtype).max + 1)
-    matrix = _to_bt709(primaries if primaries in CHROMATICITIES else SRGB)
+    known = primaries if primaries in CHROMATICITIES else SRGB
+    matrix = np.asarray(np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(known), np.float32)
     found = np.empty(pixels.shape, np.uint8)
     step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))
     for start in range(0, len(pixels), step):
@@ -58,24 +55,19 @@ def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     """Linear light to sRGB, both 0…1 (IEC 61966-2-1)."""
-    return np.where(
-        linear <= 0.0031308,
-        linear * 12.92,
-        1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055,
-    )
+    curve = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, linear * 12.92, curve)
 
 
 def with_gamma(pixels: np.ndarray, gamma: float) -> np.ndarray:
-    """uint8 pixels whose file says that they are light to the power of `gamma` (PNG's gAMA), as
-    sRGB."""
+    """uint8 pixels that are light to the power of `gamma` (PNG's gAMA), as sRGB."""
     levels = linear_to_srgb((np.arange(256) / 255) ** (1 / gamma))
     return np.asarray((255 * levels + 0.5).astype(np.uint8)[pixels])
 
 
 @lru_cache(maxsize=8)
 def _linear(transfer: int, levels: int) -> np.ndarray:
-    """(levels,) light of each signal: 1 is diffuse white. HLG: of the scene, before
-    `_displayed`."""
+    """(levels,) light of each signal: 1 is diffuse white. HLG: before `_displayed`."""
     signal = np.arange(levels) / (levels - 1)
     if transfer == LINEAR:
         light = signal
@@ -94,17 +86,10 @@ def _linear(transfer: int, levels: int) -> np.ndarray:
 
 
 def _displayed(scene: np.ndarray) -> np.ndarray:
-    """HLG's light of the scene (…, 3), BT.2020, as that of a display, 1 being diffuse white
-    (BT.2100's OOTF)."""
+    """HLG's light of the scene (…, 3), BT.2020, as a display's, where 1 is diffuse white (OOTF)."""
     luminance = np.maximum(scene @ BT2020_LUMINANCE.astype(scene.dtype), 1e-6)
     gain = HLG_PEAK_CD_M2 / REFERENCE_WHITE_CD_M2 * luminance ** (HLG_SYSTEM_GAMMA - 1)
     return np.asarray(gain[..., None] * scene)
-
-
-@lru_cache(maxsize=8)
-def _to_bt709(primaries: int) -> np.ndarray:
-    """(3, 3) from linear light of these primaries to that of BT.709."""
-    return np.asarray(np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(primaries), np.float32)
 
 
 def _to_xyz(primaries: int) -> np.ndarray:

@@ -22,8 +22,7 @@ WHITE_LEVEL = 247
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 BAND_PIXELS = 1 << 20
-"""Pixels that are converted at a time: wide intermediate numbers of a large image would fill the
-memory."""
+"""Converted at a time: wide intermediate numbers of a large image would fill the memory."""
 
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
@@ -37,8 +36,7 @@ warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) as displayed, from the file's header. Raises StgaError where it is no image
-    or larger than images may be."""
+    """(width, height) as displayed. Raises StgaError where it is no image, or too large a one."""
     try:
         _require_regular(path)
         with Image.open(path, formats=FORMATS) as image:
@@ -102,11 +100,8 @@ def read_view(
     mask = _transparency(pixels) if view.mask is None else read_mask(view)
     small = view if scale == 1 else replace(view, camera=view.camera.scaled(scale))
     size = small.camera.height, small.camera.width
-    return (
-        small,
-        area_mean(_over(pixels, background), *size),
-        None if mask is None else area_mean(mask, *size),
-    )
+    image = area_mean(_over(pixels, background), *size)
+    return small, image, None if mask is None else area_mean(mask, *size)
 
 
 def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -130,9 +125,8 @@ def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
         mean = _differences(integral, lines, rows, part[edges]) * (height / len(pixels))
         columns = mean.swapaxes(0, 1)
         integral_across = np.concatenate([np.zeros_like(columns[:1]), np.cumsum(columns, axis=0)])
-        mean = _differences(integral_across, columns, *_edges(len(columns), width)) * (
-            width / len(columns)
-        )
+        mean = _differences(integral_across, columns, *_edges(len(columns), width))
+        mean = mean * (width / len(columns))
         small[edges.start : edges.stop - 1] = mean.swapaxes(0, 1) + 0.5
         above = integral[rows[-1]][None]
     return small
@@ -174,11 +168,8 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
             # before any pixel is unpacked
             if expected in (stored, size) and is_image_size(*expected):
                 convert = _conversion(image, path) if kind == "image" else None
-                turned = (
-                    ImageOps.exif_transpose(image)
-                    if size == expected and _orientation(image) != 1
-                    else image
-                )
+                turn = size == expected and _orientation(image) != 1
+                turned = ImageOps.exif_transpose(image) if turn else image
                 return _as_uint8(turned if convert is None else convert(turned))
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
         raise _unreadable(path, error) from error
@@ -198,8 +189,7 @@ def _displayed_size(image: Image.Image) -> tuple[int, int]:
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF's, 1 where there is none. Pillow turns TIFF by itself; a PNG's is not looked for behind
-    its pixels."""
+    """EXIF's, 1 where there is none, as in TIFF, which Pillow turns, and behind a PNG's pixels."""
     if image.format == "TIFF" or "exif" not in image.info:
         return 1
     try:
@@ -210,26 +200,19 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _conversion(image: Image.Image, path: Path) -> Callable[[Image.Image], Image.Image] | None:
-    """How the image's colors become sRGB, None where they are: by cICP, else its profile, else
-    gAMA."""
+    """How the image's colors become sRGB, None where they are: by cICP, profile, or gAMA."""
     if image.mode not in ("RGB", "RGBA", "CMYK"):
         return None
     codes = _cicp(path) if image.format == "PNG" else None
     if codes is not None:
-        return (
-            None if is_srgb(*codes) else partial(_by_pixels, lambda pixels: to_srgb(pixels, *codes))
-        )
+        convert = partial(_by_pixels, lambda pixels: to_srgb(pixels, *codes))
+        return None if is_srgb(*codes) else convert
     if image.info.get("icc_profile"):
         return _by_profile(image.info["icc_profile"])
     gamma = image.info.get("gamma")
-    if (
-        image.format != "PNG"
-        or "srgb" in image.info
-        or not isinstance(gamma, float)
-        or not gamma > 0
-    ):
+    if image.format != "PNG" or "srgb" in image.info or not isinstance(gamma, float):
         return None
-    if abs(gamma - SRGB_GAMMA) <= GAMMA_TOLERANCE:
+    if not gamma > 0 or abs(gamma - SRGB_GAMMA) <= GAMMA_TOLERANCE:
         return None
     return partial(_by_pixels, lambda pixels: with_gamma(pixels, gamma))
 
@@ -252,9 +235,8 @@ def _by_profile(data: bytes) -> Callable[[Image.Image], Image.Image] | None:
     def convert(image: Image.Image) -> Image.Image:
         mode = "RGB" if image.mode == "CMYK" else image.mode
         try:
-            converted = ImageCms.profileToProfile(
-                image, profile, ImageCms.createProfile("sRGB"), outputMode=mode
-            )
+            srgb = ImageCms.createProfile("sRGB")
+            converted = ImageCms.profileToProfile(image, profile, srgb, outputMode=mode)
         except ImageCms.PyCMSError:  # a profile of another kind of image
             return image
         return image if converted is None else converted
@@ -263,8 +245,7 @@ def _by_profile(data: bytes) -> Callable[[Image.Image], Image.Image] | None:
 
 
 def _cicp(path: Path) -> tuple[int, int] | None:
-    """Codes of primaries and transfer in a PNG's cICP chunk, which stands before the pixels; None
-    without."""
+    """Codes of primaries and transfer in a PNG's cICP chunk, before the pixels; None without."""
     with path.open("rb") as stream:
         if stream.read(8) != PNG_SIGNATURE:
             return None
@@ -284,9 +265,11 @@ def _as_uint8(image: Image.Image) -> np.ndarray:
         wide = np.asarray(image)
         if wide.min(initial=0) < 0 or wide.max(initial=0) > 65535:
             raise ValueError("has more than 16 bits a pixel")
-        return _in_bands(
-            wide, 1, lambda band: (band.astype(np.int64)[..., None] * 255 + 32767) // 65535
-        )[..., 0]
+
+        def narrow(band: np.ndarray) -> np.ndarray:
+            return np.asarray((band.astype(np.int64)[..., None] * 255 + 32767) // 65535)
+
+        return _in_bands(wide, 1, narrow)[..., 0]
     if image.mode == "F":
         raise ValueError("holds floating-point pixels")
     if image.mode in ("L", "LA", "RGB", "RGBA"):
@@ -295,9 +278,8 @@ def _as_uint8(image: Image.Image) -> np.ndarray:
         return np.asarray(image.convert(named) if named else image)
     if image.mode == "1":
         return np.asarray(image.convert("L"))
-    transparent = image.mode in ("P", "PA", "La", "RGBa") and (
-        image.mode != "P" or "transparency" in image.info
-    )
+    transparent = image.mode in ("PA", "La", "RGBa")
+    transparent |= image.mode == "P" and "transparency" in image.info
     return np.asarray(image.convert("RGBA" if transparent else "RGB"))
 
 
@@ -308,10 +290,8 @@ def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
         return pixels
 
     def blend(band: np.ndarray) -> np.ndarray:
-        alpha = band[..., -1:].astype(np.uint32)
-        return np.asarray(
-            (band[..., :-1] * alpha + np.array(background, np.uint32) * (255 - alpha) + 127) // 255
-        )
+        alpha, behind = band[..., -1:].astype(np.uint32), np.array(background, np.uint32)
+        return np.asarray((band[..., :-1] * alpha + behind * (255 - alpha) + 127) // 255)
 
     return _in_bands(pixels, 3, blend)
 

@@ -2,10 +2,10 @@
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from threading import Condition, Thread
 from time import perf_counter
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +18,7 @@ Preparation = Callable[[View, np.ndarray, np.ndarray | None], tuple[np.ndarray, 
 
 
 class LoadedView(NamedTuple):
-    """A view with its image (H, W, 3) uint8, mask (H, W) uint8 and mesh (V, 3), which are None if
-    there is none."""
+    """A view with image (H, W, 3) uint8, and mask (H, W) uint8 and mesh (V, 3) where there are."""
 
     view: View
     image: np.ndarray
@@ -42,8 +41,7 @@ class ViewLoader:
              None: those read
     mesh     timestep -> mesh (V, 3), read in the thread as well; None yields no meshes
     queue_bytes, cache_bytes  bounds on the views that are ready (at least one) and on decoded
-                              images that are kept for
-             later epochs; memory does not depend on the length of the sequence
+             images that are kept for later epochs; memory does not depend on the sequence's length
     waited_s seconds that the consumer has waited so far
 
     Arrays are read-only and shared with the cache. An exception in the thread is raised where its
@@ -73,9 +71,8 @@ class ViewLoader:
         self._error: BaseException | None = None
         self._finished = self._closed = False
         self._changed = Condition()
-        self._thread = Thread(
-            target=self._work, args=(iter(views),), name="view loader", daemon=True
-        )
+        work = (iter(views),)
+        self._thread = Thread(target=self._work, args=work, name="view loader", daemon=True)
         self._thread.start()
 
     def __iter__(self) -> Iterator[LoadedView]:
@@ -98,12 +95,7 @@ class ViewLoader:
     def __enter__(self) -> "ViewLoader":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -122,8 +114,13 @@ class ViewLoader:
                 loaded = self._load(view, self._scale(position))
                 if self._mesh is not None:
                     loaded = loaded._replace(mesh=self._mesh(view.timestep))
-                if not self._offer(loaded):
-                    return
+                with self._changed:
+                    self._changed.wait_for(partial(self._has_room, loaded.nbytes))
+                    if self._closed:
+                        return
+                    self._ready.append(loaded)
+                    self._ready_bytes += loaded.nbytes
+                    self._changed.notify_all()
         except BaseException as error:  # raised again in the consumer's thread
             self._error = error
         finally:
@@ -131,21 +128,9 @@ class ViewLoader:
                 self._finished = True
                 self._changed.notify_all()
 
-    def _offer(self, loaded: LoadedView) -> bool:
-        """Queue the view once there is room; False if closed."""
-        size = loaded.nbytes
-        with self._changed:
-            self._changed.wait_for(
-                lambda: (
-                    self._closed or not self._ready or self._ready_bytes + size <= self._queue_bytes
-                )
-            )
-            if self._closed:
-                return False
-            self._ready.append(loaded)
-            self._ready_bytes += size
-            self._changed.notify_all()
-            return True
+    def _has_room(self, size: int) -> bool:
+        within = self._ready_bytes + size <= self._queue_bytes
+        return self._closed or not self._ready or within
 
     def _load(self, view: View, scale: float) -> LoadedView:
         key = (view.image, view.mask, view.timestep, view.camera_index, scale)

@@ -1,5 +1,4 @@
-"""Geometry of triangle meshes: normals, connected parts, rigid alignment, and which triangle a
-camera's pixels show."""
+"""Triangle meshes: normals, parts, rigid alignment, and which triangle a camera's pixels show."""
 
 from dataclasses import dataclass, replace
 
@@ -12,9 +11,8 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals, weighted by the area of triangles; 0 where a vertex has none."""
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(n, 3), len(vertices)) for n in normal.T], axis=-1
-    )
+    flat, count = faces.ravel(), len(vertices)
+    total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal.T], axis=-1)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20))
 
 
@@ -126,8 +124,17 @@ def rasterize(
     closeness_slopes = (slopes * inverse_depth[rows][:, :, None]).sum(1)
     nearest = np.zeros(camera.width * camera.height)
     owner = np.full(len(nearest), -1)
-    for group in _chunks(corners, camera):
-        face, x, y = _covered(group, corners, camera)
+    # triangles that may show a pixel, in groups whose bounding boxes hold about CHUNK_PIXELS
+    low, high = corners.min(1), corners.max(1)
+    size = np.minimum(high, [camera.width, camera.height]) - np.maximum(low, 0)
+    drawn = np.flatnonzero((size >= 0).all(1))
+    groups = np.cumsum(np.ceil(size[drawn] + 1).prod(1)) // CHUNK_PIXELS
+    for group in np.split(drawn, np.flatnonzero(np.diff(groups)) + 1):
+        # pixel by pixel along the lines of the image that cross a triangle, between its edges
+        face, line = _counted(group, *_whole(low[group, 1], high[group, 1], camera.height))
+        left, right = _crossings(corners, face, line + 0.5)
+        row, x = _counted(np.arange(len(face)), *_whole(left, right, camera.width))
+        face, y = face[row], line[row]
         closeness = _at(closeness_slopes[face], x, y)
         pixel = y * camera.width + x
         np.maximum.at(nearest, pixel, closeness)
@@ -156,34 +163,8 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
     return np.asarray(picture)
 
 
-def _chunks(corners: np.ndarray, camera: Camera) -> list[np.ndarray]:
-    """Triangles (T, 3, 2) that may show a pixel, in groups whose bounding boxes hold about
-    CHUNK_PIXELS."""
-    low, high = corners.min(1), corners.max(1)
-    size = np.minimum(high, [camera.width, camera.height]) - np.maximum(low, 0)
-    drawn = np.flatnonzero((size >= 0).all(1))
-    groups = np.cumsum(np.ceil(size[drawn] + 1).prod(1)) // CHUNK_PIXELS
-    return np.split(drawn, np.flatnonzero(np.diff(groups)) + 1)
-
-
-def _covered(
-    group: np.ndarray, corners: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangle, x and y of each pixel center that lies in a triangle of the group, or on its edge.
-
-    Pixel by pixel along the lines of the image that cross a triangle, between its edges.
-    """
-    face, y = _counted(
-        group, *_whole(corners[group, :, 1].min(1), corners[group, :, 1].max(1), camera.height)
-    )
-    left, right = _crossings(corners, face, y + 0.5)
-    line, x = _counted(np.arange(len(face)), *_whole(left, right, camera.width))
-    return face[line], x, y[line]
-
-
 def _whole(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first pixel with its center from `low` to `high`, inside an image of this size, and how
-    many there are."""
+    """The first pixel with its center from `low` to `high` in an image of this size; how many."""
     first = np.ceil(np.clip(low, 0, size + 1) - 0.5).astype(np.int64)
     last = np.floor(np.clip(high, -1, size) - 0.5).astype(np.int64)
     return first, np.maximum(np.minimum(last, size - 1) - first + 1, 0)

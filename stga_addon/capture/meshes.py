@@ -1,5 +1,4 @@
-"""Tracked meshes (OBJ, PLY, GLB, STL) in the file's own order of vertices and triangles; regions of
-triangles."""
+"""Tracked meshes (OBJ, PLY, GLB, STL) in the file's order; regions of triangles."""
 
 import io
 import re
@@ -46,8 +45,7 @@ MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
 MIN_EXTENT_M = 1e-9
-"""A mesh smaller than this is a point: it has no shape to train on, and no scale to compare motion
-with."""
+"""A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -62,24 +60,17 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if suffix not in MESH_SUFFIXES:
         raise StgaError(f"{path}: is not a mesh; expected one of {', '.join(MESH_SUFFIXES)}")
     data = read_bytes(path, MAX_MESH_BYTES)
-    vertices, faces = (
-        _parse_obj(path, data) if suffix == ".obj" else _parse_with_trimesh(path, data, suffix[1:])
-    )
-    return checked_mesh(path, vertices, faces)
+    if suffix == ".obj":
+        return checked_mesh(path, *_parse_obj(path, data))
+    return checked_mesh(path, *_parse_with_trimesh(path, data, suffix[1:]))
 
 
 def checked_mesh(
     path: Path, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same arrays as float64 and int32. Raises StgaError where they are no mesh
-    (`read_mesh`)."""
-    if (
-        vertices.ndim != 2
-        or vertices.shape[1] != 3
-        or faces.ndim != 2
-        or faces.shape[1] != 3
-        or not len(faces)
-    ):
+    """The arrays as float64 and int32. Raises StgaError where they are no mesh (`read_mesh`)."""
+    triples = all(own.ndim == 2 and own.shape[1] == 3 for own in (vertices, faces))
+    if not triples or not len(faces):
         raise StgaError(
             f"{path}: holds no triangles; expected vertices with three coordinates, and triangles"
         )
@@ -95,8 +86,7 @@ def checked_mesh(
 
 
 def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
-    """The same vertices (V, 3). Raises StgaError, beginning with `source`, for a point and for what
-    lies far away."""
+    """The same vertices (V, 3). Raises StgaError for a point, and for what lies far away."""
     if not np.abs(vertices).max() <= MAX_COORDINATE_M:  # also where it is not a number
         raise StgaError(
             f"{source}: the mesh reaches farther than {MAX_COORDINATE_M:g} m from the origin"
@@ -135,7 +125,8 @@ def tracked_meshes(
             )
         if len(vertices) != count:
             raise StgaError(
-                f"{path}: has {len(vertices)} vertices, but {canonical} has {count}; the topology must not change"
+                f"{path}: has {len(vertices)} vertices, but {canonical} has {count}; "
+                "the topology must not change"
             )
         return vertices
 
@@ -143,8 +134,7 @@ def tracked_meshes(
 
 
 def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[[int], np.ndarray]:
-    """The same function with its latest results kept, read-only, within 8 MiB; `vertices` says how
-    large one is."""
+    """The function with its latest results kept, read-only, within CACHE_BYTES."""
 
     @lru_cache(maxsize=max(2, CACHE_BYTES // (24 * max(1, vertices))))
     def kept(timestep: int) -> np.ndarray:
@@ -174,9 +164,8 @@ def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.n
     if not isinstance(values, dict):
         raise StgaError(f"{path}: expected an object: region name -> list of vertex indices")
     for name, value in values.items():
-        if not isinstance(value, list) or not all(
-            type(index) is int and 0 <= index < vertices for index in value
-        ):
+        ids = value if isinstance(value, list) else [None]
+        if not all(type(index) is int and 0 <= index < vertices for index in ids):
             raise StgaError(
                 f"{path}: {name}: expected a list of vertex indices from 0 to {vertices - 1}"
             )
@@ -191,30 +180,22 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
             f"{path}: reading {file_type.upper()} needs the Python package trimesh"
         ) from error
     try:
-        if file_type == "ply":
-            _check_ply(data)
+        if file_type == "ply":  # trimesh allocates what the header promises
+            header = data[: max(0, data.find(b"end_header"))]
+            for name, count in re.findall(rb"^element\s+(\S+)\s+(\S+)", header, re.MULTILINE):
+                if not 0 <= int(count) <= len(data):
+                    found = f"{int(count)} of {name.decode('latin-1')}"
+                    raise ValueError(f"its {len(data)} bytes cannot hold {found}")
         if file_type == "glb":
             _check_glb(data)
         with np.errstate(all="ignore"):
             # From memory, so that a mesh cannot have other files (textures, buffers) read.
             options = {"skip_materials": True} if file_type == "glb" else {}
-            mesh = trimesh.load_mesh(
-                io.BytesIO(data), file_type=file_type, process=False, **options
-            )
+            stream = io.BytesIO(data)
+            mesh = trimesh.load_mesh(stream, file_type=file_type, process=False, **options)
             return np.asarray(mesh.vertices), np.asarray(mesh.faces)
     except Exception as error:  # trimesh's parsers raise any kind of error for a bad file
         raise StgaError(f"{path}: is not a readable {file_type.upper()} mesh ({error})") from error
-
-
-def _check_ply(data: bytes) -> None:
-    """trimesh allocates what the header promises. Raises ValueError where the file cannot hold
-    it."""
-    header = data[: max(0, data.find(b"end_header"))]
-    for name, count in re.findall(rb"^element\s+(\S+)\s+(\S+)", header, re.MULTILINE):
-        if not 0 <= int(count) <= len(data):
-            raise ValueError(
-                f"its {len(data)} bytes cannot hold {int(count)} of {name.decode('latin-1')}"
-            )
 
 
 def _check_glb(data: bytes) -> None:
@@ -237,8 +218,7 @@ def _check_glb(data: bytes) -> None:
 
 
 def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Own parser, because trimesh regroups and splits the vertices of an OBJ with several materials
-    or objects."""
+    """An own parser: trimesh regroups the vertices of an OBJ with several materials or objects."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     points = [n for n, line in enumerate(lines) if line.startswith((b"v ", b"v\t"))]
     polygons = [n for n, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]
@@ -246,11 +226,11 @@ def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
         vertices = np.array([lines[n].split()[1:4] for n in points], np.float64)
     except ValueError as error:
         raise StgaError(f"{path}: a vertex line does not hold three numbers") from error
-    text = b"\n".join([lines[n] for n in polygons])
+    text, earlier = b"\n".join([lines[n] for n in polygons]), (0,) * len(polygons)
+    if b"-" in text:
+        earlier = tuple(np.searchsorted(points, polygons))
     try:
-        faces = _triangles(
-            text, tuple(np.searchsorted(points, polygons)) if b"-" in text else (0,) * len(polygons)
-        )
+        faces = _triangles(text, earlier)
     except (ValueError, OverflowError) as error:
         raise StgaError(f"{path}: a face line is malformed ({error})") from error
     return vertices, faces
@@ -268,9 +248,8 @@ def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
     count = np.array([len(words) for words in corners], int)
     if (count < 3).any():
         raise ValueError("fewer than three corners")
-    index = np.array(
-        [int(word.partition(b"/")[0]) for words in corners for word in words], np.int64
-    )
+    numbers = [int(word.partition(b"/")[0]) for words in corners for word in words]
+    index = np.array(numbers, np.int64)
     if (index == 0).any():
         raise ValueError("vertex 0, but OBJ counts from 1")
     index = np.where(index > 0, index - 1, np.repeat(np.array(earlier, int), count) + index)
@@ -280,16 +259,13 @@ def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
     return np.asarray(index[np.stack([first, second, second + 1], axis=1)])
 
 
-WEIGHTS = "weights"
-FILES = (".npz", ".json")
-"""Suffixes of region files."""
 SELECTED_WEIGHT = 0.5
 """Least weight of a triangle that belongs to the region."""
 
 
 def is_region_file(name: str) -> bool:
     """Whether a region is named by its file."""
-    return Path(name).suffix.lower() in FILES
+    return Path(name).suffix.lower() in (".npz", ".json")
 
 
 def find_region(capture: Capture, name: str) -> np.ndarray:
@@ -298,35 +274,30 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
 
     Raises StgaError where there is none, or it holds no triangle.
     """
-    region = _find(capture, name)
+    masks = {} if capture.flame is None else capture.flame.model.masks
+    path, shape = Path(name), (len(capture.faces),)
+    if name in capture.regions:
+        region = np.asarray(capture.regions[name])
+    elif name in masks:
+        region = faces_within(capture.faces, masks[name])
+    elif path.suffix.lower() == ".npz":
+        weights = read_npz(path).get("weights", np.zeros(0, int))
+        if weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != shape:
+            found = f"{weights.dtype} {weights.shape}" if weights.size else "no such array"
+            raise StgaError(
+                f"{path}: expected 'weights', one number from 0 to 1 per triangle {shape}, "
+                f"found {found}"
+            )
+        region = np.asarray(weights >= SELECTED_WEIGHT)
+    elif path.suffix.lower() == ".json":
+        regions = read_regions(path, capture.faces, len(capture.neutral))
+        region = np.asarray(np.any([np.zeros(shape, bool), *regions.values()], axis=0))
+    else:
+        known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
+        raise StgaError(
+            f"region '{name}': is neither a region of the capture ({known}) nor an .npz or .json "
+            "file"
+        )
     if not region.any():
         raise StgaError(f"region '{name}': holds no triangle")
     return region
-
-
-def _find(capture: Capture, name: str) -> np.ndarray:
-    masks = {} if capture.flame is None else capture.flame.model.masks
-    if name in capture.regions:
-        return np.asarray(capture.regions[name])
-    if name in masks:
-        return faces_within(capture.faces, masks[name])
-    path = Path(name)
-    if path.suffix.lower() == ".npz":
-        weights, expected = read_npz(path).get(WEIGHTS), (len(capture.faces),)
-        if (
-            weights is None
-            or weights.dtype not in (np.float32, np.float64, np.bool_)
-            or weights.shape != expected
-        ):
-            found = "no such array" if weights is None else f"{weights.dtype} {weights.shape}"
-            raise StgaError(
-                f"{path}: expected '{WEIGHTS}', one number from 0 to 1 per triangle {expected}, found {found}"
-            )
-        return np.asarray(weights >= SELECTED_WEIGHT)
-    if path.suffix.lower() == ".json":
-        regions = read_regions(path, capture.faces, len(capture.neutral))
-        return np.asarray(np.any([np.zeros(len(capture.faces), bool), *regions.values()], axis=0))
-    known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
-    raise StgaError(
-        f"region '{name}': is neither a region of the capture ({known}) nor an .npz or .json file"
-    )

@@ -1,5 +1,4 @@
-"""Data model of a capture, independent of its layout on disk; its summary in text; several takes as
-one capture."""
+"""A capture in memory, whatever its layout on disk; its summary; several takes as one capture."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
@@ -33,8 +32,7 @@ class View:
 
 
 ViewExposure = Callable[[View], np.ndarray | None]
-"""View -> gain and offset (2, 3), in levels, of red, green and blue in its image; None where they
-are not known."""
+"""View -> gain and offset (2, 3), in levels, of red, green and blue; None where not known."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,7 @@ class Capture:
 
 
 def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
-    """At most `limit` of the items, such as views or timesteps: the first, the last, and those
-    evenly between."""
+    """At most `limit` of the items: the first, the last, and those evenly between."""
     if len(items) <= limit:
         return list(items)
     return [items[n] for n in np.linspace(0, len(items) - 1, limit).round().astype(int)]
@@ -83,52 +80,48 @@ def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
 
 def parts_of(timesteps: Sequence[int], limit: int) -> list[list[int]]:
     """Consecutive parts of at most `limit` timesteps, the same on every machine; at least one."""
-    return [
-        part.tolist()
-        for part in np.array_split(np.array(timesteps), max(1, -(-len(timesteps) // limit)))
-    ]
+    count = max(1, -(-len(timesteps) // limit))
+    return [part.tolist() for part in np.array_split(np.array(timesteps), count)]
 
 
 def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
     """(label, value) lines: recording, tracking, warnings. Reads no image."""
     views = [view for split in capture.views.values() for view in split]
-    lines = [("folder", str(capture.root)), ("layout", capture.layout)]
     sizes = sorted({(view.camera.width, view.camera.height) for view in views})
     masked = sum(view.mask is not None for view in views)
+    splits = []
+    for name, split in capture.views.items():
+        timesteps = {view.timestep for view in split}
+        cameras = {view.camera_index for view in split}
+        counts = f"{len(timesteps)} timesteps, {len(cameras)} cameras"
+        splits += [f"{name} {len(split)} views ({counts})"] if split else []
     recorded = [
         ("cameras", format_ranges(sorted({view.camera_index for view in views}))),
         ("image size", ", ".join(f"{width} x {height}" for width, height in sizes)),
         ("masks", f"{masked} of {len(views)} views"),
-        (
-            "splits",
-            "; ".join(f"{name} {_split(split)}" for name, split in capture.views.items() if split),
-        ),
+        ("splits", "; ".join(splits)),
     ]
-    lines += (
-        recorded if views else [("cameras", "none: can be imported and animated, not trained on")]
-    )
-    regions = [
-        f"{name} {int(np.count_nonzero(members))}" for name, members in capture.regions.items()
-    ]
+    bare = [("cameras", "none: can be imported and animated, not trained on")]
+    regions = [f"{name} {int(np.count_nonzero(own))}" for name, own in capture.regions.items()]
+    lines = [("folder", str(capture.root)), ("layout", capture.layout)]
+    lines += [*(recorded if views else bare), ("timesteps", format_ranges(capture.timesteps))]
+    if capture.fps is not None:
+        lines.append(("frame rate", f"{capture.fps:g} frames per second"))
     lines += [
-        ("timesteps", format_ranges(capture.timesteps)),
-        *(
-            [("frame rate", f"{capture.fps:g} frames per second")]
-            if capture.fps is not None
-            else []
-        ),
         ("mesh", f"{len(capture.neutral)} vertices, {len(capture.faces)} triangles"),
         ("regions", ", ".join(regions) + " triangles" if regions else "none"),
     ]
-    if capture.given_selection:
-        shares = [float(np.mean(selected)) for selected in capture.given_selection.values()]
-        lines.append(
-            (
-                "given selection",
-                f"{len(shares)} timesteps, {np.mean(shares):.1%} of the triangles on average",
-            )
-        )
-    return lines + _flame(capture) + [("warning", warning) for warning in capture.warnings]
+    shares = [float(np.mean(selected)) for selected in capture.given_selection.values()]
+    if shares:
+        share = f"{np.mean(shares):.1%} of the triangles on average"
+        lines.append(("given selection", f"{len(shares)} timesteps, {share}"))
+    if capture.flame is not None:
+        first = capture.flame.frame(capture.flame.timesteps[0])
+        offsets = (("static", capture.flame.static_offset), ("dynamic", first.dynamic_offset))
+        for name, own in offsets:
+            size = 0.0 if own is None else 1000 * float(np.linalg.norm(own, axis=1).max())
+            lines.append((f"{name} offset", "none" if own is None else f"up to {size:.1f} mm"))
+    return lines + [("warning", warning) for warning in capture.warnings]
 
 
 def format_ranges(numbers: Sequence[int]) -> str:
@@ -144,32 +137,10 @@ def _span(first: int, last: int) -> str:
     return str(first) if first == last else f"{first}–{last}"
 
 
-def _split(views: Sequence[View]) -> str:
-    cameras = len({view.camera_index for view in views})
-    return f"{len(views)} views ({len({view.timestep for view in views})} timesteps, {cameras} cameras)"
-
-
-def _flame(capture: Capture) -> list[tuple[str, str]]:
-    """Largest offsets; the dynamic one is that of the first timestep."""
-    if capture.flame is None:
-        return []
-    dynamic = capture.flame.frame(capture.flame.timesteps[0]).dynamic_offset
-    offsets = (("static offset", capture.flame.static_offset), ("dynamic offset", dynamic))
-    largest = [
-        (name, None if o is None else 1000 * float(np.linalg.norm(o, axis=1).max()))
-        for name, o in offsets
-    ]
-    return [
-        (name, "none" if offset is None else f"up to {offset:.1f} mm") for name, offset in largest
-    ]
-
-
 MAX_NEUTRAL_DIFFERENCE_M = 1e-4
-"""Largest distance between the neutral meshes of two takes of one head: trackers write rounded
-shape coefficients."""
+"""Between neutral meshes of takes of one head: trackers write rounded shape coefficients."""
 MAX_SCALE_FACTOR = 5.0
-"""Largest ratio of the head's sizes in two takes; another unit than the meter makes it 10 or
-more."""
+"""Largest ratio of the head's sizes in two takes; another unit makes it 10 or more."""
 COMPARED = 8
 """Views, and timesteps, of a take whose scale is looked at."""
 
@@ -191,15 +162,16 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
         return first
     for other in takes[1:]:
         require_same_head(first, other)
-    starts = first_timesteps(takes)
-    views: dict[str, tuple[View, ...]] = {}
-    for take, start in zip(takes, starts, strict=True):
+    starts, views = first_timesteps(takes), dict[str, tuple[View, ...]]()
+    numbered = list(zip(takes, starts, strict=True))
+    for take, start in numbered:
         free = _first_free_index(take, start, first, views)
         for split, members in take.views.items():
             views[split] = (*views.get(split, ()), *_shifted(members, start, first, free))
-    flame = [take.flame for take in takes if take.flame is not None]
-    numbered = list(zip(takes, starts, strict=True))
     timesteps = tuple(start + timestep for take, start in numbered for timestep in take.timesteps)
+    flame = [take.flame for take in takes if take.flame is not None]
+    frame = _dispatch([each.frame for each in flame], starts)
+    whole = replace(flame[0], timesteps=timesteps, frame=frame) if flame else None
     rates = [take.fps for take in takes if take.fps is not None]
     return replace(
         first,
@@ -207,11 +179,7 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
         timesteps=timesteps,
         mesh=_dispatch([take.mesh for take in takes], starts),
         expression_mesh=_dispatch([take.expression_mesh for take in takes], starts),
-        flame=replace(
-            flame[0], timesteps=timesteps, frame=_dispatch([each.frame for each in flame], starts)
-        )
-        if len(flame) == len(takes)
-        else None,
+        flame=whole if len(flame) == len(takes) else None,
         given_selection={
             start + timestep: faces
             for take, start in numbered
@@ -232,13 +200,14 @@ def require_same_head(first: Capture, other: Capture) -> None:
     """Raise StgaError where `other` has another mesh, or another neutral shape, than `first`."""
     if not np.array_equal(first.faces, other.faces):
         raise StgaError(
-            f"{other.root}: its mesh has other triangles than {first.root}; a take must be of the same head"
+            f"{other.root}: its mesh has other triangles than {first.root}; "
+            "a take must be of the same head"
         )
     distance = float(np.linalg.norm(first.neutral - other.neutral, axis=1).max())
     if distance > MAX_NEUTRAL_DIFFERENCE_M:
         raise StgaError(
-            f"{other.root}: its neutral mesh is up to {1000 * distance:.2g} mm from that of {first.root}; "
-            "a take must be of the same head, tracked with the same shape"
+            f"{other.root}: its neutral mesh is up to {1000 * distance:.2g} mm from that of "
+            f"{first.root}; a take must be of the same head, tracked with the same shape"
         )
 
 
@@ -253,7 +222,8 @@ def require_same_scale(first: Capture, other: Capture) -> None:
     factor = float(np.median(posed)) / _extent(other.neutral)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
         raise StgaError(
-            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral mesh; expected meters"
+            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral "
+            "mesh; expected meters"
         )
     factor = _share_of_images(first) / _share_of_images(other)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
@@ -288,31 +258,20 @@ def _first_free_index(
     Where possible it counts from the take's start: the identities of runs hold these indices.
     """
     taken = {view.camera_index for members in joined.values() for view in members}
-    free = (
-        1
-        + start
-        + max(
-            (view.camera_index for members in first.views.values() for view in members), default=-1
-        )
-    )
-    collides = any(
-        free + view.camera_index in taken for members in take.views.values() for view in members
-    )
-    return 1 + max(taken) if collides else free
+    known = [view.camera_index for members in first.views.values() for view in members]
+    own = [view.camera_index for members in take.views.values() for view in members]
+    free = 1 + start + max(known, default=-1)
+    return 1 + max(taken) if any(free + index in taken for index in own) else free
 
 
 def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
-    """The views at the joined timesteps; `free` is added to indices of cameras that the first take
-    does not have."""
-    cameras = {
-        view.camera_index: view.camera for members in first.views.values() for view in members
-    }
+    """The views at the joined timesteps; `free`: added to indices that the first take lacks."""
+    known = [view for members in first.views.values() for view in members]
+    poses = {view.camera_index: view.camera.world_to_camera for view in known}
     shifted = []
     for view in views:
-        known, camera = cameras.get(view.camera_index), view.camera
-        same = known is not None and np.allclose(
-            known.world_to_camera, camera.world_to_camera, atol=1e-6
-        )
+        pose, own = poses.get(view.camera_index), view.camera.world_to_camera
+        same = pose is not None and np.allclose(pose, own, atol=1e-6)
         index = view.camera_index if start == 0 or same else free + view.camera_index
         shifted.append(replace(view, timestep=start + view.timestep, camera_index=index))
     return shifted
@@ -321,8 +280,7 @@ def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> li
 def _dispatch(
     functions: Sequence[Callable[..., Item]], starts: Sequence[int]
 ) -> Callable[..., Item]:
-    """timestep of the joined capture -> what the function of its take says about its own
-    timestep."""
+    """timestep of the joined capture -> what its take's function says about its own."""
 
     def of(timestep: int, *rest: str) -> Item:
         take = bisect_right(starts, timestep) - 1

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from os.path import isdir, isfile  # which are False, not an error, for a path that is too long
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npy, read_npz
+from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES, key_regions
 from ..flame.sequence import (
     FlameSequence,
@@ -23,7 +25,6 @@ from ..flame.sequence import (
     sequence_mesh,
 )
 from ..flame.teeth import flame_model
-from .camera import Camera
 from .mesh_geometry import without_head_motion
 from .meshes import (
     MESH_SUFFIXES,
@@ -71,104 +72,96 @@ def open_capture(
     """
     if principal_point not in PRINCIPAL_POINTS:
         raise StgaError(
-            f"principal point convention {shorten(principal_point)} is not one of {', '.join(PRINCIPAL_POINTS)}"
+            f"principal point convention {shorten(principal_point)} is not one of "
+            f"{', '.join(PRINCIPAL_POINTS)}"
         )
     if folder.suffix.lower() == ".npz" and isfile(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
-        model_file = (
-            BUNDLED_HEAD if EXPRESSION_NAMES in read_npz(path) else _model_file(path, flame)
-        )
+        bundled = EXPRESSION_NAMES in read_npz(path)
+        model_file = BUNDLED_HEAD if bundled else _model_file(path, flame)
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not isdir(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
-    root = folder.resolve()
-    transforms = (
-        read_splits(root, principal_point) if has_transforms(root) else Transforms({}, None, None)
-    )
-    views = {
-        split: tuple(frame.view for frame in frames) for split, frames in transforms.splits.items()
-    }
-    _require_files(transforms)
-    capture = _open_layout(root, transforms, views, flame)
+    root, transforms = folder.resolve(), Transforms({}, None, None)
+    if has_transforms(root):
+        transforms = read_splits(root, principal_point)
+    # A missing file is reported now rather than an hour into the training.
+    seen, keys = set[Path](), ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
+    for frame in transforms.frames:
+        files = frame.view.image, frame.view.mask, frame.mesh, frame.flame
+        for key, file in zip(keys, files, strict=True):
+            if file is None or file in seen:
+                continue
+            if not isfile(file):
+                raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
+            seen.add(file)
+    capture = _open_layout(root, transforms, flame)
     warnings = list(capture.warnings)
-    if found := principal_point_warning(transforms.frames, capture.mesh, principal_point):
+    if found := _principal_point_warning(transforms.frames, capture.mesh, principal_point):
         warnings.append(found)
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
     if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
         warnings.append(
-            f"{root}: the neutral mesh measures {size:.3g} m; expected a head of {TYPICAL_HEAD_EXTENT_M} m"
+            f"{root}: the neutral mesh measures {size:.3g} m; "
+            f"expected a head of {TYPICAL_HEAD_EXTENT_M} m"
         )
     return replace(capture, fps=transforms.fps, warnings=tuple(warnings))
 
 
-def _open_layout(
-    root: Path, transforms: Transforms, views: Mapping[str, tuple[View, ...]], flame: Path | None
-) -> Capture:
-    frames = transforms.frames
+def _open_layout(root: Path, transforms: Transforms, flame: Path | None) -> Capture:
+    frames, given = transforms.frames, transforms.splits
+    views = {split: tuple(frame.view for frame in own) for split, own in given.items()}
     if (root / CANONICAL_NAME).is_file() or any(frame.flame for frame in frames):
-        return open_flame_capture(root, transforms, views, flame)
+        return _open_flame_capture(root, transforms, views, flame)
     if any(frame.mesh for frame in frames):
         files = tracked_files(frames, "mesh")
-        return _mesh_capture(
-            root, "mesh", files, transforms.canonical_mesh, views, transforms.regions
-        )
+        canonical, regions = transforms.canonical_mesh, transforms.regions
+        return _mesh_capture(root, "mesh", files, canonical, views, regions)
     if any((root / "meshes").glob("mesh_*.json")):
-        return open_release(root, views)
-    if not transforms.splits and mesh_files(root):
-        return open_mesh_folder(root)
-    if not transforms.splits and (root / PARAMETERS).is_dir():
-        return open_flame_capture(root, transforms, views, flame)
-    if transforms.splits:
+        return _open_release(root, views)
+    if not given and mesh_files(root):
+        return _open_mesh_folder(root)
+    if not given and (root / PARAMETERS).is_dir():
+        return _open_flame_capture(root, transforms, views, flame)
+    if given:
         expected = "a frame with flame_param_path or mesh_path in the transforms"
     else:
         expected = f"transforms_{'|'.join(SPLITS)}.json, transforms.json or meshes"
     raise StgaError(f"{root}: is not a capture; expected {expected}")
 
 
-def _require_files(transforms: Transforms) -> None:
-    """Raise StgaError for a missing file now rather than an hour into the training."""
-    seen: set[Path] = set()
-    for frame in transforms.frames:
-        names = ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
-        for field, path in zip(
-            names, (frame.view.image, frame.view.mask, frame.mesh, frame.flame), strict=True
-        ):
-            if path is not None and path not in seen:
-                if not isfile(path):
-                    raise StgaError(
-                        f"{path}: does not exist, but {frame.where} names it as its {field}"
-                    )
-                seen.add(path)
-
-
-def principal_point_warning(
+def _principal_point_warning(
     frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str
 ) -> str | None:
-    """A warning where another convention puts clearly more of the mesh inside the masks, else None.
+    """A warning where another convention puts clearly more of the mesh inside the masks.
 
-    Checks a few views in which the conventions differ. Only vertices outside of a mask count: hair
-    and shoulders lie inside the mask but beside the mesh. Without Pillow, which Blender lacks,
-    nothing is checked. Raises StgaError where a mask cannot be read.
+    A few views are checked in which the conventions differ. Only vertices outside of a mask count:
+    hair and shoulders lie inside the mask but beside the mesh. Nothing is checked without Pillow,
+    which Blender lacks. Raises StgaError where a mask cannot be read.
     """
     if find_spec("PIL") is None:
         return None
     from .images import read_mask
 
-    apart = []
+    apart, outside = [], []
     for frame in frames:
-        cameras = [
-            with_principal_point(frame.view.camera, frame.principal, name)
-            for name in PRINCIPAL_POINTS
-        ]
+        own = frame.view.camera
+        cameras = [with_principal_point(own, frame.principal, name) for name in PRINCIPAL_POINTS]
         if (np.ptp([(camera.cx, camera.cy) for camera in cameras], axis=0) > 0.5).any():
             apart.append((frame.view, cameras))
-    outside = []
     for view, cameras in evenly_spread(apart, MAX_COMPARED_VIEWS):
         if (mask := read_mask(view)) is not None:
-            points = mesh(view.timestep)
-            outside.append([_share_outside(points, camera, mask) for camera in cameras])
+            points, shares = mesh(view.timestep), []
+            for camera in cameras:
+                pixels, depth = camera.project(points)
+                size = np.array([camera.width, camera.height])
+                pixels = np.floor(np.clip(pixels, -1, size)).astype(int)
+                visible = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+                column, row = pixels[visible].T
+                shares.append(1 - float((mask[row, column] > 127).sum()) / len(points))
+            outside.append(shares)
     if not outside:
         return None
     share = dict(zip(PRINCIPAL_POINTS, np.mean(outside, axis=0).tolist(), strict=True))
@@ -176,34 +169,22 @@ def principal_point_warning(
     if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
         return None
     return (
-        f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read as {chosen!r}, "
-        f"but {share[best]:.1%} with {best!r}: the capture was probably written that way"
+        f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read "
+        f"as {chosen!r}, but {share[best]:.1%} with {best!r}: "
+        "the capture was probably written that way"
     )
 
 
-def _share_outside(points: np.ndarray, camera: Camera, mask: np.ndarray) -> float:
-    pixels, depth = camera.project(points)
-    column, row = np.floor(np.clip(pixels, -1, [camera.width, camera.height])).astype(int).T
-    visible = (
-        (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    )
-    inside = mask[row[visible], column[visible]] > 127
-    return 1 - float(inside.sum()) / len(points)
-
-
-NEUTRAL_NAMES = ("neutral", "canonical")
-REGIONS_NAME = "regions.json"
-
-
-def open_mesh_folder(root: Path) -> Capture:
+def _open_mesh_folder(root: Path) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep.
 
     Timesteps are the numbers at the end of the names, or the alphabetical order where a name has
     none. A mesh called `neutral` or `canonical` is the canonical one, and `regions.json` the
     regions file. Raises StgaError.
     """
-    meshes = mesh_files(root)
-    canonical = next((path for path in meshes if path.stem.lower() in NEUTRAL_NAMES), None)
+    meshes, regions = mesh_files(root), root / "regions.json"
+    names = ("neutral", "canonical")
+    canonical = next((path for path in meshes if path.stem.lower() in names), None)
     tracked = [path for path in meshes if path != canonical]
     if not tracked:
         raise StgaError(
@@ -211,20 +192,15 @@ def open_mesh_folder(root: Path) -> Capture:
         )
     numbers = [re.search(r"(\d+)$", path.stem, re.ASCII) for path in tracked]
     numbered = {int(match[1]): path for match, path in zip(numbers, tracked, strict=True) if match}
-    files = (
-        dict(sorted(numbered.items()))
-        if len(numbered) == len(tracked)
-        else dict(enumerate(tracked))
-    )
-    regions = root / REGIONS_NAME
+    files = dict(sorted(numbered.items()))
+    files = files if len(files) == len(tracked) else dict(enumerate(tracked))
     return _mesh_capture(root, "mesh", files, canonical, {}, regions if regions.is_file() else None)
 
 
 def mesh_files(folder: Path) -> list[Path]:
     """The meshes directly in a folder, by name."""
-    return sorted(
-        path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES and path.is_file()
-    )
+    files = (path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
+    return sorted(path for path in files if path.is_file())
 
 
 def _mesh_capture(
@@ -245,7 +221,8 @@ def _mesh_capture(
     neutral, faces = read(canonical)
     if any(path.suffix.lower() == ".stl" for path in (canonical, *files.values())):
         warnings.append(
-            "STL has no shared vertices: of the topology, only the number of triangles can be checked"
+            "STL has no shared vertices: of the topology, only the number of triangles can be "
+            "checked"
         )
     regions = {} if regions_file is None else read_regions(regions_file, faces, len(neutral))
     empty = [name for name, members in regions.items() if not members.any()]
@@ -266,7 +243,7 @@ def _mesh_capture(
     )
 
 
-def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
+def _open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
     """Capture of layout "release": `meshes/mesh_%04d.json` and `training_faces/%04d.npy` by
     `keyframe`.
 
@@ -277,17 +254,14 @@ def open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
     files = {timestep: root / "meshes" / f"mesh_{timestep:04d}.json" for timestep in timesteps}
     if not files:
         raise StgaError(
-            f"{root}: its transforms hold no frame; expected a keyframe for each mesh in {root / 'meshes'}"
+            f"{root}: its transforms hold no frame; "
+            f"expected a keyframe for each mesh in {root / 'meshes'}"
         )
     capture = _mesh_capture(root, "release", files, None, views, read=read_soup)
-    chosen = {timestep: root / "training_faces" / f"{timestep:04d}.npy" for timestep in timesteps}
-    faces = len(capture.faces)
-    return replace(
-        capture,
-        given_selection={
-            t: read_face_ids(path, faces) for t, path in chosen.items() if path.is_file()
-        },
-    )
+    chosen = {t: root / "training_faces" / f"{t:04d}.npy" for t in timesteps}
+    listed = {t: path for t, path in chosen.items() if path.is_file()}
+    selection = {t: read_face_ids(path, len(capture.faces)) for t, path in listed.items()}
+    return replace(capture, given_selection=selection)
 
 
 def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -305,7 +279,8 @@ def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ) from error
     if corners.ndim != 3 or corners.shape[1:] != (3, 3):
         raise StgaError(
-            f"{path}: triangles: expected three Vertices with three coordinates each in every triangle"
+            f"{path}: triangles: expected three Vertices with three coordinates each in every "
+            "triangle"
         )
     return checked_mesh(path, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
@@ -333,7 +308,7 @@ BUNDLED_MODEL = "bundled_head.npz"
 """Copy of the head model of this package in the folder of a capture that was tracked with it."""
 
 
-def open_flame_capture(
+def _open_flame_capture(
     root: Path,
     transforms: Transforms,
     views: Mapping[str, tuple[View, ...]],
@@ -349,16 +324,26 @@ def open_flame_capture(
     """
     model_file = _model_file(root, model_file)
     model = flame_model(model_file)
-    files = parameter_files(root, transforms)
+    frames, folder = transforms.frames, root / PARAMETERS
+    if any(frame.flame for frame in frames):
+        files = tracked_files(frames, "flame")
+    elif frames:
+        timesteps = sorted({frame.view.timestep for frame in frames})
+        files = {t: folder / f"{t:05d}.npz" for t in timesteps}
+    else:
+        listed = [p for p in folder.glob("*.npz") if re.fullmatch(r"\d+", p.stem, re.ASCII)]
+        files = dict(sorted((int(path.stem), path) for path in listed))
+    if not files:
+        raise StgaError(
+            f"{folder}: holds no parameters; expected one .npz per timestep, such as 00000.npz"
+        )
     first = files[min(files)]
     shape, static_offset = read_identity(first, model)
-    sequence = FlameSequence(
-        model,
-        shape,
-        static_offset,
-        tuple(files),
-        lambda timestep: read_frame(file_of(files, timestep), model),
-    )
+
+    def frame(timestep: int) -> FlameFrame:
+        return read_frame(file_of(files, timestep), model)
+
+    sequence = FlameSequence(model, shape, static_offset, tuple(files), frame)
     return sequence_capture(root, sequence, model_file, views)
 
 
@@ -373,11 +358,13 @@ def sequence_capture(
     model_file: Path | None,
     views: Mapping[str, tuple[View, ...]],
 ) -> Capture:
-    """The capture of layout "flame" whose meshes a sequence makes; `root` and `model_file` say
-    where it is from."""
+    """The capture of layout "flame" whose meshes a sequence makes; where both are from."""
     model = sequence.model
     regions = key_regions(model)
-    missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): triangles are selected one by one"
+    missing = (
+        "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): "
+        "triangles are selected one by one"
+    )
     return Capture(
         root=root,
         layout="flame",
@@ -400,43 +387,21 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
 
     return {
         "mesh": cached_meshes(mesh, len(sequence.model.v_template)),
-        "expression_mesh": lambda timestep, zero_pose: expression_mesh(
-            sequence, timestep, zero_pose
-        ),
+        "expression_mesh": partial(expression_mesh, sequence),
         "flame": sequence,
     }
 
 
 def _model_file(root: Path, given: Path | None) -> Path:
-    """The capture's bundled head, else the FLAME model file that is given, else the one in the
-    capture's folder."""
+    """The capture's bundled head, else the given FLAME model file, else the one in its folder."""
     if (root / BUNDLED_MODEL).is_file():
         return root / BUNDLED_MODEL
     beside = (root / name for name in OWN_MODELS)
     found = given or next((path for path in beside if path.is_file()), None)
     if found is None:
         raise StgaError(
-            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame or in the"
-            f" preferences of the add-on, or put it into the folder as {OWN_MODELS[0]}"
+            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame "
+            "or in the preferences of the add-on, or put it into the folder as "
+            f"{OWN_MODELS[0]}"
         )
     return found
-
-
-def parameter_files(root: Path, transforms: Transforms) -> dict[int, Path]:
-    """timestep -> parameter file, ascending; without any frames, those in `flame_param`. Raises
-    StgaError."""
-    frames = transforms.frames
-    if any(frame.flame for frame in frames):
-        return tracked_files(frames, "flame")
-    if frames:
-        return {
-            t: root / PARAMETERS / f"{t:05d}.npz"
-            for t in sorted({frame.view.timestep for frame in frames})
-        }
-    listed = (root / PARAMETERS).glob("*.npz")
-    files = {int(path.stem): path for path in listed if re.fullmatch(r"\d+", path.stem, re.ASCII)}
-    if not files:
-        raise StgaError(
-            f"{root / PARAMETERS}: holds no parameters; expected one .npz per timestep, such as 00000.npz"
-        )
-    return dict(sorted(files.items()))

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import StgaError, shorten
 from ..files import read_json
 from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
-from .model import FPS_LIMIT, View
+from .model import FPS_LIMIT, Item, View
 
 SPLITS = ("train", "val", "test")
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
@@ -47,8 +47,7 @@ class Frame:
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
-    """A camera as an entry of a transforms file has it; cy is counted from the bottom, as VHAP
-    writes it."""
+    """A camera as a transforms file's entry; cy is counted from the bottom, as VHAP writes it."""
     return {
         "transform_matrix": camera.camera_to_world_gl.tolist(),
         "w": camera.width,
@@ -62,8 +61,7 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Transforms:
-    """All frames of a capture by split, and what the top level says (None where it is missing):
-    files, frame rate."""
+    """All frames by split, and what the top level says, None where it is missing."""
 
     splits: dict[str, tuple[Frame, ...]]
     canonical_mesh: Path | None
@@ -102,42 +100,40 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
 
     Cameras without `camera_index` are numbered alike in all splits. Raises StgaError.
     """
-    names = {
-        split: _split_file(split) for split in SPLITS if (folder / _split_file(split)).is_file()
-    }
+    names = {split: _split_file(split) for split in SPLITS}
+    names = {split: name for split, name in names.items() if (folder / name).is_file()}
     documents = {}
     for split, name in (names or {"train": "transforms.json"}).items():
         values = read_json(folder / name)
         if not isinstance(values, dict):
             raise StgaError(f"{folder / name}: expected a JSON object with the field frames")
         documents[split] = _Record(folder / name, folder.resolve(), "", values)
+    records = documents.values()
     frames = {
         split: _read_frames(record.path, record.values, principal_point)
         for split, record in documents.items()
     }
-    rates = [frame_rate(record.path, record.values) for record in documents.values()]
+    rates = [frame_rate(record.path, record.values) for record in records]
     numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
-    splits = {
-        split: tuple(itertools.islice(numbered, len(frames.get(split, ())))) for split in SPLITS
-    }
-    return Transforms(
-        splits,
-        canonical_mesh=_first_path(documents.values(), "canonical_mesh_path"),
-        regions=_first_path(documents.values(), "regions_path"),
-        fps=next((rate for rate in rates if rate is not None), None),
-    )
+    counts = {split: len(frames.get(split, ())) for split in SPLITS}
+    splits = {split: tuple(itertools.islice(numbered, n)) for split, n in counts.items()}
+    meshes = [record.path_of("canonical_mesh_path") for record in records]
+    regions = [record.path_of("regions_path") for record in records]
+    return Transforms(splits, _first(meshes), _first(regions), _first(rates))
+
+
+def _first(values: Iterable[Item | None]) -> Item | None:
+    return next((value for value in values if value is not None), None)
 
 
 def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
-    """`fps` at the top level of a transforms file; None where it is missing. Raises StgaError
-    naming the file."""
+    """`fps` at the top level of a transforms file; None without. Raises StgaError."""
     record = _Record(path, path.parent, "", values)
     return record.number("fps", low=0, high=FPS_LIMIT) if record.has("fps") else None
 
 
 def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:
-    """The camera with the principal point that the file's (cx, cy) mean under the convention
-    (`read_transforms`)."""
+    """The camera with the principal point that the file's (cx, cy) mean (`read_transforms`)."""
     if convention not in PRINCIPAL_POINTS:
         raise StgaError(
             f"principal point convention {convention!r} is not one of {', '.join(PRINCIPAL_POINTS)}"
@@ -163,7 +159,8 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
             )
         if files.setdefault(timestep, path) != path:
             raise StgaError(
-                f"{frame.where}.{key}: is {path}, but timestep {timestep} already has {files[timestep]}"
+                f"{frame.where}.{key}: is {path}, "
+                f"but timestep {timestep} already has {files[timestep]}"
             )
     return dict(sorted(files.items()))
 
@@ -177,14 +174,12 @@ def inside(root: Path, relative: str, where: str) -> Path:
     """
     text = relative.replace("\\", "/")
     parts = posixpath.normpath(text).split("/")
-    absolute = text.startswith("/") or any(
-        ":" in part and PureWindowsPath(part).drive for part in parts
-    )
+    drives = [PureWindowsPath(part).drive for part in parts if ":" in part]
+    absolute = text.startswith("/") or any(drives)
     if absolute or "\0" in text or parts == ["."]:
         raise StgaError(f"{where}: {shorten(relative)} is not a path of a file relative to {root}")
-    if len(text) > MAX_PATH_CHARACTERS or any(
-        len(part.encode()) > MAX_NAME_BYTES for part in parts
-    ):
+    longest = max(len(part.encode()) for part in parts)
+    if len(text) > MAX_PATH_CHARACTERS or longest > MAX_NAME_BYTES:
         raise StgaError(f"{where}: {shorten(relative)} is longer than a path can be")
     # Behind a first "..", only the name of a sibling may follow.
     if parts[:2] == ["..", ".."] or parts == [".."]:
@@ -194,8 +189,7 @@ def inside(root: Path, relative: str, where: str) -> Path:
 
 @dataclass(frozen=True)
 class _Record:
-    """A JSON object, its file, that file's folder without symbolic links, and its place in the file
-    for messages."""
+    """A JSON object, its file, that file's resolved folder, and its place in it for messages."""
 
     path: Path
     folder: Path
@@ -211,27 +205,19 @@ class _Record:
     def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
         """A finite number strictly between the bounds."""
         value = self.values[key]
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not low < value < high
-            or abs(value) > MAX_NUMBER
-        ):
-            limits = [
-                f"{word} {limit:g}"
-                for word, limit in (("above", low), ("below", high))
-                if math.isfinite(limit)
-            ]
-            expected = " ".join(["a finite number", " and ".join(limits)]).strip()
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not low < value < high or abs(value) > MAX_NUMBER:
+            bounds = (("above", low), ("below", high))
+            limits = [f"{word} {limit:g}" for word, limit in bounds if math.isfinite(limit)]
+            expected = f"a finite number {' and '.join(limits)}".strip()
             raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
         return float(value)
 
     def natural(self, key: str) -> int:
         value = self.values[key]
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INDEX_LIMIT:
-            raise StgaError(
-                f"{self.where(key)}: expected a whole number from 0 up, below 2^31, not {shorten(value)}"
-            )
+            expected = "a whole number from 0 up, below 2^31"
+            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
         return value
 
     def path_of(self, key: str) -> Path | None:
@@ -257,15 +243,8 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
     for number, entry in enumerate(values["frames"]):
         if not isinstance(entry, dict):
             raise StgaError(f"{path}: frames[{number}]: expected an object, not {shorten(entry)}")
-        frames.append(
-            _frame(
-                replace(shared, place=f"frames[{number}].", values=entry),
-                shared,
-                timed,
-                principal_point,
-                cameras,
-            )
-        )
+        record = replace(shared, place=f"frames[{number}].", values=entry)
+        frames.append(_frame(record, shared, timed, principal_point, cameras))
     return frames
 
 
@@ -276,8 +255,7 @@ def _frame(
     principal_point: str,
     cameras: dict[tuple[bytes | float, ...], Camera],
 ) -> Frame:
-    """cameras: those of earlier frames by their numbers in the file, because most frames share
-    theirs."""
+    """cameras: those of earlier frames by their numbers in the file; most frames share theirs."""
     image = record.path_of("file_path")
     if image is None:
         raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
@@ -288,53 +266,39 @@ def _frame(
         raise StgaError(
             f"{record.where('timestep_index')}: is missing, though other frames have it"
         )
-    width, height = _image_size(record, shared, image)
+    size = width, height = _image_size(record, shared, image)
     written = _principal(record, shared, "cx", width), _principal(record, shared, "cy", height)
     focal = _focal(record, shared, width, height)
     try:
         matrix = np.array(record.values["transform_matrix"], np.float64)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise StgaError(f"{record.where('transform_matrix')}: expected {MATRIX}") from error
-    key_of_camera = matrix.tobytes(), width, height, *focal, *written
-    if key_of_camera not in cameras:
-        camera = camera_from_gl(_pose(record, matrix), width, height, *focal, *written)
-        cameras[key_of_camera] = with_principal_point(camera, written, principal_point)
-    view = View(
-        timestep=record.natural(key) if key else 0,
-        camera_index=record.natural("camera_index") if record.has("camera_index") else -1,
-        camera=cameras[key_of_camera],
-        # Forward slashes on every system: files are named after views.
-        name=record.values["file_path"].replace("\\", "/"),
-        image=image,
-        mask=record.path_of("fg_mask_path"),
-    )
+    known = matrix.tobytes(), *size, *focal, *written
+    if known not in cameras:
+        camera = camera_from_gl(_pose(record, matrix), *size, *focal, *written)
+        cameras[known] = with_principal_point(camera, written, principal_point)
+    timestep = record.natural(key) if key else 0
+    index = record.natural("camera_index") if record.has("camera_index") else -1
+    name = record.values["file_path"].replace("\\", "/")  # files are named after views
+    mask = record.path_of("fg_mask_path")
+    view = View(timestep, index, cameras[known], name, image, mask)
     camera_id = str(record.values["camera_id"]) if record.has("camera_id") else None
-    where = record.where("").rstrip(".")
-    return Frame(
-        view,
-        written,
-        camera_id,
-        record.path_of("mesh_path"),
-        record.path_of("flame_param_path"),
-        where,
-    )
+    mesh, flame = record.path_of("mesh_path"), record.path_of("flame_param_path")
+    return Frame(view, written, camera_id, mesh, flame, record.where("").rstrip("."))
 
 
 def _timestep_key(values: dict[str, Any]) -> str | None:
     """The key of the timestep: VHAP writes timestep_index, the STGA authors' release keyframe."""
-    return next(
-        (key for key in ("timestep_index", "keyframe") if values.get(key) is not None), None
-    )
+    keys = ("timestep_index", "keyframe")
+    return next((key for key in keys if values.get(key) is not None), None)
 
 
 def _principal(record: _Record, shared: _Record, key: str, size: int) -> float:
     """One coordinate of the principal point as written; the image's center where there is none."""
     source = record if record.has(key) else shared
-    return (
-        source.number(key, low=-MAX_FOCAL_PIXELS, high=MAX_FOCAL_PIXELS)
-        if source.has(key)
-        else size / 2
-    )
+    if not source.has(key):
+        return size / 2
+    return source.number(key, low=-MAX_FOCAL_PIXELS, high=MAX_FOCAL_PIXELS)
 
 
 def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int]:
@@ -342,7 +306,8 @@ def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int
     if source is None:
         if not isfile(image):
             raise StgaError(
-                f"{record.where('w')}: w and h are missing, and so is the image {image} to take them from"
+                f"{record.where('w')}: w and h are missing, "
+                f"and so is the image {image} to take them from"
             )
         from .images import image_size
 
@@ -356,48 +321,32 @@ def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int
 
 
 def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
-    focal = _written_focal(record, shared, width, height)
-    for name, value in zip(("fl_x", "fl_y"), focal, strict=True):
+    source = next((s for s in (record, shared) if s.has("fl_x") or s.has("camera_angle_x")), None)
+    if source is None:
+        where = record.where("fl_x")
+        raise StgaError(f"{where}: is missing, and so is camera_angle_x, here and at the top level")
+
+    def of_angle(key: str, size: int) -> float:
+        return size / 2 / math.tan(source.number(key, low=MIN_ANGLE, high=math.pi) / 2)
+
+    given = source.has("fl_x")
+    fl_x = fl_y = source.number("fl_x", low=0) if given else of_angle("camera_angle_x", width)
+    if source.has("fl_y"):
+        fl_y = source.number("fl_y", low=0)
+    elif source.has("camera_angle_y") and not given:
+        fl_y = of_angle("camera_angle_y", height)
+    for name, value in (("fl_x", fl_x), ("fl_y", fl_y)):
         if not 1 <= value <= MAX_FOCAL_PIXELS:
             raise StgaError(
                 f"{record.where(name)}: expected a focal length of 1 to 1e7 pixels, not {value:g}"
             )
-    return focal
-
-
-def _written_focal(
-    record: _Record, shared: _Record, width: int, height: int
-) -> tuple[float, float]:
-    for source in (record, shared):
-        if source.has("fl_x"):
-            fl_x = source.number("fl_x", low=0)
-        elif source.has("camera_angle_x"):
-            fl_x = (
-                width
-                / 2
-                / math.tan(source.number("camera_angle_x", low=MIN_ANGLE, high=math.pi) / 2)
-            )
-        else:
-            continue
-        if source.has("fl_y"):
-            return fl_x, source.number("fl_y", low=0)
-        if source.has("camera_angle_y") and not source.has("fl_x"):
-            return fl_x, height / 2 / math.tan(
-                source.number("camera_angle_y", low=MIN_ANGLE, high=math.pi) / 2
-            )
-        return fl_x, fl_x
-    raise StgaError(
-        f"{record.where('fl_x')}: is missing, and so is camera_angle_x, here and at the top level"
-    )
+    return fl_x, fl_y
 
 
 def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
     where = record.where("transform_matrix")
-    if (
-        matrix.shape != (4, 4)
-        or not np.isfinite(matrix).all()
-        or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6)
-    ):
+    finite = matrix.shape == (4, 4) and np.isfinite(matrix).all()
+    if not finite or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
     if np.abs(matrix).max() > MAX_COORDINATE_M:
         raise StgaError(
@@ -407,14 +356,14 @@ def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(rotation) < 0:
         raise StgaError(
-            f"{where}: expected a rotation without scale, shear or mirroring in its upper left 3x3 part"
+            f"{where}: expected a rotation without scale, shear or mirroring in its upper left "
+            "3x3 part"
         )
     return matrix
 
 
 def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:
-    """Frames whose cameras all have an index: that of the same camera elsewhere, or the next free
-    number."""
+    """Frames with an index for each camera: that of the same one elsewhere, or the next free."""
     known = {_camera_key(f): f.view.camera_index for f in frames if f.view.camera_index >= 0}
     taken = set(known.values())
     free = (number for number in itertools.count() if number not in taken)
@@ -433,9 +382,3 @@ def _camera_key(frame: Frame) -> str | bytes:
     """Identity of a camera: its name, else its pose (the cameras of a rig do not move)."""
     # Adding zero turns -0 into 0, whose bytes differ.
     return frame.camera_id or (np.round(frame.view.camera.world_to_camera, 6) + 0.0).tobytes()
-
-
-def _first_path(records: Iterable[_Record], key: str) -> Path | None:
-    return next(
-        (path for path in (record.path_of(key) for record in records) if path is not None), None
-    )

@@ -8,8 +8,7 @@ from .model import FlameModel
 from .quaternions import from_axis_angle, to_matrices
 
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
-"""The last numbers of a frame's parameters: axis-angles of five joints, and the translation.
-Expression comes first."""
+"""At the end of a frame's parameters, after the expression: five joints' axis-angles; a shift."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
 SMALL_ANGLE = 1e-4
 """Radians, below which a quotient by the squared angle is its limit."""
@@ -67,14 +66,12 @@ def cross_matrices(vectors: np.ndarray) -> np.ndarray:
     """(N, 3, 3): the matrices of x ↦ vector × x, of vectors (N, 3)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
-    return np.stack(
-        [np.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2
-    )
+    rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
+    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def left_jacobian(angles: np.ndarray) -> np.ndarray:
-    """(3, 3): the small rotation, in front of the rotation of an axis-angle (3,), that a change of
-    it amounts to."""
+    """(3, 3): the small rotation, before that of an axis-angle (3,), that its change amounts to."""
     angle = float(np.linalg.norm(angles))
     cross = cross_matrices(angles[None])[0]
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
@@ -85,8 +82,7 @@ def left_jacobian(angles: np.ndarray) -> np.ndarray:
 def shaped_vertices(
     model: FlameModel, shape: np.ndarray, expr: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """Template with identity (I,), expression (E,) and vertex offset (V, 3) added, before posing:
-    (V, 3) meters."""
+    """Template (V, 3) in meters with identity (I,), expression (E,) and offset (V, 3), unposed."""
     shaped = model.v_template + model.shapedirs @ np.concatenate([shape, expr])
     return np.asarray(shaped if offset is None else shaped + offset)
 
@@ -119,16 +115,15 @@ def parameters_gradient(
     respect to its vertices (V, 3): the reverse of `flame_forward`, of a model whose template has
     the identity and the static offset.
     """
-    shaped = model.v_template + model.shapedirs[:, :, model.n_identity :] @ frame.expr
-    posed = _posed(
-        model, shaped if frame.dynamic_offset is None else shaped + frame.dynamic_offset, frame
-    )
+    expressions = model.shapedirs[:, :, model.n_identity :]
+    shaped = model.v_template + expressions @ frame.expr
+    shaped = shaped if frame.dynamic_offset is None else shaped + frame.dynamic_offset
+    posed = _posed(model, shaped, frame)
     force = model.weights.T @ vertex_gradient  # (5, 3), by where each joint moves what it carries
     by_corrected = np.einsum("vab,va->vb", posed.skin, vertex_gradient)
     outer = (vertex_gradient[:, :, None] * posed.corrected[:, None]).reshape(-1, 9)
-    by_world = (model.weights.T @ outer).reshape(-1, 3, 3) - force[:, :, None] * posed.joints[
-        :, None
-    ]
+    by_world = (model.weights.T @ outer).reshape(-1, 3, 3)
+    by_world = by_world - force[:, :, None] * posed.joints[:, None]
     by_place, by_joint = force.copy(), -np.einsum("jab,ja->jb", posed.world, force)
     by_local = np.zeros_like(by_world)
     for joint in reversed(range(len(model.parents))):
@@ -146,11 +141,9 @@ def parameters_gradient(
     by_local[1:] += np.tensordot(by_corrected, model.posedirs, 2).reshape(-1, 3, 3)
     twist = by_local @ posed.local.swapaxes(1, 2)
     torque = np.stack([twist[:, k - 1, k - 2] - twist[:, k - 2, k - 1] for k in range(3)], 1)
-    by_pose = [
-        left_jacobian(own).T @ by_turn for own, by_turn in zip(frame.pose, torque, strict=True)
-    ]
+    by_pose = [left_jacobian(own).T @ turn for own, turn in zip(frame.pose, torque, strict=True)]
     by_shaped = by_corrected + model.j_regressor.T @ by_joint
-    by_expression = np.tensordot(by_shaped, model.shapedirs[:, :, model.n_identity :], 2)
+    by_expression = np.tensordot(by_shaped, expressions, 2)
     return np.concatenate([by_expression, *by_pose, vertex_gradient.sum(0)])
 
 
@@ -177,6 +170,5 @@ def _posed(model: FlameModel, shaped: np.ndarray, frame: FlameFrame) -> _Posed:
             world[joint] = world[parent] @ local[joint]
             places[joint] = places[parent] + world[parent] @ (joints[joint] - joints[parent])
     moved = places - np.einsum("jab,jb->ja", world, joints)
-    return _Posed(
-        joints, corrected, local, world, moved, np.einsum("vj,jab->vab", model.weights, world)
-    )
+    skin = np.einsum("vj,jab->vab", model.weights, world)
+    return _Posed(joints, corrected, local, world, moved, skin)

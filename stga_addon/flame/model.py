@@ -1,5 +1,4 @@
-"""FLAME head models: template, blend shapes, a skeleton of five joints, and regions of
-triangles."""
+"""FLAME head models: template, blend shapes, skeleton of five joints, regions of triangles."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,8 +23,7 @@ Creative Technologies) in FLAME's form, made by `development/bundled_head.py`.""
 EXPRESSION_NAMES = "expression_names"
 """Key of the names in model files, and in motions of the bundled head."""
 SHAPE_STEP_M = 1e-5
-"""Step of `shape_steps` (K, V, 3), displacements in whole numbers, which a file may have in place
-of shapedirs."""
+"""Of `shape_steps` (K, V, 3), whole numbers, which a file may have in place of shapedirs."""
 # Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
 KEY_MASKS = {
     "left_eye": ("left_eye_region", "left_eyeball"),
@@ -36,8 +34,7 @@ KEY_MASKS = {
 EYEBALL_WEIGHT = 0.9
 """Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
 MIN_TORSO_WEIGHT = 0.7
-"""Skinning weight of the root joint at the torso's vertices; the published FLAME's last ring has
-0.9."""
+"""Skinning weight of the root joint at the torso; the published FLAME's last ring has 0.9."""
 
 
 @dataclass(frozen=True)
@@ -86,49 +83,57 @@ def read_flame(path: Path) -> FlameModel:
     any class in a pickle that is not an array.
     """
     path = Path(path)
-    in_npz = path.suffix.lower() == ".npz"
-    arrays = _npz_arrays(path) if in_npz else read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
+    if path.suffix.lower() == ".npz":
+        arrays = dict(read_npz(path))
+        if "shape_steps" in arrays and "v_template" in arrays:
+            steps = _floats(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
+            arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
+        if "v_template" in arrays:
+            arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
+    else:
+        arrays = read_pickled_arrays(path, (*MODEL_KEYS, "n_identity"))
     for key in MODEL_KEYS:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}, which a FLAME model needs")
     template = _floats(path, arrays, "v_template", (None, 3))
     vertices = len(template)
     shapedirs = _floats(path, arrays, "shapedirs", (vertices, 3, None))
-    n_identity = _identity_count(path, arrays, shapedirs.shape[2])
-    return FlameModel(
-        v_template=template,
-        shapedirs=shapedirs,
-        n_identity=n_identity,
-        posedirs=_floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES)),
-        j_regressor=_floats(path, arrays, "J_regressor", (len(JOINTS), vertices)),
-        parents=_parents(path, arrays),
-        weights=_floats(path, arrays, "weights", (vertices, len(JOINTS))),
-        faces=_faces(path, arrays, vertices),
-        masks=_masks(path, arrays, vertices),
-        expression_names=_expression_names(path, arrays, shapedirs.shape[2] - n_identity),
-    )
-
-
-def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The file's arrays, with what an npz may leave out."""
-    arrays = dict(read_npz(path))
-    if "shape_steps" in arrays and "v_template" in arrays:
-        steps = _floats(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
-        arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)
-    if "v_template" in arrays:
-        arrays.setdefault("posedirs", np.zeros((len(arrays["v_template"]), 3, POSE_FEATURES)))
-    return arrays
-
-
-def _expression_names(path: Path, arrays: Mapping[str, np.ndarray], count: int) -> tuple[str, ...]:
-    if EXPRESSION_NAMES not in arrays:
-        return ()
-    names = arrays[EXPRESSION_NAMES]
-    if names.dtype.kind != "U" or names.shape != (count,) or len(set(names.tolist())) != count:
+    components = shapedirs.shape[2]
+    n_identity = FULL_IDENTITY if components == FULL_COMPONENTS else components * 3 // 4
+    if components != FULL_COMPONENTS and "n_identity" in arrays:
+        given = _integers(path, "n_identity", arrays["n_identity"])
+        if given.size != 1 or not 0 <= int(given.reshape(())) <= components:
+            expected = f"one number from 0 to {components}"
+            raise StgaError(f"{path}: n_identity is {given.tolist()}, expected {expected}")
+        n_identity = int(given.reshape(()))
+    posedirs = _floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES))
+    regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), vertices))
+    _check_shape(path, "kintree_table", arrays["kintree_table"], (2, len(JOINTS)))
+    parents = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(np.int64)
+    parents[0] = -1  # the published files write the root's parent as 2**32 - 1
+    if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
+        raise StgaError(
+            f"{path}: kintree_table names the parents {parents.tolist()}, "
+            "expected each before its child"
+        )
+    weights = _floats(path, arrays, "weights", (vertices, len(JOINTS)))
+    _check_shape(path, "f", arrays["f"], (None, 3))
+    faces = _integers(path, "f", arrays["f"]).astype(np.int64)
+    if faces.min() < 0 or faces.max() >= vertices:
+        raise StgaError(
+            f"{path}: f names vertices {faces.min()} to {faces.max()}, expected 0 to {vertices - 1}"
+        )
+    masks, names = _masks(path, arrays, vertices), arrays.get(EXPRESSION_NAMES)
+    count = components - n_identity
+    if names is not None and (
+        names.dtype.kind != "U" or names.shape != (count,) or len(set(names.tolist())) != count
+    ):
         raise StgaError(
             f"{path}: expression_names: expected {count} different names, one per expression"
         )
-    return tuple(names.tolist())
+    named, faces = () if names is None else tuple(names.tolist()), faces.astype(np.int32)
+    skeleton = posedirs, regressor, parents, weights
+    return FlameModel(template, shapedirs, n_identity, *skeleton, faces, masks, named)
 
 
 def _check_shape(path: Path, key: str, array: np.ndarray, expected: tuple[int | None, ...]) -> None:
@@ -160,50 +165,10 @@ def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _identity_count(path: Path, arrays: Mapping[str, np.ndarray], components: int) -> int:
-    if components == FULL_COMPONENTS:
-        return FULL_IDENTITY
-    if "n_identity" not in arrays:
-        return components * 3 // 4
-    count = _integers(path, "n_identity", arrays["n_identity"])
-    if count.size != 1 or not 0 <= int(count.reshape(())) <= components:
-        raise StgaError(
-            f"{path}: n_identity is {count.tolist()}, expected one number from 0 to {components}"
-        )
-    return int(count.reshape(()))
-
-
-def _parents(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    _check_shape(path, "kintree_table", arrays["kintree_table"], (2, len(JOINTS)))
-    parents: np.ndarray = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(
-        np.int64
-    )
-    parents[0] = -1  # the published files write the root's parent as 2**32 - 1
-    if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
-        raise StgaError(
-            f"{path}: kintree_table names the parents {parents.tolist()}, expected each before its child"
-        )
-    return parents
-
-
-def _faces(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> np.ndarray:
-    _check_shape(path, "f", arrays["f"], (None, 3))
-    faces = _integers(path, "f", arrays["f"]).astype(np.int64)
-    if faces.min() < 0 or faces.max() >= vertices:
-        raise StgaError(
-            f"{path}: f names vertices {faces.min()} to {faces.max()}, expected 0 to {vertices - 1}"
-        )
-    return np.ascontiguousarray(faces, np.int32)
-
-
 def _masks(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> dict[str, np.ndarray]:
-    source = path
-    found = {
-        key[len(MASK_PREFIX) :]: value
-        for key, value in arrays.items()
-        if key.startswith(MASK_PREFIX)
-    }
-    beside = path.with_name(MASK_FILE)
+    own = {key: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
+    found = {key.removeprefix(MASK_PREFIX): value for key, value in own.items()}
+    source, beside = path, path.with_name(MASK_FILE)
     if not found and beside.is_file():
         source, found = beside, read_pickled_arrays(beside)
     masks = {}
@@ -224,14 +189,12 @@ def faces_within(faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 def torso_faces(model: FlameModel) -> np.ndarray:
     """(F,) bool: triangles at the end of the neck, which the root joint carries."""
-    return np.asarray(
-        (model.weights[:, JOINTS.index("root")] > MIN_TORSO_WEIGHT)[model.faces].all(axis=1)
-    )
+    torso = model.weights[:, JOINTS.index("root")] > MIN_TORSO_WEIGHT
+    return np.asarray(torso[model.faces].all(axis=1))
 
 
 def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
-    """left_eye, right_eye, mouth and nose as (F,) bool; a region none of whose masks the model has
-    is left out."""
+    """left_eye, right_eye, mouth, nose as (F,) bool; those without any mask are left out."""
     regions = {}
     for region, names in KEY_MASKS.items():
         present = [model.masks[name] for name in names if name in model.masks]

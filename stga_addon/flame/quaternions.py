@@ -10,8 +10,7 @@ def from_axis_angle(vectors: np.ndarray) -> np.ndarray:
 
 
 def to_matrices(quaternions: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length; of zero ones, the
-    identity."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length; zero: the identity."""
     length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(quaternions / np.maximum(length, 1e-12), -1, 0)
     rows = [
@@ -32,8 +31,7 @@ def to_axis_angle(quaternions: np.ndarray) -> np.ndarray:
 
 
 def continuous(quaternions: np.ndarray) -> np.ndarray:
-    """(T, 4) with signs changed so that consecutive quaternions are close; q and -q are the same
-    rotation."""
+    """(T, 4) with signs changed so that consecutive ones are close; q and -q are one rotation."""
     flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(1))
     signs = np.cumprod(np.where(flips < 0, -1.0, 1.0))
     return np.concatenate([quaternions[:1], quaternions[1:] * signs[:, None]])
@@ -59,9 +57,8 @@ def normalized(q: np.ndarray) -> np.ndarray:
     """(..., 4) normalized in float64; a zero quaternion counts as the identity."""
     q = np.asarray(q, np.float64)
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
-    q = np.where(
-        largest > 0, q / np.where(largest > 0, largest, 1.0), np.array([1.0, 0.0, 0.0, 0.0])
-    )
+    unit = q / np.where(largest > 0, largest, 1.0)
+    q = np.where(largest > 0, unit, np.array([1.0, 0.0, 0.0, 0.0]))
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
@@ -69,16 +66,13 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product of wxyz quaternions (..., 4): rotate by b, then by a."""
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    product = np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
+    product = (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )
-    return np.asarray(product)
+    return np.stack(product, axis=-1)
 
 
 def from_matrices(matrices: np.ndarray) -> np.ndarray:
@@ -90,10 +84,8 @@ def from_matrices(matrices: np.ndarray) -> np.ndarray:
     m = np.asarray(matrices, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     outer = np.empty((*m.shape[:-2], 4, 4))
-    outer[..., 0, 0] = 1 + xx + yy + zz
-    outer[..., 1, 1] = 1 + xx - yy - zz
-    outer[..., 2, 2] = 1 - xx + yy - zz
-    outer[..., 3, 3] = 1 - xx - yy + zz
+    for axis, (x, y, z) in enumerate(((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))):
+        outer[..., axis, axis] = 1 + x * xx + y * yy + z * zz
     outer[..., 0, 1] = outer[..., 1, 0] = m[..., 2, 1] - m[..., 1, 2]
     outer[..., 0, 2] = outer[..., 2, 0] = m[..., 0, 2] - m[..., 2, 0]
     outer[..., 0, 3] = outer[..., 3, 0] = m[..., 1, 0] - m[..., 0, 1]

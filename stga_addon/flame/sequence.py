@@ -1,5 +1,4 @@
-"""Tracked FLAME sequences: reading of parameter files, meshes; retargeting to another person, speed
-or strength."""
+"""Tracked FLAME sequences: files, meshes; retargeting to another person, speed or strength."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,16 +30,10 @@ COEFFICIENT_FIELDS = ("expr", "shape")
 REQUIRED_FIELDS = ("expr", "rotation", "translation")
 # What trackers other than VHAP call the fields.
 FIELD_ALIASES = {
-    "exp": "expr",
-    "expression": "expr",
-    "global_orient": "rotation",
-    "transl": "translation",
-    "jaw": "jaw_pose",
-    "neck": "neck_pose",
-    "eyes": "eyes_pose",
-    "eye_pose": "eyes_pose",
+    "exp": "expr", "expression": "expr", "global_orient": "rotation", "transl": "translation",
+    "jaw": "jaw_pose", "neck": "neck_pose", "eyes": "eyes_pose", "eye_pose": "eyes_pose",
     "betas": "shape",
-}
+}  # fmt: skip
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
@@ -87,8 +80,7 @@ def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> n
 
 
 def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
-    """The canonical mesh (V, 3): expression, pose and translation zero, with the person's shape and
-    static offset."""
+    """The canonical mesh (V, 3): the person's shape and static offset, everything else zero."""
     return _mesh(sequence, neutral_frame(sequence.model))
 
 
@@ -107,24 +99,20 @@ def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np
 
 
 def with_identity(sequence: FlameSequence) -> FlameSequence:
-    """The same motion with shape and static offset baked into the template, so that a mesh needs a
-    quarter of the blend shapes."""
+    """The motion with the identity in the template: a mesh needs a quarter of the blend shapes."""
     model = sequence.model
     shapes = model.shapedirs[:, :, model.n_identity :]
-    template = shaped_vertices(
-        model, sequence.shape, np.zeros(shapes.shape[2]), sequence.static_offset
-    )
-    person = replace(
-        model, v_template=template, shapedirs=np.ascontiguousarray(shapes), n_identity=0
-    )
+    none, offset = np.zeros(shapes.shape[2]), sequence.static_offset
+    template = shaped_vertices(model, sequence.shape, none, offset)
+    shapes = np.ascontiguousarray(shapes)
+    person = replace(model, v_template=template, shapedirs=shapes, n_identity=0)
     return replace(sequence, model=person, shape=np.zeros(0), static_offset=None)
 
 
 def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
     """Largest angle (5,) in degrees by which the frames turn each of `JOINTS`."""
-    return np.asarray(
-        np.degrees(np.linalg.norm([frame.pose for frame in frames], axis=2).max(axis=0))
-    )
+    angles = np.linalg.norm([frame.pose for frame in frames], axis=2)
+    return np.asarray(np.degrees(angles.max(axis=0)))
 
 
 def _mesh(sequence: FlameSequence, frame: FlameFrame) -> np.ndarray:
@@ -147,8 +135,7 @@ def read_frame(path: Path, model: FlameModel) -> FlameFrame:
 
 
 def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
-    """Shape coefficients (I,) and static offset (V, 3) or None from a parameter file. Errors as in
-    `read_frame`."""
+    """Shape (I,) and static offset (V, 3) or None of a file. Errors as in `read_frame`."""
     return _identity(path, read_npz(path), model)
 
 
@@ -166,27 +153,37 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
 
 def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameSequence:
     """The motion in the arrays of a file, as `read_motion` reads it; errors name `path`."""
-    arrays = _spelled_out(path, arrays)
+    spelled = {FIELD_ALIASES[name]: own for name, own in arrays.items() if name in FIELD_ALIASES}
+    arrays = spelled | dict(arrays)
+    pose = arrays.pop("pose", None)
+    if pose is not None:
+        if pose.ndim < 2 or not len(pose) or pose[0].size not in POSE_LAYOUTS:
+            sizes = " or ".join(f"(timesteps, {size})" for size in POSE_LAYOUTS)
+            raise StgaError(f"{path}: pose has shape {pose.shape}, expected {sizes}")
+        fields, columns = POSE_LAYOUTS[pose[0].size], pose.reshape(len(pose), -1)
+        parts = np.split(columns, range(3, 3 * len(fields), 3), axis=1)
+        arrays = dict(zip(fields, parts, strict=True)) | arrays
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
     if not moving:
         raise StgaError(
             f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of"
         )
-    name, array = next(iter(moving.items()))
-    if array.ndim < 2 or not len(array):
-        raise StgaError(
-            f"{path}: {name} has shape {array.shape}, expected (timesteps, coefficients)"
-        )
-    count = len(array)
+    count: int | None = None
     for name, array in moving.items():
-        if array.ndim < 2 or len(array) != count:
-            raise StgaError(
-                f"{path}: {name} has shape {array.shape}, expected {count} timesteps first"
-            )
+        if array.ndim < 2 or len(array) != (count or len(array)) or not len(array):
+            expected = "(timesteps, coefficients)" if count is None else f"{count} timesteps first"
+            raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
+        count = len(array)
+    assert count is not None
     if "shape" in arrays and arrays["shape"].ndim == 2:
         arrays["shape"] = arrays["shape"][0]  # one per timestep, all of the same person
     shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
-    timesteps = _timesteps(path, arrays.get("timesteps", np.arange(count)), count)
+    found = arrays.get("timesteps", np.arange(count))
+    named = found.dtype.kind in "iu" and found.shape == (count,)
+    if not named or found[0] < 0 or (found[1:] <= found[:-1]).any() or found[-1] > MAX_TIMESTEP:
+        limits = f"from 0 to {MAX_TIMESTEP}, each more than the one before"
+        raise StgaError(f"{path}: timesteps: expected {count} whole numbers {limits}")
+    timesteps = tuple(found.tolist())
     row = {timestep: number for number, timestep in enumerate(timesteps)}
 
     def frame(timestep: int) -> FlameFrame:
@@ -206,44 +203,15 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
     for I and E with a published FLAME.
     """
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    none = np.zeros_like(sequence.model.v_template)
+    none, static = np.zeros_like(sequence.model.v_template), sequence.static_offset
     offsets = [none if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames]
+    moving = {name: [getattr(frame, name) for frame in frames] for name in FRAME_FIELDS}
     return {
-        **{
-            name: np.stack([getattr(frame, name) for frame in frames], dtype=dtype)
-            for name in FRAME_FIELDS
-        },
+        **{name: np.stack(own, dtype=dtype) for name, own in moving.items()},
         "shape": sequence.shape.astype(dtype),
-        "static_offset": (
-            none if sequence.static_offset is None else sequence.static_offset
-        ).astype(dtype),
+        "static_offset": (none if static is None else static).astype(dtype),
         "dynamic_offset": np.stack(offsets, dtype=dtype),
     }
-
-
-def _timesteps(path: Path, found: np.ndarray, count: int) -> tuple[int, ...]:
-    named = found.dtype.kind in "iu" and found.shape == (count,)
-    if not named or found[0] < 0 or (found[1:] <= found[:-1]).any() or found[-1] > MAX_TIMESTEP:
-        limits = f"from 0 to {MAX_TIMESTEP}, each more than the one before"
-        raise StgaError(f"{path}: timesteps: expected {count} whole numbers {limits}")
-    return tuple(found.tolist())
-
-
-def _spelled_out(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays by VHAP's names, with `pose` split into joints."""
-    named = {
-        FIELD_ALIASES[name]: array for name, array in arrays.items() if name in FIELD_ALIASES
-    } | dict(arrays)
-    pose = named.pop("pose", None)
-    if pose is None:
-        return named
-    if pose.ndim < 2 or not len(pose) or pose[0].size not in POSE_LAYOUTS:
-        sizes = " or ".join(f"(timesteps, {size})" for size in POSE_LAYOUTS)
-        raise StgaError(f"{path}: pose has shape {pose.shape}, expected {sizes}")
-    fields = POSE_LAYOUTS[pose[0].size]
-    columns = pose.reshape(len(pose), -1)
-    parts = np.split(columns, range(3, 3 * len(fields), 3), axis=1)
-    return dict(zip(fields, parts, strict=True)) | named
 
 
 def _frame(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameFrame:
@@ -258,10 +226,8 @@ def _identity(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     if "shape" not in arrays:
         raise StgaError(f"{path}: has no shape, the person's identity coefficients")
-    return (
-        _vector(path, arrays, "shape", model.n_identity),
-        _offset(path, arrays, "static_offset", len(model.v_template)),
-    )
+    shape = _vector(path, arrays, "shape", model.n_identity)
+    return shape, _offset(path, arrays, "static_offset", len(model.v_template))
 
 
 def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
@@ -275,17 +241,14 @@ def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) -> np.ndarray:
-    """(size,) float64 from (size,) or (1, size); absent fields are zero, shorter coefficient
-    vectors padded."""
+    """(size,) float64 from (size,) or (1, size); absent fields are zero, short ones padded."""
     vector = np.zeros(size)
     if name not in arrays:
         return vector
     array = _finite(path, name, arrays[name])
     given = array[0] if array.ndim == 2 and len(array) == 1 else array
-    fits = given.ndim == 1 and (
-        given.size == size or (name in COEFFICIENT_FIELDS and given.size < size)
-    )
-    if not fits:
+    fits = given.size == size or (name in COEFFICIENT_FIELDS and given.size < size)
+    if given.ndim != 1 or not fits:
         raise StgaError(
             f"{path}: {name} has shape {array.shape}, expected ({size},) or (1, {size})"
         )
@@ -296,17 +259,15 @@ def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) 
 def _offset(
     path: Path, arrays: Mapping[str, np.ndarray], name: str, vertices: int
 ) -> np.ndarray | None:
-    """(V, 3) float64 or None where it is absent or all zero; rows of the teeth are added or dropped
-    to fit."""
+    """(V, 3) float64, None where absent or all zero; the teeth's rows are added or dropped."""
     if name not in arrays:
         return None
     array = _finite(path, name, arrays[name])
     rows = array.shape[-2] if array.ndim >= 2 else 0
     accepted = (vertices, vertices - TEETH_VERTICES, vertices + TEETH_VERTICES)
     if array.ndim not in (2, 3) or rows not in accepted or array.size != rows * 3:
-        raise StgaError(
-            f"{path}: {name} has shape {array.shape}, expected ({vertices}, 3) or (1, {vertices}, 3)"
-        )
+        expected = f"({vertices}, 3) or (1, {vertices}, 3)"
+        raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
     offset = np.zeros((vertices, 3))
     kept = min(rows, vertices)
     offset[:kept] = array.reshape(rows, 3)[:kept]
@@ -321,7 +282,6 @@ PARTS = {
     "neck": ("neck_pose",),
     "head": ("rotation", "translation"),
 }
-LINEAR = ("expr", "translation")
 ROTATIONS = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
 
@@ -334,25 +294,21 @@ def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
     """
     times = np.asarray(sequence.timesteps, np.float64)
     wanted = np.arange(times[0], times[-1] + TIME_TOLERANCE, step)
-    row = np.clip(
-        np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1, 0, max(len(times) - 2, 0)
-    )
+    row = np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1
+    row = np.clip(row, 0, max(len(times) - 2, 0))
     after = np.minimum(row + 1, len(times) - 1)
     share = (wanted - times[row]) / np.maximum(times[after] - times[row], 1.0)
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    tracked = {
-        name: np.stack([getattr(frame, name) for frame in frames]) for name in (*LINEAR, *ROTATIONS)
-    }
     values = {}
-    for name in LINEAR:
-        start, end = tracked[name][row], tracked[name][after]
-        values[name] = start + share[:, None] * (end - start)
-    for name in ROTATIONS:
-        values[name] = _turned(tracked[name][row], tracked[name][after], share)
-    return [
-        FlameFrame(**{name: column[index] for name, column in values.items()})
-        for index in range(len(wanted))
-    ]
+    for name in FRAME_FIELDS:
+        tracked = np.stack([getattr(frame, name) for frame in frames])
+        start, end = tracked[row], tracked[after]
+        if name in ROTATIONS:
+            values[name] = _turned(start, end, share)
+        else:
+            values[name] = start + share[:, None] * (end - start)
+    rows = range(len(wanted))
+    return [FlameFrame(**{name: own[index] for name, own in values.items()}) for index in rows]
 
 
 def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFrame]:
@@ -361,23 +317,15 @@ def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFra
 
     Rotation and translation of the head are scaled about the first frame's.
     """
-    first = frames[0]
-    here = np.array([strength])
-    changed = []
+    first, here, changed = frames[0], np.array([strength]), []
     for frame in frames:
-        inner = {name: getattr(frame, name)[None] for name in ROTATIONS if name != "rotation"}
-        turns = {
-            name: _turned(np.zeros_like(value), value, here)[0] for name, value in inner.items()
-        }
-        changed.append(
-            replace(
-                frame,
-                **turns,
-                expr=strength * frame.expr,
-                rotation=_turned(first.rotation[None], frame.rotation[None], here)[0],
-                translation=first.translation + strength * (frame.translation - first.translation),
-            )
-        )
+        turns = {}
+        for name in ROTATIONS:
+            value = getattr(frame, name)[None]
+            start = first.rotation[None] if name == "rotation" else np.zeros_like(value)
+            turns[name] = _turned(start, value, here)[0]
+        moved = first.translation + strength * (frame.translation - first.translation)
+        changed.append(replace(frame, **turns, expr=strength * frame.expr, translation=moved))
     return changed
 
 

@@ -8,7 +8,7 @@ from the mesh.
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -71,9 +71,7 @@ def flame_model(path: Path | None) -> FlameModel:
     return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
 
 
-@cache
-def _bundled_head() -> FlameModel:
-    return read_flame(BUNDLED_HEAD)
+_bundled_head = cache(partial(read_flame, BUNDLED_HEAD))
 
 
 def with_teeth(model: FlameModel) -> FlameModel:
@@ -85,7 +83,8 @@ def with_teeth(model: FlameModel) -> FlameModel:
     """
     if len(model.v_template) != TEMPLATE_VERTICES:
         raise StgaError(
-            f"teeth: the model has {len(model.v_template)} vertices, expected FLAME's topology of {TEMPLATE_VERTICES}"
+            f"teeth: the model has {len(model.v_template)} vertices, "
+            f"expected FLAME's topology of {TEMPLATE_VERTICES}"
         )
     mouth = _mouth(model)
     teeth = _positions(model.v_template, mouth)
@@ -101,12 +100,8 @@ def with_teeth(model: FlameModel) -> FlameModel:
         model,
         v_template=np.concatenate([model.v_template, teeth]),
         shapedirs=np.concatenate([model.shapedirs, shapedirs]),
-        posedirs=np.concatenate(
-            [model.posedirs, np.zeros((TEETH_VERTICES, *model.posedirs.shape[1:]))]
-        ),
-        j_regressor=np.concatenate(
-            [model.j_regressor, np.zeros((len(JOINTS), TEETH_VERTICES))], axis=1
-        ),
+        posedirs=np.pad(model.posedirs, ((0, TEETH_VERTICES), (0, 0), (0, 0))),
+        j_regressor=np.pad(model.j_regressor, ((0, 0), (0, TEETH_VERTICES))),
         weights=np.concatenate([model.weights, weights]),
         faces=np.concatenate([model.faces, teeth_faces(TEMPLATE_VERTICES)]),
         masks={**model.masks, "teeth": added},
@@ -120,25 +115,19 @@ def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
     They are found on FLAME's mesh with or without teeth, and where expressions have ARKit's names.
     Raises StgaError for another mesh without an open mouth.
     """
-    if "jawOpen" in model.expression_names:
-        return _opened_lips(model)
+    if "jawOpen" in model.expression_names:  # which moves one lip and leaves the other
+        column = model.n_identity + model.expression_names.index("jawOpen")
+        lips, at = model.masks["lips"], model.v_template
+        opened = np.linalg.norm(model.shapedirs[lips, :, column], axis=1)
+        upper, lower = lips[opened < opened.max() / 4], lips[opened > opened.max() / 2]
+        distances = np.linalg.norm(at[upper, None] - at[lower], axis=2)
+        near = np.flatnonzero(distances.min(axis=1) < MAX_LIP_DISTANCE_M)
+        return upper[near], lower[distances[near].argmin(axis=1)]
     lips = _mouth(model).lips
     half = len(lips) // 2
     sides = lips[1:half], lips[:half:-1]
     heights = [model.v_template[side, 1].mean() for side in sides]
     return sides if heights[0] > heights[1] else sides[::-1]
-
-
-def _opened_lips(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs of nearest vertices of the lips, of which jawOpen moves one and leaves the
-    other."""
-    column = model.n_identity + model.expression_names.index("jawOpen")
-    lips = model.masks["lips"]
-    opened = np.linalg.norm(model.shapedirs[lips, :, column], axis=1)
-    upper, lower = lips[opened < opened.max() / 4], lips[opened > opened.max() / 2]
-    distances = np.linalg.norm(model.v_template[upper, None] - model.v_template[lower], axis=2)
-    near = np.flatnonzero(distances.min(axis=1) < MAX_LIP_DISTANCE_M)
-    return upper[near], lower[distances[near].argmin(axis=1)]
 
 
 def teeth_faces(first: int) -> np.ndarray:
@@ -153,8 +142,7 @@ def teeth_faces(first: int) -> np.ndarray:
 
 
 def _mouth(model: FlameModel) -> _Mouth:
-    """Rings of neighbours from the mesh's foremost hole outwards, up to the one that lies foremost
-    on average."""
+    """Rings of neighbours from the mesh's foremost hole up to the one that lies foremost."""
     faces = model.faces[(model.faces < TEMPLATE_VERTICES).all(axis=1)]
     depth = model.v_template[:, 2]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
@@ -162,7 +150,8 @@ def _mouth(model: FlameModel) -> _Mouth:
     holes = [hole for hole in _holes(edges) if depth[hole].mean() > depth[faces].mean()]
     if not holes:
         raise StgaError(
-            "teeth: the FLAME model's mesh has a closed mouth, expected one that is open at the throat"
+            "teeth: the FLAME model's mesh has a closed mouth, "
+            "expected one that is open at the throat"
         )
     rings = [max(holes, key=lambda hole: float(depth[hole].mean()))]
     reached = np.zeros(len(model.v_template), bool)
@@ -174,7 +163,9 @@ def _mouth(model: FlameModel) -> _Mouth:
             break
         rings.append(ring)
     lips = _ring_order(edges, rings[-1])
-    return _Mouth(tuple(rings), _from_corner(model.v_template, lips))
+    x = model.v_template[lips, 0]  # from the left corner on; the right one is half a ring further
+    lips = np.roll(lips, -int((x - np.roll(x, len(lips) // 2)).argmax()))
+    return _Mouth(tuple(rings), lips)
 
 
 def _holes(edges: np.ndarray) -> list[np.ndarray]:
@@ -194,8 +185,7 @@ def _holes(edges: np.ndarray) -> list[np.ndarray]:
 
 
 def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """The vertices of a ring in order around it. Raises StgaError where the edges among them are
-    not one ring."""
+    """A ring's vertices in order. Raises StgaError where the edges among them are no ring."""
     inside = edges[np.isin(edges, ring).all(axis=1)]
     beside: dict[int, set[int]] = {vertex: set() for vertex in ring.tolist()}
     for one, other in inside.tolist():
@@ -208,17 +198,10 @@ def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
         left.discard(ordered[-1])
     if left or len(ring) % 2 or any(len(others) != 2 for others in beside.values()):
         raise StgaError(
-            "teeth: the FLAME model's mesh has no ring of vertices around its lips, expected FLAME's mesh"
+            "teeth: the FLAME model's mesh has no ring of vertices around its lips, "
+            "expected FLAME's mesh"
         )
     return np.array(ordered)
-
-
-def _from_corner(vertices: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """The ring (N,) from the person's left corner of the mouth on; the right one is N / 2
-    further."""
-    half = len(ring) // 2
-    x = vertices[ring, 0]
-    return np.roll(ring, -int((x - np.roll(x, half)).argmax()))
 
 
 def _positions(vertices: np.ndarray, mouth: _Mouth) -> np.ndarray:
@@ -255,9 +238,8 @@ def _arch(half_width: float, curvature: float) -> tuple[np.ndarray, np.ndarray]:
     x = (x - x[::-1]) / 2
     zero = np.zeros_like(x)
     normals = np.stack([2 * curvature * x, zero, zero + 1], axis=1)
-    return np.stack([x, zero, -curvature * x**2], axis=1), normals / np.linalg.norm(
-        normals, axis=1, keepdims=True
-    )
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.stack([x, zero, -curvature * x**2], axis=1), normals
 
 
 def _followed(points: np.ndarray, displacements: np.ndarray, teeth: np.ndarray) -> np.ndarray:

@@ -66,9 +66,7 @@ class _Scalar(_Inert):
     source = "numpy.scalar"
 
 
-class _Buffer(_Inert):
-    """An array of pickle protocol 5: arguments are buffer, dtype, shape, order."""
-
+class _Buffer(_Inert):  # an array of pickle protocol 5: buffer, dtype, shape, order
     source = "numpy.frombuffer"
 
 
@@ -81,12 +79,13 @@ class _Chumpy(_Inert):
     source = "chumpy"
 
 
+CORES, BUILTINS = ("numpy.core", "numpy._core"), ("__builtin__", "builtins")
 GLOBALS: dict[str, type] = {
     "numpy.ndarray": _Array,
     "numpy.dtype": _Dtype,
-    **{f"{core}.multiarray.scalar": _Scalar for core in ("numpy.core", "numpy._core")},
-    **{f"{core}.numeric._frombuffer": _Buffer for core in ("numpy.core", "numpy._core")},
-    **{f"{module}.object": _Inert for module in ("__builtin__", "builtins")},
+    **{f"{core}.multiarray.scalar": _Scalar for core in CORES},
+    **{f"{core}.numeric._frombuffer": _Buffer for core in CORES},
+    **{f"{module}.object": _Inert for module in BUILTINS},
 }
 
 
@@ -95,8 +94,7 @@ class _Refused(Exception):
 
 
 class _Function:
-    """A function that a pickle may call but not change: BUILD would write into the `__dict__` of a
-    plain one."""
+    """A function that a pickle may call but not change: BUILD would write into its `__dict__`."""
 
     __slots__ = ("_call",)
 
@@ -116,12 +114,10 @@ class _RestrictedUnpickler(pickle.Unpickler):
         functions: dict[str, Callable[..., Any]] = {
             "_codecs.encode": self.encode,
             "collections.OrderedDict": OrderedDict,
-            **{
-                f"{core}.multiarray._reconstruct": self.array_shell
-                for core in ("numpy.core", "numpy._core")
-            },
+            # numpy's own would allocate the shape at once; the contents arrive with the state
+            **{f"{core}.multiarray._reconstruct": lambda *_: _Array() for core in CORES},
             **{f"{module}._reconstructor": self.rebuild for module in ("copy_reg", "copyreg")},
-            **{f"{module}.set": set for module in ("__builtin__", "builtins")},
+            **{f"{module}.set": set for module in BUILTINS},
         }
         self.functions = {name: _Function(call) for name, call in functions.items()}
 
@@ -139,11 +135,6 @@ class _RestrictedUnpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> Any:
         raise pickle.UnpicklingError("asks for objects outside the file")
-
-    def array_shell(self, kind: Any, shape: Any, dtype: Any) -> _Array:
-        # numpy's own reconstructor would allocate `shape` at once; the contents arrive with the
-        # state.
-        return _Array()
 
     def rebuild(self, kind: Any, base: Any, state: Any) -> _Inert:
         if not (isinstance(kind, type) and issubclass(kind, _Inert)):
@@ -165,64 +156,50 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     truncated, too large, no dictionary of arrays, or asks for any other class (named in the
     message).
     """
-    loaded = _load(path)
+    data = read_bytes(path, MAX_FILE_BYTES)
+    try:
+        for opcode, slot, _ in pickletools.genops(data):
+            # the C unpickler allocates a table of as many memo slots as are named
+            if slot is not None and "PUT" in opcode.name and not 0 <= int(slot) <= len(data):
+                raise pickle.UnpicklingError(f"memo slot {slot} in a file of {len(data)} bytes")
+        loaded = _RestrictedUnpickler(data).load()
+    except _Refused as error:
+        raise StgaError(
+            f"{path}: asks for the class {error}, refused: only arrays are read"
+        ) from error
+    except Exception as error:  # a damaged pickle raises anything from the opcodes that it spells
+        reason = str(error) or type(error).__name__
+        raise StgaError(f"{path}: is not a readable pickle of arrays ({reason})") from error
     if not isinstance(loaded, dict):
         raise StgaError(f"{path}: holds a {type(loaded).__name__}, expected a dictionary of arrays")
     arrays = {}
     for key in names if names is not None else [name for name in loaded if isinstance(name, str)]:
         folder, _, name = ("", "", key) if key in loaded else key.rpartition("/")
-        entries = _entries(loaded, folder)
-        if name in entries:
-            try:
-                arrays[key] = _dense(entries[name])
-            except _NotAnArray as error:
-                raise StgaError(
-                    f"{path}: {key} is {error}, expected an array of numbers"
-                ) from error
-            except Exception as error:
-                # Shapes, indices and states are whatever the file says, of any type and size.
-                raise StgaError(
-                    f"{path}: {key} is malformed ({error}), expected an array of numbers"
-                ) from error
+        entries = loaded
+        for part in folder.split("/") if folder else ():
+            found = entries.get(part)
+            entries = found if isinstance(found, dict) else {}
+        if name not in entries:
+            continue
+        try:
+            arrays[key] = _dense(entries[name])
+        except Exception as error:  # shapes, indices and states are whatever the file says
+            wrong = error if isinstance(error, _NotAnArray) else f"malformed ({error})"
+            raise StgaError(f"{path}: {key} is {wrong}, expected an array of numbers") from error
     return arrays
-
-
-def _entries(loaded: dict[Any, Any], folder: str) -> dict[Any, Any]:
-    """The dictionary at a path of keys such as "a/b"; empty where there is none."""
-    for part in folder.split("/") if folder else ():
-        found = loaded.get(part)
-        loaded = found if isinstance(found, dict) else {}
-    return loaded
-
-
-def _load(path: Path) -> Any:
-    data = read_bytes(path, MAX_FILE_BYTES)
-    try:
-        _check_instructions(data)
-        return _RestrictedUnpickler(data).load()
-    except _Refused as error:
-        raise StgaError(
-            f"{path}: asks for the class {error}, refused: only arrays are read"
-        ) from error
-    except Exception as error:
-        # A damaged pickle can raise nearly anything from the opcodes it happens to spell.
-        reason = str(error) or type(error).__name__
-        raise StgaError(f"{path}: is not a readable pickle of arrays ({reason})") from error
-
-
-def _check_instructions(data: bytes) -> None:
-    """Refuse memo slots beyond the file's length, for which the C unpickler would allocate a
-    table."""
-    for opcode, argument, _ in pickletools.genops(data):
-        if argument is not None and "PUT" in opcode.name and not 0 <= int(argument) <= len(data):
-            raise pickle.UnpicklingError(f"memo slot {argument} in a file of {len(data)} bytes")
 
 
 def _dense(value: Any) -> np.ndarray:
     if isinstance(value, _Array):
-        return _array(value)
+        if not isinstance(value.state, tuple) or len(value.state) < 4:
+            raise _NotAnArray("an incomplete array")
+        shape, dtype, fortran, raw = value.state[-4:]
+        return _from_bytes(raw, _dtype(dtype), shape, "F" if fortran else "C")
     if isinstance(value, _Buffer):
-        return _from_buffer(value)
+        if len(value.arguments) != 4:
+            raise _NotAnArray("an incomplete array")
+        raw, dtype, shape, order = value.arguments
+        return _from_bytes(raw, _dtype(dtype), shape, "F" if order == "F" else "C")
     if isinstance(value, _Scalar) and len(value.arguments) == 2:
         return _from_bytes(value.arguments[1], _dtype(value.arguments[0]), (), "C")
     if isinstance(value, _Sparse):
@@ -237,21 +214,6 @@ def _dense(value: Any) -> np.ndarray:
         if plain.dtype.kind in "biuf":
             return plain
     raise _NotAnArray(f"a {value.source if isinstance(value, _Inert) else type(value).__name__}")
-
-
-def _array(value: _Array) -> np.ndarray:
-    state = value.state
-    if not isinstance(state, tuple) or len(state) < 4:
-        raise _NotAnArray("an incomplete array")
-    shape, dtype, fortran, raw = state[-4:]
-    return _from_bytes(raw, _dtype(dtype), shape, "F" if fortran else "C")
-
-
-def _from_buffer(value: _Buffer) -> np.ndarray:
-    if len(value.arguments) != 4:
-        raise _NotAnArray("an incomplete array")
-    raw, dtype, shape, order = value.arguments
-    return _from_bytes(raw, _dtype(dtype), shape, "F" if order == "F" else "C")
 
 
 def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.ndarray:
@@ -272,12 +234,10 @@ def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.nd
 
 def _dtype(value: Any) -> np.dtype[Any]:
     code = value.arguments[0] if isinstance(value, _Dtype) and value.arguments else None
-    if not isinstance(code, str) or not re.fullmatch(r"[iuf][1248]|b1", code):
-        raise _NotAnArray(
-            f"an array of type {code}" if isinstance(code, str) else "an array of unknown type"
-        )
-    if code == "f1":
-        raise _NotAnArray("an array of type f1")
+    if not isinstance(code, str):
+        raise _NotAnArray("an array of unknown type")
+    if not re.fullmatch(r"[iu][1248]|f[248]|b1", code):
+        raise _NotAnArray(f"an array of type {code}")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
     return np.dtype(code).newbyteorder(">" if order == ">" else "<")
 
@@ -285,40 +245,32 @@ def _dtype(value: Any) -> np.dtype[Any]:
 def _sparse(value: _Sparse) -> np.ndarray:
     """Dense (rows, columns) matrix of a pickled compressed or coordinate matrix."""
     state = value.state if isinstance(value.state, dict) else {}
-    shape = state.get("_shape", state.get("shape"))
-    if (
-        not isinstance(shape, tuple)
-        or len(shape) != 2
-        or not all(isinstance(n, int) and n >= 0 for n in shape)
-    ):
+    shape: Any = state.get("_shape", state.get("shape"))
+    is_shape = isinstance(shape, tuple) and len(shape) == 2
+    if not is_shape or not all(isinstance(n, int) and n >= 0 for n in shape):
         raise _NotAnArray("a sparse matrix without a shape")
     if math.prod(shape) > MAX_DENSE_ELEMENTS:
         raise _NotAnArray(f"a sparse matrix of shape {shape}, too large to fill in")
     data = _dense(state.get("data"))
-    rows, columns = _sparse_indices(value.format, state)
+    if value.format == "coo":
+        coords = state.get("coords", ())
+        pair = coords if len(coords) == 2 else (state.get("row"), state.get("col"))
+        rows, columns = map(_integers, pair)
+    else:
+        inner, starts = _integers(state.get("indices")), _integers(state.get("indptr"))
+        counts = np.diff(starts)
+        if len(starts) == 0 or (counts < 0).any() or counts.sum() != len(inner):
+            raise _NotAnArray("a sparse matrix whose index pointers do not match its indices")
+        outer = np.repeat(np.arange(len(counts)), counts)
+        rows, columns = (inner, outer) if value.format == "csc" else (outer, inner)
     if not (data.shape == rows.shape == columns.shape):
         raise _NotAnArray("a sparse matrix whose indices do not match its data")
-    if len(data) and (
-        min(rows.min(), columns.min()) < 0 or rows.max() >= shape[0] or columns.max() >= shape[1]
-    ):
-        raise _NotAnArray("a sparse matrix with indices outside its shape")
+    for indices, size in zip((rows, columns), shape, strict=True):
+        if len(data) and not 0 <= indices.min() <= indices.max() < size:
+            raise _NotAnArray("a sparse matrix with indices outside its shape")
     dense = np.zeros(shape, np.float64)
-    # a sparse matrix may hold an entry twice, meaning their sum
-    np.add.at(dense, (rows, columns), data)
+    np.add.at(dense, (rows, columns), data)  # an entry may be there twice, meaning their sum
     return dense
-
-
-def _sparse_indices(layout: str, state: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    if layout == "coo":
-        if "coords" in state and len(state["coords"]) == 2:
-            return _integers(state["coords"][0]), _integers(state["coords"][1])
-        return _integers(state.get("row")), _integers(state.get("col"))
-    inner, starts = _integers(state.get("indices")), _integers(state.get("indptr"))
-    counts = np.diff(starts)
-    if len(starts) == 0 or (counts < 0).any() or counts.sum() != len(inner):
-        raise _NotAnArray("a sparse matrix whose index pointers do not match its indices")
-    outer = np.repeat(np.arange(len(counts)), counts)
-    return (inner, outer) if layout == "csc" else (outer, inner)
 
 
 def _integers(value: Any) -> np.ndarray:
@@ -335,15 +287,11 @@ def _chumpy(value: _Chumpy) -> np.ndarray:
         return _dense(state["x"])
     if "a" in state and "idxs" in state:
         source, chosen = _dense(state["a"]).ravel(), _dense(state["idxs"])
-        if chosen.dtype.kind not in "iu" or (
-            chosen.size and not 0 <= chosen.min() <= chosen.max() < source.size
-        ):
+        inside = not chosen.size or 0 <= chosen.min() <= chosen.max() < source.size
+        if chosen.dtype.kind not in "iu" or not inside:
             raise _NotAnArray(f"a {value.source} with indices outside its array")
         picked: np.ndarray = source[chosen]
-        shape = state.get("preferred_shape")
-        return (
-            picked.reshape(shape)
-            if isinstance(shape, tuple) and math.prod(shape) == picked.size
-            else picked
-        )
+        shape: Any = state.get("preferred_shape")
+        fits = isinstance(shape, tuple) and math.prod(shape) == picked.size
+        return picked.reshape(shape) if fits else picked
     raise _NotAnArray(f"a {value.source}, whose value is not stored in the file")

@@ -18,7 +18,7 @@ from ..flame.sequence import FRAME_FIELDS, FlameSequence
 from ..flame.teeth import flame_model
 from ..options import like, option
 from ..progress import Progress, Report, Say
-from ..tracking.footage.file_types import is_video
+from ..tracking.footage.sources import is_video
 from .avatar_source import findings, motion_options_field
 from .results import Written
 from .train import Train

@@ -1,5 +1,4 @@
-"""Appearance of a head's surface points: sampled in pyramids of calibrated images, freed of
-lighting, averaged."""
+"""Appearance of a head's surface points: sampled in image pyramids, freed of lighting, averaged."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +11,9 @@ from ..capture.camera import Camera
 LEVELS_M = (0.0012, 0.0024, 0.0048, 0.0096)
 """Pixel sizes of the pyramid at the head."""
 BLUR_PX = 0.8
-"""Standard deviation of the blur at every level, so that differences of neighboring pixels are
-derivatives."""
+"""Standard deviation of the blur, so that differences of neighboring pixels are derivatives."""
 DETAIL_PX = 2.5
-"""Standard deviation of the neighborhood whose mean is taken off the luma: what is left hardly
-depends on lighting."""
+"""Of the neighborhood whose mean is taken off the luma: the rest hardly depends on lighting."""
 COLORS = np.array([[0.299, 0.587, 0.114], [0.8, -0.8, 0.0]], np.float32)
 """Luma, and redness, in which lips differ from skin."""
 CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
@@ -24,8 +21,7 @@ CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
 NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
-"""Weight of the camera's usual lighting in that of a view, as a share of the information of all
-points."""
+"""Weight of the camera's usual lighting in a view's, as a share of the points' information."""
 LIGHT_ITERATIONS, TEXTURE_ITERATIONS, MEAN_ITERATIONS = 2, 4, 3
 ALBEDO_SCALE, TEXTURE_SCALE = 6 * NOISE_LEVELS, 4 * NOISE_LEVELS
 LIGHT_SCALE, MEAN_SCALE = 2 * NOISE_LEVELS, 3 * NOISE_LEVELS
@@ -33,8 +29,7 @@ LIGHT_SCALE, MEAN_SCALE = 2 * NOISE_LEVELS, 3 * NOISE_LEVELS
 as it is found, the texture, and the mean."""
 MIN_SHADING, MAX_SHADING = 0.2, 4.0
 OWN_VIEW_PRIOR = 6.0
-"""Observations of all cameras that count beside a camera's own in its texture: skin shines
-differently to each side."""
+"""Observations of all cameras beside a camera's own: skin shines differently to each side."""
 MAX_DEVIATION_LEVELS = 60.0
 MAX_SAMPLES = 1 << 14
 """Of an image at a time: OpenCV takes less than 2^15."""
@@ -44,8 +39,7 @@ MIN_OBSERVATIONS = 1.0
 
 @dataclass(frozen=True)
 class Level:
-    """An image of the pyramid: camera, channels (H, W, 3), and their derivatives by x and y (2, H,
-    W, 3), float32."""
+    """An image: camera, channels (H, W, 3), derivatives by x and y (2, H, W, 3); float32."""
 
     camera: Camera
     channels: np.ndarray
@@ -79,8 +73,7 @@ class Texture:
 
 
 def pyramid(camera: Camera, image: np.ndarray, center: np.ndarray) -> list[Level]:
-    """Levels of an image (H, W, 3) uint8 with pixels of LEVELS_M at `center` (3,), or its own where
-    they are larger."""
+    """Levels of an image (H, W, 3) uint8: pixels of LEVELS_M at `center` (3,), or larger ones."""
     import cv2
 
     pixel = float(camera.project(center[None])[1][0]) / camera.fl_x
@@ -90,15 +83,11 @@ def pyramid(camera: Camera, image: np.ndarray, center: np.ndarray) -> list[Level
         image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
         colors = cv2.GaussianBlur(image.astype(np.float32) @ COLORS.T, (0, 0), BLUR_PX)
         luma = colors[..., 0]
-        channels = np.stack(
-            [luma, luma - cv2.GaussianBlur(luma, (0, 0), DETAIL_PX), colors[..., 1]], axis=2
-        )
+        detail = luma - cv2.GaussianBlur(luma, (0, 0), DETAIL_PX)
+        channels = np.stack([luma, detail, colors[..., 1]], axis=2)
         along = np.array([[-0.5, 0, 0.5]], np.float32)
-        levels.append(
-            Level(
-                small, channels, np.stack([cv2.filter2D(channels, -1, k) for k in (along, along.T)])
-            )
-        )
+        gradient = np.stack([cv2.filter2D(channels, -1, own) for own in (along, along.T)])
+        levels.append(Level(small, channels, gradient))
     return levels
 
 
@@ -109,13 +98,9 @@ def sampled(images: Sequence[np.ndarray], pixels: np.ndarray) -> list[np.ndarray
 
     if not len(pixels):
         return [np.zeros((0, *image.shape[2:]), np.float32) for image in images]
-    at = np.clip(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, images[0].shape[1::-1]).astype(
-        np.float32
-    )
-    parts = [
-        (part[None, :, 0], part[None, :, 1])
-        for part in np.array_split(at, max(1, -(-len(at) // MAX_SAMPLES)))
-    ]
+    at = np.clip(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, images[0].shape[1::-1])
+    split = np.array_split(at.astype(np.float32), max(1, -(-len(at) // MAX_SAMPLES)))
+    parts = [(part[None, :, 0], part[None, :, 1]) for part in split]
     border: dict[str, Any] = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
     return [
         np.concatenate([cv2.remap(image, *part, **border)[0] for part in parts]) for image in images
@@ -125,9 +110,8 @@ def sampled(images: Sequence[np.ndarray], pixels: np.ndarray) -> list[np.ndarray
 def light_basis(normals: np.ndarray) -> np.ndarray:
     """(N, 9) spherical harmonics up to order 2 of unit normals (N, 3), unscaled."""
     x, y, z = normals.T
-    return np.stack(
-        [np.ones(len(x)), x, y, z, x * y, y * z, x * z, x * x - y * y, z * z - 1 / 3], axis=1
-    )
+    second = [x * y, y * z, x * z, x * x - y * y, z * z - 1 / 3]
+    return np.stack([np.ones(len(x)), x, y, z, *second], axis=1)
 
 
 def shading(basis: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -183,38 +167,22 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
             own = [light for light, s in zip(found, samples, strict=True) if s.camera == name]
             lights[name] = np.median(own, axis=0)
         factors = [shading(s.basis, light) for s, light in zip(samples, found, strict=True)]
-        lit = [
-            [level / factor for level in s.values]
-            for s, factor in zip(samples, factors, strict=True)
-        ]
+        both = list(zip(samples, factors, strict=True))
+        lit = [[level / factor for level in s.values] for s, factor in both]
         values = [_robust_mean([own[level] for own in lit], weight) for level in range(len(lit[0]))]
     difference = np.abs(np.stack([own[0] for own in lit]) - values[0])[..., 1:].max(2)
-    deviation = (weight * np.minimum(difference, MAX_DEVIATION_LEVELS)).sum(0) / np.maximum(
-        weight.sum(0), 1e-9
-    )
+    deviation = (weight * np.minimum(difference, MAX_DEVIATION_LEVELS)).sum(0)
+    deviation = deviation / np.maximum(weight.sum(0), 1e-9)
     trust = np.where(known, 1 / (1 + (deviation / TEXTURE_SCALE) ** 2), 0.0)
-    by_camera = {name: _own_texture(name, samples, lit, weight, values) for name in lights}
+    by_camera: dict[bytes, list[np.ndarray]] = {}
+    for name in lights:  # what one camera sees, drawn to what all do
+        rows = [row for row, own in enumerate(samples) if own.camera == name]
+        share, by_camera[name] = weight[rows].sum(0)[:, None], []
+        for level, every in enumerate(values):
+            mean = _robust_mean([lit[row][level] for row in rows], weight[rows], every)
+            mean = (share * mean + OWN_VIEW_PRIOR * every) / (share + OWN_VIEW_PRIOR)
+            by_camera[name].append(mean)
     return Texture(by_camera, lights, trust)
-
-
-def _own_texture(
-    name: bytes,
-    samples: Sequence[Sample],
-    lit: Sequence[Sequence[np.ndarray]],
-    weight: np.ndarray,
-    values: Sequence[np.ndarray],
-) -> list[np.ndarray]:
-    """By level, the texture (N, 3) that one camera sees, drawn to that of all: `values`."""
-    rows = [row for row, own in enumerate(samples) if own.camera == name]
-    share = weight[rows].sum(0)[:, None]
-    return [
-        (
-            share * _robust_mean([lit[row][level] for row in rows], weight[rows], every)
-            + OWN_VIEW_PRIOR * every
-        )
-        / (share + OWN_VIEW_PRIOR)
-        for level, every in enumerate(values)
-    ]
 
 
 def _robust_mean(
@@ -222,24 +190,16 @@ def _robust_mean(
 ) -> np.ndarray:
     """(N, 3) of M values (N, 3) with weights (M, N), from the weighted median on; outliers by
     detail and redness."""
-    stacked = np.stack(values)
-    mean = _weighted_median(stacked, weight) if start is None else start
+    stacked, mean = np.stack(values), start
+    if mean is None:
+        order = np.argsort(stacked, axis=0)
+        ordered = np.take_along_axis(stacked, order, axis=0)
+        weights = np.repeat(weight[..., None], stacked.shape[2], 2)
+        share = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+        middle = np.minimum((share < 0.5 * share[-1:]).sum(0), len(values) - 1)
+        mean = np.take_along_axis(ordered, middle[None], axis=0)[0]
     for _ in range(MEAN_ITERATIONS):
         used = weight * robust(np.abs(stacked - mean)[..., 1:].max(2), MEAN_SCALE)
-        total = used.sum(0)[:, None]
-        mean = np.where(
-            total > 1e-6, (used[..., None] * stacked).sum(0) / np.maximum(total, 1e-6), mean
-        )
+        total, mass = (used[..., None] * stacked).sum(0), used.sum(0)[:, None]
+        mean = np.where(mass > 1e-6, total / np.maximum(mass, 1e-6), mean)
     return np.asarray(mean)
-
-
-def _weighted_median(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    order = np.argsort(values, axis=0)
-    ordered = np.take_along_axis(values, order, axis=0)
-    share = np.cumsum(
-        np.take_along_axis(np.repeat(weight[..., None], values.shape[2], 2), order, axis=0), axis=0
-    )
-    middle = (share < 0.5 * share[-1:]).sum(0)
-    return np.asarray(
-        np.take_along_axis(ordered, np.minimum(middle, len(values) - 1)[None], axis=0)[0]
-    )

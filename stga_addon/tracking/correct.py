@@ -15,11 +15,11 @@ from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
-from .contact_sheet import write_contact_sheet
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
 from .footage.model import Footage
 from .footage.open import open_footage
 from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
+from .pictures import write_contact_sheet
 from .posed_points import PosedPoints, SurfacePoints
 from .solve import LANDMARK_SIGMA_M, acceleration_precision
 from .write_capture import moving_arrays
@@ -51,16 +51,18 @@ def correct_capture(
     places, used = read_places(out / LANDMARKS_FOLDER / PLACES_FILE, len(capture.flame.model.faces))
     timesteps, solved = _solved(out, capture.flame)
     rows = _rows(out, timesteps, keys, solved.shape[1])
-    seen = _with_landmarks(out, timesteps)
+    report_file = read_json(out / REPORT_FILE)
+    trust = _trust(out / REPORT_FILE, report_file, timesteps)
     footage = open_footage(out)
-    footage = replace(
-        footage, cameras=tuple(sorted(footage.cameras, key=lambda camera: camera.name))
-    )
-    found = _landmarks(out, footage, places, used)
+    by_name = tuple(sorted(footage.cameras, key=lambda camera: camera.name))
+    footage = replace(footage, cameras=by_name)
+    found = read_landmarks(footage, out / LANDMARKS_FOLDER)
+    check_count(found, places)
+    if not any(own.confidence.any() and own.confidence[:, used].any() for own in found.values()):
+        raise StgaError(f"{out / LANDMARKS_FOLDER}: has no landmarks of a face")
     report("Solve", 0, 1)
     person = with_identity(capture.flame).model
     chosen = SurfacePoints(places.face[used], places.barycentric[used])
-    trust = np.where(seen, _explained(out, timesteps), 0.0)
     heads = corrected(person, chosen, solved, trust, rows, span)
     write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
     for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
@@ -68,7 +70,7 @@ def correct_capture(
         write_npz(path, {**read_npz(path), **moving_arrays(values)})  # identity and offsets stay
         report("Heads", number + 1, len(timesteps))
     report("Contact sheet", 0, 1)
-    _report_errors(out, open_capture(out, model), footage, found, places, used)
+    _report_errors(out, report_file, open_capture(out, model), footage, found, places, used)
 
 
 def corrected(
@@ -102,12 +104,17 @@ def corrected(
     shares = trust[near] * (distance[near] / (span + 1)) ** 2
     # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter
     # for translation.
-    blocks = [
-        share * _stiffness(model, points, solved[row]) + np.eye(size)
-        for row, share in zip(near, shares, strict=True)
-    ]
+    blocks, posed = [], PosedPoints(model, points)
+    for row, share in zip(near, shares, strict=True):
+        _, jacobian = posed.linearized(solved[row, :-RIGID_SIZE], solved[row, -RIGID_SIZE:])
+        flat = jacobian.reshape(-1, size) / LANDMARK_SIGMA_M
+        blocks.append(share * (flat.T @ flat) + np.eye(size))
     matrix = block_diag(blocks)
-    second = _second_differences(near)
+    # second differences of three rows that follow each other
+    middle = 1 + np.flatnonzero((np.diff(near)[:-1] == 1) & (np.diff(near)[1:] == 1))
+    at = np.tile(np.arange(len(middle)), 3), np.concatenate([middle - 1, middle, middle + 1])
+    values = np.repeat([1.0, -2.0, 1.0], len(middle))
+    second = csc_matrix((values, at), shape=(len(middle), len(near)))
     matrix = matrix + kron(second.T @ second, diags(acceleration_precision(model)))
     matrix = csc_matrix(matrix)
     open_ = np.repeat(free[near], size)
@@ -117,29 +124,6 @@ def corrected(
         flat[open_] = spsolve(matrix[open_][:, open_], right)
         change[near] = flat.reshape(-1, size)
     return np.asarray(solved + change)
-
-
-def _second_differences(rows: np.ndarray) -> Any:
-    """Sparse (D, N): the second differences of values at N ascending rows, of which three follow
-    each other."""
-    from scipy.sparse import csc_matrix
-
-    middle = 1 + np.flatnonzero((np.diff(rows)[:-1] == 1) & (np.diff(rows)[1:] == 1))
-    number = np.arange(len(middle))
-    at = np.tile(number, 3), np.concatenate([middle - 1, middle, middle + 1])
-    return csc_matrix(
-        (np.repeat([1.0, -2.0, 1.0], len(middle)), at), shape=(len(middle), len(rows))
-    )
-
-
-def _stiffness(model: FlameModel, points: SurfacePoints, parameters: np.ndarray) -> np.ndarray:
-    """(E + 18, E + 18): how much a change of each parameter moves the points, in standard
-    deviations of a landmark."""
-    _, jacobian = PosedPoints(model, points).linearized(
-        parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
-    )
-    flat = jacobian.reshape(-1, jacobian.shape[2]) / LANDMARK_SIGMA_M
-    return np.asarray(flat.T @ flat)
 
 
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
@@ -168,71 +152,43 @@ def _are_parameters(values: np.ndarray | None, shape: tuple[int, ...]) -> bool:
 def _rows(
     out: Path, timesteps: list[int], keys: Mapping[int, np.ndarray], size: int
 ) -> dict[int, np.ndarray]:
-    """The keys by row instead of timestep. Raises StgaError for one of no timestep, or that poses
-    no head."""
+    """The keys by row. Raises StgaError for one of no timestep, or that poses no head."""
     unknown = sorted(set(keys) - set(timesteps))
     if unknown:
         raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
     for timestep, values in keys.items():
         if not _are_parameters(values, (size,)):
             raise StgaError(f"key at timestep {timestep}: expected {(size,)} finite numbers")
-    return {
-        timesteps.index(timestep): values.astype(np.float64) for timestep, values in keys.items()
-    }
-
-
-def _with_landmarks(out: Path, timesteps: list[int]) -> np.ndarray:
-    """(T,) bool. Raises StgaError where the report does not list the timesteps without."""
-    report = read_json(out / REPORT_FILE)
-    interpolated = report.get("interpolated") if isinstance(report, dict) else None
-    if not isinstance(interpolated, list) or not all(
-        type(timestep) is int for timestep in interpolated
-    ):
-        raise StgaError(
-            f"{out / REPORT_FILE}: interpolated: expected timesteps, got {shorten(interpolated)}"
-        )
-    without = set(interpolated)
-    return np.array([timestep not in without for timestep in timesteps])
-
-
-def _landmarks(
-    out: Path, footage: Footage, places: SurfacePoints, used: np.ndarray
-) -> dict[str, CameraLandmarks]:
-    """What the capture was tracked from. Raises StgaError where it fits neither the head model's
-    file nor a face."""
-    found = read_landmarks(footage, out / LANDMARKS_FOLDER)
-    check_count(found, places)
-    if not any(own.confidence.any() and own.confidence[:, used].any() for own in found.values()):
-        raise StgaError(f"{out / LANDMARKS_FOLDER}: has no landmarks of a face")
-    return found
+    return {timesteps.index(t): values.astype(np.float64) for t, values in keys.items()}
 
 
 def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
-    """Region -> timestep -> share of the images that is not explained, of a report; empty where it
-    has none."""
+    """Region -> timestep -> share of the images not explained, of a report that has one."""
     return {
         name: {int(t): float(value) for t, value in own.items()}
         for name, own in report.get("image_misfit", {}).items()
     }
 
 
-def _explained(out: Path, timesteps: Sequence[int]) -> np.ndarray:
-    """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain; 1 where that
-    is not known."""
+def _trust(path: Path, report: Any, timesteps: Sequence[int]) -> np.ndarray:
+    """(T,) from 0 to 1: share of the images that the timesteps' worst regions explain, 1 where that
+    is not known; 0 without landmarks. Raises StgaError where the report says neither."""
+    without = report.get("interpolated") if isinstance(report, dict) else None
+    if not isinstance(without, list) or not all(type(timestep) is int for timestep in without):
+        raise StgaError(f"{path}: interpolated: expected timesteps, got {shorten(without)}")
     try:
-        misfit = _misfit(read_json(out / REPORT_FILE))
+        misfit = _misfit(report)
         worst = [max((own.get(t, 0.0) for own in misfit.values()), default=0.0) for t in timesteps]
         if not np.isfinite(worst).all():
             raise ValueError
     except (ValueError, TypeError, AttributeError) as error:
-        raise StgaError(
-            f"{out / REPORT_FILE}: image_misfit: expected shares by region and timestep"
-        ) from error
-    return 1 - np.clip(worst, 0.0, 1.0)
+        raise StgaError(f"{path}: image_misfit: expected shares by region and timestep") from error
+    return np.where(np.isin(timesteps, list(set(without))), 0.0, 1 - np.clip(worst, 0.0, 1.0))
 
 
 def _report_errors(
     out: Path,
+    report: dict[str, Any],
     capture: Capture,
     footage: Footage,
     found: Mapping[str, CameraLandmarks],
@@ -243,27 +199,19 @@ def _report_errors(
     errors: dict[str, dict[int, float]] = {camera.name: {} for camera in footage.cameras}
     cameras = {camera.name: camera.camera for camera in footage.cameras}
     for name, own in found.items():
-        for timestep, pixels, confidence in zip(
-            own.timesteps.tolist(), own.points, own.confidence, strict=True
-        ):
+        rows = zip(own.timesteps.tolist(), own.points, own.confidence, strict=True)
+        for timestep, pixels, confidence in rows:
             use = used & (confidence > 0)
             if use.any():
                 head = places.on(capture.mesh(timestep), capture.faces)
                 distance = np.linalg.norm(cameras[name].project(head[use])[0] - pixels[use], axis=1)
                 errors[name][timestep] = float(np.median(distance))
-    report = read_json(out / REPORT_FILE)
-    rounded = {
+    every = [px for own in errors.values() for px in own.values()]
+    report["median_reprojection_px"] = round(float(np.median(every)), 3)
+    report["reprojection_px"] = {
         name: {str(t): round(px, 3) for t, px in own.items()} for name, own in errors.items()
     }
-    every = [px for own in errors.values() for px in own.values()]
-    write_json(
-        out / REPORT_FILE,
-        {
-            **report,
-            "median_reprojection_px": round(float(np.median(every)), 3),
-            "reprojection_px": rounded,
-        },
-    )
-    write_contact_sheet(
-        out / SHEET_FILE, footage, cameras, capture.mesh, capture.faces, errors, _misfit(report)
-    )
+    write_json(out / REPORT_FILE, report)
+    misfit = _misfit(report)
+    sheet = out / SHEET_FILE
+    write_contact_sheet(sheet, footage, cameras, capture.mesh, capture.faces, errors, misfit)

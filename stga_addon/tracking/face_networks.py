@@ -30,225 +30,40 @@ CROP_SCALE = 1.5
 """Side of the landmarks' crop, in sides of the detected box."""
 DETECTOR_SIZE_PX, CROP_SIZE_PX, PERSON_SIZE_PX = 128, 256, 256
 ANCHOR_GRIDS = ((16, 2), (8, 6))
-"""Cells along a side of the detector's grids, and anchors of a cell; an anchor is its cell's
-center."""
+"""Cells along a side of the detector's grids, and anchors of each, which are its center."""
 IRIS_CENTERS = (468, 473)
 FIRST_IRIS_POINT, MESH_POINTS = 468, 478
 """Landmarks: 468 of the skin, and five an iris of which the first is its center."""
-SCORE_POINTS = np.array(
-    [
-        "0",
-        "1",
-        "4",
-        "5",
-        "6",
-        "7",
-        "8",
-        "10",
-        "13",
-        "14",
-        "17",
-        "21",
-        "33",
-        "37",
-        "39",
-        "40",
-        "46",
-        "52",
-        "53",
-        "54",
-        "55",
-        "58",
-        "61",
-        "63",
-        "65",
-        "66",
-        "67",
-        "70",
-        "78",
-        "80",
-        "81",
-        "82",
-        "84",
-        "87",
-        "88",
-        "91",
-        "93",
-        "95",
-        "103",
-        "105",
-        "107",
-        "109",
-        "127",
-        "132",
-        "133",
-        "136",
-        "144",
-        "145",
-        "146",
-        "148",
-        "149",
-        "150",
-        "152",
-        "153",
-        "154",
-        "155",
-        "157",
-        "158",
-        "159",
-        "160",
-        "161",
-        "162",
-        "163",
-        "168",
-        "172",
-        "173",
-        "176",
-        "178",
-        "181",
-        "185",
-        "191",
-        "195",
-        "197",
-        "234",
-        "246",
-        "249",
-        "251",
-        "263",
-        "267",
-        "269",
-        "270",
-        "276",
-        "282",
-        "283",
-        "284",
-        "285",
-        "288",
-        "291",
-        "293",
-        "295",
-        "296",
-        "297",
-        "300",
-        "308",
-        "310",
-        "311",
-        "312",
-        "314",
-        "317",
-        "318",
-        "321",
-        "323",
-        "324",
-        "332",
-        "334",
-        "336",
-        "338",
-        "356",
-        "361",
-        "362",
-        "365",
-        "373",
-        "374",
-        "375",
-        "377",
-        "378",
-        "379",
-        "380",
-        "381",
-        "382",
-        "384",
-        "385",
-        "386",
-        "387",
-        "388",
-        "389",
-        "390",
-        "397",
-        "398",
-        "400",
-        "402",
-        "405",
-        "409",
-        "415",
-        "454",
-        "466",
-        "468",
-        "469",
-        "470",
-        "471",
-        "472",
-        "473",
-        "474",
-        "475",
-        "476",
-        "477",
-    ],
-    np.int64,
-)
+SCORE_POINTS = np.array([
+    0, 1, 4, 5, 6, 7, 8, 10, 13, 14, 17, 21, 33, 37, 39, 40, 46, 52, 53, 54, 55, 58, 61, 63, 65, 66,
+    67, 70, 78, 80, 81, 82, 84, 87, 88, 91, 93, 95, 103, 105, 107, 109, 127, 132, 133, 136, 144,
+    145, 146, 148, 149, 150, 152, 153, 154, 155, 157, 158, 159, 160, 161, 162, 163, 168, 172, 173,
+    176, 178, 181, 185, 191, 195, 197, 234, 246, 249, 251, 263, 267, 269, 270, 276, 282, 283, 284,
+    285, 288, 291, 293, 295, 296, 297, 300, 308, 310, 311, 312, 314, 317, 318, 321, 323, 324, 332,
+    334, 336, 338, 356, 361, 362, 365, 373, 374, 375, 377, 378, 379, 380, 381, 382, 384, 385, 386,
+    387, 388, 389, 390, 397, 398, 400, 402, 405, 409, 415, 454, 466, 468, 469, 470, 471, 472, 473,
+    474, 475, 476, 477,
+])  # fmt: skip
 """Landmarks that the scores' network takes."""
 SCORE_NAMES = [
-    "_neutral",
-    "browDownLeft",
-    "browDownRight",
-    "browInnerUp",
-    "browOuterUpLeft",
-    "browOuterUpRight",
-    "cheekPuff",
-    "cheekSquintLeft",
-    "cheekSquintRight",
-    "eyeBlinkLeft",
-    "eyeBlinkRight",
-    "eyeLookDownLeft",
-    "eyeLookDownRight",
-    "eyeLookInLeft",
-    "eyeLookInRight",
-    "eyeLookOutLeft",
-    "eyeLookOutRight",
-    "eyeLookUpLeft",
-    "eyeLookUpRight",
-    "eyeSquintLeft",
-    "eyeSquintRight",
-    "eyeWideLeft",
-    "eyeWideRight",
-    "jawForward",
-    "jawLeft",
-    "jawOpen",
-    "jawRight",
-    "mouthClose",
-    "mouthDimpleLeft",
-    "mouthDimpleRight",
-    "mouthFrownLeft",
-    "mouthFrownRight",
-    "mouthFunnel",
-    "mouthLeft",
-    "mouthLowerDownLeft",
-    "mouthLowerDownRight",
-    "mouthPressLeft",
-    "mouthPressRight",
-    "mouthPucker",
-    "mouthRight",
-    "mouthRollLower",
-    "mouthRollUpper",
-    "mouthShrugLower",
-    "mouthShrugUpper",
-    "mouthSmileLeft",
-    "mouthSmileRight",
-    "mouthStretchLeft",
-    "mouthStretchRight",
-    "mouthUpperUpLeft",
-    "mouthUpperUpRight",
-    "noseSneerLeft",
-    "noseSneerRight",
-]
+    "_neutral", "browDownLeft", "browDownRight", "browInnerUp", "browOuterUpLeft",
+    "browOuterUpRight", "cheekPuff", "cheekSquintLeft", "cheekSquintRight", "eyeBlinkLeft",
+    "eyeBlinkRight", "eyeLookDownLeft", "eyeLookDownRight", "eyeLookInLeft", "eyeLookInRight",
+    "eyeLookOutLeft", "eyeLookOutRight", "eyeLookUpLeft", "eyeLookUpRight", "eyeSquintLeft",
+    "eyeSquintRight", "eyeWideLeft", "eyeWideRight", "jawForward", "jawLeft", "jawOpen", "jawRight",
+    "mouthClose", "mouthDimpleLeft", "mouthDimpleRight", "mouthFrownLeft", "mouthFrownRight",
+    "mouthFunnel", "mouthLeft", "mouthLowerDownLeft", "mouthLowerDownRight", "mouthPressLeft",
+    "mouthPressRight", "mouthPucker", "mouthRight", "mouthRollLower", "mouthRollUpper",
+    "mouthShrugLower", "mouthShrugUpper", "mouthSmileLeft", "mouthSmileRight", "mouthStretchLeft",
+    "mouthStretchRight", "mouthUpperUpLeft", "mouthUpperUpRight", "noseSneerLeft", "noseSneerRight",
+]  # fmt: skip
 
 
 class Detector(Protocol):
     """Finds faces in an image; every face has the same N landmarks."""
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
-        """Landmarks (N, 2) in pixels of each face in an image (H, W, 3) uint8; centers lie at
-        .5."""
+        """Landmarks (N, 2) of each face in an image (H, W, 3) uint8; pixel centers lie at .5."""
 
 
 @dataclass(frozen=True)
@@ -264,8 +79,7 @@ class FaceScores:
 
 @dataclass(frozen=True)
 class _Crop:
-    """A square of an image: center (2,) and side in pixels, turned by an angle, clockwise as
-    seen."""
+    """A square of an image: center (2,) and side in pixels, turned clockwise by an angle."""
 
     center: np.ndarray
     side: float
@@ -301,54 +115,45 @@ class FaceNetworks:
 
     def _landmarks(self, image: np.ndarray, most: int) -> list[np.ndarray]:
         """(478, 3) of each face: pixels, and depth in pixels, which grows away from the camera."""
-        found = []
-        for crop in self._crops(image)[:most]:
+        found, (height, width) = [], image.shape[:2]
+        whole = _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
+        matrix, scale = whole.matrix(DETECTOR_SIZE_PX), whole.side / DETECTOR_SIZE_PX
+        small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
+        self._faces.setInput(_blob(small, low=-1.0))
+        boxes, scores = self._faces.forward(["regressors", "classificators"])
+        for box in _faces_of(np.reshape(boxes, (-1, 16)), np.ravel(scores))[:most]:
+            center, side, (right_eye, left_eye) = box[:2], box[2:4].max(), box[4:8].reshape(2, 2)
+            angle = float(np.arctan2(*(left_eye - right_eye)[::-1]))
+            center = center @ matrix[:, :2].T + matrix[:, 2]
+            crop = _Crop(center, CROP_SCALE * scale * side, angle)
             self._mesh.setInput(_blob(_resampled(image, crop.matrix(CROP_SIZE_PX), CROP_SIZE_PX)))
             points, presence = self._mesh.forward(["Identity", "Identity_1"])
             if _sigmoid(float(np.ravel(presence)[0])) < MIN_PRESENCE:
                 continue
             points = np.reshape(points, (MESH_POINTS, 3)).astype(np.float64)
-            matrix, scale = crop.matrix(CROP_SIZE_PX), crop.side / CROP_SIZE_PX
-            flat = points[:, :2] @ matrix[:, :2].T + matrix[:, 2]
-            found.append(np.column_stack([flat, points[:, 2] * scale]))
+            to_image = crop.matrix(CROP_SIZE_PX)
+            flat = points[:, :2] @ to_image[:, :2].T + to_image[:, 2]
+            found.append(np.column_stack([flat, points[:, 2] * (crop.side / CROP_SIZE_PX)]))
         return found
-
-    def _crops(self, image: np.ndarray) -> list[_Crop]:
-        """Around each detected face, the clearest first."""
-        height, width = image.shape[:2]
-        whole = _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
-        matrix = whole.matrix(DETECTOR_SIZE_PX)
-        small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
-        self._faces.setInput(_blob(small, low=-1.0))
-        boxes, scores = self._faces.forward(["regressors", "classificators"])
-        scale = whole.side / DETECTOR_SIZE_PX
-        crops = []
-        for box in _faces_of(np.reshape(boxes, (-1, 16)), np.ravel(scores)):
-            center, side, (right_eye, left_eye) = box[:2], box[2:4].max(), box[4:8].reshape(2, 2)
-            angle = np.arctan2(*(left_eye - right_eye)[::-1])
-            center = center @ matrix[:, :2].T + matrix[:, 2]
-            crops.append(_Crop(center, CROP_SCALE * scale * side, float(angle)))
-        return crops
 
     @cached_property
     def _faces(self) -> Any:
-        return _network(_face_part("face_detector.tflite"))
+        return _face_network("face_detector.tflite")
 
     @cached_property
     def _mesh(self) -> Any:
-        return _network(_face_part("face_landmarks_detector.tflite"))
+        return _face_network("face_landmarks_detector.tflite")
 
     @cached_property
     def _scores(self) -> Any:
-        return _network(_face_part("face_blendshapes.tflite"))
+        return _face_network("face_blendshapes.tflite")
 
 
 class PersonNetwork:
     """Segmentation of people, in 256×256 pixels of the whole image."""
 
     def probability(self, image: np.ndarray) -> np.ndarray:
-        """(H, W) float32 in 0…1 of an image (H, W, 3) uint8: how likely each pixel shows a
-        person."""
+        """(H, W) float32, 0…1, of an image (H, W, 3) uint8: how likely a pixel shows a person."""
         import cv2
 
         size = PERSON_SIZE_PX, PERSON_SIZE_PX
@@ -367,11 +172,11 @@ def _network(data: bytes) -> Any:
     return cv2.dnn.readNetFromTFLite(np.frombuffer(data, np.uint8))
 
 
-def _face_part(name: str) -> bytes:
+def _face_network(name: str) -> Any:
     """Raises StgaError where the file was damaged or removed."""
     try:
         with zipfile.ZipFile(FACE_FILE) as archive:
-            return archive.read(name)
+            return _network(archive.read(name))
     except (OSError, KeyError, zipfile.BadZipFile) as error:
         raise StgaError(f"{FACE_FILE}: {name} cannot be read ({error}); install again") from error
 
@@ -412,7 +217,10 @@ def _faces_of(boxes: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
     left = left[share[left] >= MIN_DETECTION_SCORE]
     faces = []
     while len(left):
-        same = _overlaps(boxes[left[0]], boxes[left]) > MAX_BOX_OVERLAP
+        low, high = boxes[left, :2] - boxes[left, 2:4] / 2, boxes[left, :2] + boxes[left, 2:4] / 2
+        common = np.maximum(np.minimum(high, high[0]) - np.maximum(low, low[0]), 0).prod(axis=1)
+        area = boxes[left, 2:4].prod(axis=1)
+        same = common / np.maximum(area + area[0] - common, 1e-9) > MAX_BOX_OVERLAP
         same[0] = True
         weights = share[left[same]]
         faces.append(weights @ boxes[left[same]] / weights.sum())
@@ -429,15 +237,6 @@ def _anchors() -> np.ndarray:
         y, x = np.meshgrid(centers, centers, indexing="ij")
         rows.append(np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), count, axis=0))
     return np.concatenate(rows)
-
-
-def _overlaps(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """(N,) intersection over union of a box with others, given as center and size."""
-    low = np.maximum(box[:2] - box[2:4] / 2, boxes[:, :2] - boxes[:, 2:4] / 2)
-    high = np.minimum(box[:2] + box[2:4] / 2, boxes[:, :2] + boxes[:, 2:4] / 2)
-    common = np.maximum(high - low, 0).prod(axis=1)
-    union = box[2:4].prod() + boxes[:, 2:4].prod(axis=1) - common
-    return np.asarray(common / np.maximum(union, 1e-9))
 
 
 def _sigmoid(value: Any) -> Any:

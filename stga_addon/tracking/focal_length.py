@@ -1,5 +1,5 @@
 """Focal length of a single camera, from landmarks of a head that turns: a near head changes its
-shape in the image."""
+shape in the image; and cameras of a rig that see the head larger or smaller than the others do."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,33 +10,44 @@ from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE
 from .fit import (
+    HeadFit,
     LandmarkVisibility,
     TimestepLandmarks,
     observed_landmarks,
     rigid_start,
     triangulated,
 )
+from .footage.model import Footage
 from .head_model import HeadModel
+from .landmarks import CameraLandmarks
 from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
 
 CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
-"""Timesteps among which those of the most different turns are chosen, and how many; landmarks that
-are used."""
+"""Timesteps of which the most differently turned are chosen, and how many; landmarks used."""
 MIN_TURN_DEG = 20.0
-"""Between two timesteps, below which the head does not turn: what lies nearer cannot be told from
-what is larger."""
+"""Between two timesteps; below it, what lies nearer cannot be told from what is larger."""
 USUAL_SIGMA = 0.35
 """Standard deviation of the inverse focal length about that of a phone, relative."""
 NEAREST, FARTHEST = 2.0, 0.2
-"""Largest and smallest inverse focal length, relative to that of a phone: 104° and 15° over the
-diagonal."""
+"""Largest and smallest inverse, relative to that of a phone: 104° and 15° over the diagonal."""
 OWN_SIGMA_M, NOISE_SIGMA_M = LANDMARK_SIGMA_M, 0.0006
 """Standard deviations of what a landmark misses the head by in all timesteps alike, which says
 nothing of focal lengths, and beyond that in one of them."""
 SOLVES, ROUNDS, CONVERGED = 6, 2, 0.01
 """Inverse focal lengths that are tried; fits of the head for each, as its depth is that of the fit
 before; and the relative change after which no more are tried."""
+MAX_SCALE_DIFFERENCE = 0.043
+"""Of a camera from the median of all; 5 % of focal length show."""
+MAX_SIDE_DEG = 60.0
+"""Between the way the head faces and a camera, beyond which its landmarks are not compared: on the
+path-traced head, scales of single views have a standard deviation of 0.01 up to here, and of 0.03
+beyond, with a mean of −0.02."""
+MIN_CAMERAS = 4
+MIN_VISIBILITY = 0.1
+"""Squared cosine of the angle between a landmark's surface and a camera that may use it."""
+MAX_COMPARED_TIMESTEPS = 40
+SCALE_ITERATIONS, OUTLIER_SCALE = 8, 1.5
 HERE = Similarity(1.0, np.eye(3), np.zeros(3))
 """The head is fitted in the camera's own world, in meters."""
 
@@ -60,9 +71,8 @@ def solved_focal(
         for t, own in take.items()
         if (own.confidence[:, rows] > 0).all()
     }
-    own_head, own_places = _with_own_places(
-        head, SurfacePoints(places.face[rows], places.barycentric[rows])
-    )
+    chosen = SurfacePoints(places.face[rows], places.barycentric[rows])
+    own_head, own_places = _with_own_places(head, chosen)
     timesteps = _turned(own_head, own_places, seen)
     if not timesteps:
         return None
@@ -86,8 +96,7 @@ def solved_focal(
 
 
 def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
-    """The head at its landmarks alone, with components of identity that move each of them by
-    OWN_SIGMA_M."""
+    """The head at its landmarks alone, and an identity that moves each by OWN_SIGMA_M."""
     model, count = head.model, len(places)
     corners = model.faces[places.face].ravel()
     own = OWN_SIGMA_M * np.eye(3 * count).reshape(count, 1, 3, 3 * count).repeat(3, axis=1)
@@ -128,12 +137,10 @@ def _turned(
 def _observed(
     head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
 ) -> tuple[list[Observation], np.ndarray]:
-    """Landmarks in the camera's world at the depth of the head, and the poses (T, 18) that bring it
-    there."""
+    """Landmarks in the camera's world at the head's depth, and poses (T, 18) that lead there."""
     neutral, used = places.on(head.model.v_template, head.model.faces), np.ones(len(places), bool)
-    found = [
-        observed_landmarks(triangulated(view, used, neutral, 1.0), HERE, used) for view in views
-    ]
+    points = (triangulated(view, used, neutral, 1.0) for view in views)
+    found = [observed_landmarks(own, HERE, used) for own in points]
     return found, np.stack([rigid_start(neutral, own) for own in found])
 
 
@@ -154,17 +161,10 @@ def _slope(
         seen, starts = _observed(subject, places, views)
         frames = frames if len(frames) else np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
         visibility = LandmarkVisibility(subject, places)
-        sides = (
-            visibility.weighted(view, own, HERE) for view, own in zip(views, frames, strict=True)
-        )
-        observed = [
-            replace(
-                own,
-                root=own.root * (LANDMARK_SIGMA_M / NOISE_SIGMA_M),
-                weight=own.weight * side.confidence[0],
-            )
-            for own, side in zip(seen, sides, strict=True)
-        ]
+        observed, factor = [], LANDMARK_SIGMA_M / NOISE_SIGMA_M
+        for view, own, values in zip(views, seen, frames, strict=True):
+            weight = own.weight * visibility.weighted(view, values, HERE).confidence[0]
+            observed.append(replace(own, root=own.root * factor, weight=weight))
         identity = solve_identity(head, places, observed, starts, metric=True)
         subject, frames = person(head, identity.shape), identity.frames
     points, total = PosedPoints(subject.model, places), 0.0
@@ -173,10 +173,67 @@ def _slope(
         at = points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         residual = np.einsum("nij,nj->ni", own.root, at - own.position) / LANDMARK_SIGMA_M
         _, depth = camera.project(at)
-        flat = (
-            (view.points[0] - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y] * depth[:, None]
-        )
+        flat = (view.points[0] - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
+        flat = flat * depth[:, None]
         away = np.einsum("nij,nj->ni", own.root, flat @ rotation[:2]) / LANDMARK_SIGMA_M
         weight = own.weight / np.sqrt(1 + (residual**2).sum(1))
         total -= float((weight * (residual * away).sum(1)).sum())
     return total
+
+
+def scale_warnings(
+    fit: HeadFit,
+    places: SurfacePoints,
+    used: np.ndarray,
+    footage: Footage,
+    found: Mapping[str, CameraLandmarks],
+) -> tuple[str, ...]:
+    """One sentence for each camera whose landmarks are of another size than the fitted head is
+    there: the sign of a wrong focal length. Faces seen from the side do not count."""
+    visibility = LandmarkVisibility(fit.head, places)
+    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
+    timesteps = sorted(fit.parameters)[:: 1 + len(fit.parameters) // MAX_COMPARED_TIMESTEPS]
+    scales: dict[str, dict[int, float]] = {}
+    for timestep in timesteps:
+        for name, own in found.items():
+            rows = np.flatnonzero(own.timesteps == timestep)
+            if not len(rows):
+                continue
+            parameters, eye = fit.parameters[timestep], cameras[name].position
+            at, (visible,) = visibility.seen(parameters, eye[None])
+            away = (eye - at[used].mean(0)) @ head_rotation(parameters)
+            if away[2] < np.cos(np.radians(MAX_SIDE_DEG)) * np.linalg.norm(away):
+                continue
+            use = used & (own.confidence[rows[0]] > 0) & (visible > MIN_VISIBILITY)
+            if use.sum() > RIGID_SIZE:
+                projected, pixels = cameras[name].project(at[use])[0], own.points[rows[0]][use]
+                scale = _scale(projected, pixels, visible[use])
+                scales.setdefault(name, {})[timestep] = scale
+    if len(scales) < MIN_CAMERAS:
+        return ()
+    medians = {name: float(np.median(list(own.values()))) for name, own in scales.items()}
+    usual = float(np.median(list(medians.values())))
+    warnings = []
+    for name, value in medians.items():
+        difference = value / usual - 1
+        if abs(difference) > MAX_SCALE_DIFFERENCE:
+            worst = max(scales[name], key=lambda t: abs(scales[name][t] / usual - 1))
+            size = "larger" if difference > 0 else "smaller"
+            warnings.append(
+                f"camera {name}: shows the head {abs(difference):.1%} {size} than the other "
+                f"cameras do, most at timestep {worst}; check its focal length and position"
+            )
+    return tuple(warnings)
+
+
+def _scale(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> float:
+    """The scale from points (N, 2) to others, after the mean shift; outliers count little."""
+    scale, used = 1.0, weights
+    for _ in range(SCALE_ITERATIONS):
+        a = source - (used[:, None] * source).sum(0) / used.sum()
+        b = target - (used[:, None] * target).sum(0) / used.sum()
+        scale = float((used * (a * b).sum(1)).sum() / (used * (a**2).sum(1)).sum())
+        distance = np.linalg.norm(b - scale * a, axis=1)
+        usual = max(OUTLIER_SCALE * float(np.median(distance)), 1e-9)
+        used = weights / (1 + (distance / usual) ** 2) ** 2
+    return scale

@@ -1,20 +1,25 @@
-"""Files of a tracked capture's folder."""
+"""Files of a tracked capture's folder, and what they say of the torso."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-from ..capture.open import CANONICAL_NAME
+import numpy as np
 
-REPORT_FILE, SHEET_FILE, LANDMARKS_FOLDER, PLACES_FILE, MATTES_FILE = (
-    "tracking.json",
-    "contact_sheet.png",
-    "landmarks",
-    "head_model.npz",
-    "mattes.json",
-)
+from ..capture.open import CANONICAL_NAME
+from ..errors import StgaError
+from ..files import read_json, read_npz, write_npz
+from ..schema import from_json, setting
+
+REPORT_FILE, SHEET_FILE, MATTES_FILE = "tracking.json", "contact_sheet.png", "mattes.json"
+LANDMARKS_FOLDER, PLACES_FILE = "landmarks", "head_model.npz"
 KEPT_FOLDER = "unfinished"
-"""Of results of parts, with which an interrupted tracking goes on; removed once the capture is
-written."""
+"""Of results of parts, with which an interrupted tracking goes on; removed at its end."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
+TORSO_KEY = "torso"
+"""Of the report; null where the motion could not be told."""
+POINTS_FILE = "torso_points.npz"
 
 
 def image_name(timestep: int, camera: int, suffix: str = ".png") -> str:
@@ -40,3 +45,86 @@ def is_flame(out: Path) -> bool:
 def is_tracked(out: Path) -> bool:
     """Whether a capture has what its correction starts from."""
     return (out / LANDMARKS_FOLDER / PLACES_FILE).is_file() and (out / REPORT_FILE).is_file()
+
+
+@dataclass(frozen=True)
+class TorsoMotion:
+    """Which of MOTIONS the torso follows, and what speaks for it.
+
+    misfit    motion -> share of the points below the head, held out from fitting, that images do
+              not explain
+    turn_deg  largest angle between torso and head
+    shift_mm  largest distance of the torso from where the neck's joint holds it; 0 where a rotation
+              explains enough
+    bend_mm   largest distance of its cloth from where a rigid torso has it; 0 where that explains
+              enough
+    """
+
+    motion: str = setting(choices=MOTIONS)
+    misfit: Mapping[str, float] = setting(minimum=0, maximum=1)
+    turn_deg: float = setting(minimum=0)
+    shift_mm: float = setting(0.0, minimum=0)
+    bend_mm: float = setting(0.0, minimum=0)
+
+    @property
+    def description(self) -> str:
+        """A clause with the figures that decided."""
+        shift = f" and {self.shift_mm:.0f} mm" if self.shift_mm else ""
+        bend = f", its cloth bends by up to {self.bend_mm:.0f} mm" if self.bend_mm else ""
+        apart = f", up to {self.turn_deg:.0f}°{shift} apart from the head{bend}"
+        head, still, own = (f"{self.misfit[name]:.0%}" for name in MOTIONS)
+        return (
+            f"the torso {MOTIONS[self.motion]}{'' if self.motion == 'head' else apart}; "
+            f"images below the head are not explained by {head} if it turned with the head, "
+            f"{still} still, {own} on its own"
+        )
+
+
+def read_torso_motion(capture: Path) -> TorsoMotion | None:
+    """What the report of a tracked capture says; None where it has no report, or that does not say.
+
+    Raises StgaError where the report is malformed.
+    """
+    path = capture / REPORT_FILE
+    report = read_json(path) if path.is_file() else None
+    found = report.get(TORSO_KEY) if isinstance(report, dict) else None
+    if found is None:
+        return None
+    try:
+        if isinstance(found, dict):
+            # of a capture that was tracked before there were any
+            found = {"shift_mm": 0.0, "bend_mm": 0.0, **found}
+        motion: TorsoMotion = from_json(TorsoMotion, found)
+        if set(motion.misfit) != set(MOTIONS):
+            raise StgaError(f"misfit: expected {', '.join(MOTIONS)}")
+    except StgaError as error:
+        raise StgaError(f"{path}: {TORSO_KEY}: {error}") from error
+    return motion
+
+
+@dataclass(frozen=True)
+class TorsoPoints:
+    """Where the torso's surface is seen at a timestep: (N, 3) meters in the capture's world."""
+
+    timestep: int
+    at: np.ndarray
+
+
+def write_torso_points(capture: Path, points: TorsoPoints) -> None:
+    """Write the points into a capture's folder."""
+    arrays = {"timestep": np.array(points.timestep), "points": points.at.astype(np.float32)}
+    write_npz(capture / POINTS_FILE, arrays)
+
+
+def read_torso_points(capture: Path) -> TorsoPoints | None:
+    """The points in a capture's folder; None without. Raises StgaError where damaged."""
+    path = capture / POINTS_FILE
+    if not path.is_file():
+        return None
+    arrays = read_npz(path)
+    timestep, at = arrays.get("timestep", np.zeros(0)), arrays.get("points", np.zeros(0))
+    if timestep.shape != () or timestep.dtype.kind not in "iu":
+        raise StgaError(f"{path}: timestep: expected a whole number")
+    if at.ndim != 2 or at.shape[1] != 3 or at.dtype.kind != "f" or not np.isfinite(at).all():
+        raise StgaError(f"{path}: points: expected (points, 3) finite numbers")
+    return TorsoPoints(int(timestep), at.astype(np.float64))

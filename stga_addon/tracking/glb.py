@@ -21,13 +21,16 @@ promise as many zeros as they like, and nodes repeat meshes; sparse morph target
 reach 4 a byte."""
 PRIMITIVE_NUMBERS = 100
 """That each primitive counts for besides its own: it takes time even where it is small."""
+UNREADABLE = (
+    LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError,
+)  # fmt: skip
+"""What a damaged document leads to."""
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
 
 
 @dataclass(frozen=True)
 class MorphMesh:
-    """positions (V, 3) in meters, y up; faces (F, 3); names of K morph targets and their
-    displacements (V, 3, K)."""
+    """positions (V, 3) meters, y up; faces (F, 3); names and displacements (V, 3, K) of targets."""
 
     positions: np.ndarray
     faces: np.ndarray
@@ -46,62 +49,42 @@ def read_glb(path: Path) -> MorphMesh:
     try:
         with np.errstate(all="ignore"):  # a head's vertices are checked by `read_head_model`
             document, data = glb_chunks(content)
-            _require_readable(path, document)
+            unknown = set(document.get("extensionsRequired", ())) - READABLE_EXTENSIONS
+            if unknown:
+                names = ", ".join(sorted(map(str, unknown)))
+                raise StgaError(f"{path}: needs {names}; export it without compression")
+            if any("uri" in buffer for buffer in document.get("buffers", ())):
+                raise StgaError(
+                    f"{path}: refers to other files; export a GLB that holds its buffers"
+                )
             nodes = list(_mesh_nodes(document))
-            _require_bounded(
-                path, document, nodes, MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * len(content)
-            )
-            parts = [
-                part for node, matrix in nodes for part in _placed(document, data, node, matrix)
-            ]
-    except (
-        LookupError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:
-        raise StgaError(
-            f"{path}: is not a readable GLB ({type(error).__name__}: {error!s:.100})"
-        ) from error
+            _require_bounded(path, document, nodes, len(content))
+            parts = [own for each in nodes for own in _placed(document, data, *each)]
+    except UNREADABLE as error:
+        reason = f"{type(error).__name__}: {error!s:.100}"
+        raise StgaError(f"{path}: is not a readable GLB ({reason})") from error
     if not parts:
         raise StgaError(f"{path}: its scene has no triangle mesh")
     return _merged(_joined(parts))
 
 
-def _require_readable(path: Path, document: dict[str, Any]) -> None:
-    unknown = set(document.get("extensionsRequired", ())) - READABLE_EXTENSIONS
-    if unknown:
-        raise StgaError(
-            f"{path}: needs {', '.join(sorted(map(str, unknown)))}; export it without compression"
-        )
-    if any("uri" in buffer for buffer in document.get("buffers", ())):
-        raise StgaError(f"{path}: refers to other files; export a GLB that holds its buffers")
-
-
 def _require_bounded(
-    path: Path,
-    document: dict[str, Any],
-    nodes: list[tuple[dict[str, Any], np.ndarray]],
-    allowed: int,
+    path: Path, document: dict[str, Any], nodes: list[tuple[dict[str, Any], np.ndarray]], size: int
 ) -> None:
-    """Raise StgaError where the joined mesh of all nodes would hold more numbers than allowed."""
-    vertices = corners = 0
-    names: set[str] = set()
-    for node, _ in nodes:
-        for primitive, targets in _primitives(document, node):
-            vertices += _count(document["accessors"][primitive["attributes"]["POSITION"]])
-            corners += PRIMITIVE_NUMBERS
-            corners += (
-                _count(document["accessors"][primitive["indices"]]) if "indices" in primitive else 0
+    """Raise StgaError where the joined mesh would hold more numbers than such a file may."""
+    allowed = MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
+    vertices, corners, accessors, names = 0, 0, document["accessors"], set[str]()
+    for primitive, targets in (own for node, _ in nodes for own in _primitives(document, node)):
+        vertices += _count(accessors[primitive["attributes"]["POSITION"]])
+        corners += PRIMITIVE_NUMBERS
+        corners += _count(accessors[primitive["indices"]]) if "indices" in primitive else 0
+        names.update(name for name, _ in targets)
+        numbers = 3 * vertices * (1 + len(names)) + corners
+        if numbers > allowed:
+            raise StgaError(
+                f"{path}: its meshes hold {numbers} numbers, more than the {allowed} allowed to a "
+                "file of this size"
             )
-            names.update(name for name, _ in targets)
-            numbers = 3 * vertices * (1 + len(names)) + corners
-            if numbers > allowed:
-                raise StgaError(
-                    f"{path}: its meshes hold {numbers} numbers, more than the {allowed} allowed to a file of this size"
-                )
 
 
 def _primitives(
@@ -114,42 +97,31 @@ def _primitives(
     for primitive in mesh["primitives"]:
         if primitive.get("mode", TRIANGLES) == TRIANGLES:
             targets = primitive.get("targets", ())
-            named = len(names) == len(targets)
-            yield (
-                primitive,
-                [
-                    (str(names[k]) if named else f"target {k}", target)
-                    for k, target in enumerate(targets)
-                ],
-            )
+            if len(names) != len(targets):
+                names = [f"target {number}" for number in range(len(targets))]
+            yield primitive, [(str(names[k]), target) for k, target in enumerate(targets)]
 
 
 def _mesh_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Nodes of the scene that have a mesh, and their transforms (4, 4)."""
-    nodes = document.get("nodes", [])
-    waiting = [
-        (int(row), np.eye(4))
-        for row in document["scenes"][document.get("scene", 0)].get("nodes", ())
-    ]
+    nodes, scene = document.get("nodes", []), document["scenes"][document.get("scene", 0)]
+    waiting = [(int(row), np.eye(4)) for row in scene.get("nodes", ())]
     for _ in range(len(nodes)):  # each node has one parent: more would be a loop
         if not waiting:
             return
         row, above = waiting.pop()
         node = nodes[row]
-        matrix = above @ _transform(node)
+        own = np.eye(4)
+        if "matrix" in node:
+            own = np.array(node["matrix"], float).reshape(4, 4).T
+        else:
+            turn = np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), float), 1)
+            own[:3, :3] = to_matrices(turn) * np.array(node.get("scale", (1, 1, 1)), float)
+            own[:3, 3] = node.get("translation", (0, 0, 0))
+        matrix = above @ own
         waiting += [(int(child), matrix) for child in node.get("children", ())]
         if "mesh" in node:
             yield node, np.eye(4) if "skin" in node else matrix
-
-
-def _transform(node: dict[str, Any]) -> np.ndarray:
-    if "matrix" in node:
-        return np.array(node["matrix"], float).reshape(4, 4).T
-    result = np.eye(4)
-    result[:3, :3] = to_matrices(np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), float), 1))
-    result[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), float)
-    result[:3, 3] = node.get("translation", (0, 0, 0))
-    return result
 
 
 def _placed(
@@ -164,21 +136,15 @@ def _placed(
         for column, (_, morph) in enumerate(morphs):
             if "POSITION" in morph:
                 targets[:, :, column] = _accessor(document, data, morph["POSITION"], count)
-        corners = np.arange(count, dtype=np.int64)
+        corners = np.arange(count)
         if "indices" in primitive:
-            corners = _accessor(document, data, primitive["indices"], width=1)[:, 0].astype(
-                np.int64
-            )
+            values = _accessor(document, data, primitive["indices"], width=1)[:, 0]
+            corners = values.astype(np.int64)
         if corners.min(initial=0) < 0 or corners.max(initial=0) >= count:
             raise ValueError("a primitive's indices do not fit its vertices")
-        parts.append(
-            MorphMesh(
-                positions @ matrix[:3, :3].T + matrix[:3, 3],
-                corners[: len(corners) // 3 * 3].reshape(-1, 3),
-                tuple(name for name, _ in morphs),
-                np.einsum("ab,vbk->vak", matrix[:3, :3], targets),
-            )
-        )
+        turn, faces = matrix[:3, :3], corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        names, moved = tuple(name for name, _ in morphs), np.einsum("ab,vbk->vak", turn, targets)
+        parts.append(MorphMesh(positions @ turn.T + matrix[:3, 3], faces, names, moved))
     return parts
 
 
@@ -192,28 +158,22 @@ def _count(accessor: dict[str, Any]) -> int:
 def _accessor(
     document: dict[str, Any], data: bytes, number: int, expected: int | None = None, width: int = 3
 ) -> np.ndarray:
-    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where that is
-    given."""
+    """Values (N, width) of an accessor, sparse ones applied; N is `expected` where given."""
     accessor = document["accessors"][number]
     count = _count(accessor)
     if WIDTHS[accessor["type"]] != width or count != (expected or count):
         raise ValueError("an accessor is of another type or length than its use")
+    component, values = accessor["componentType"], np.zeros((count, width))
     if "bufferView" in accessor:
-        values = _view(document, data, accessor, accessor["componentType"], count, width)
-    else:
-        values = np.zeros((count, width))
+        values = _view(document, data, accessor, component, (count, width))
     sparse = accessor.get("sparse")
     if sparse:
-        changed = _count(sparse)
-        rows = _view(
-            document, data, sparse["indices"], sparse["indices"]["componentType"], changed, 1
-        )[:, 0]
-        values[rows.astype(np.int64)] = _view(
-            document, data, sparse["values"], accessor["componentType"], changed, width
-        )
+        changed, indices = _count(sparse), sparse["indices"]
+        rows = _view(document, data, indices, indices["componentType"], (changed, 1))[:, 0]
+        found = _view(document, data, sparse["values"], component, (changed, width))
+        values[rows.astype(np.int64)] = found
     if accessor.get("normalized"):
-        limits = np.iinfo(COMPONENTS[accessor["componentType"]])
-        values = np.maximum(values / limits.max, -1)
+        values = np.maximum(values / np.iinfo(COMPONENTS[component]).max, -1)
     return values
 
 
@@ -222,20 +182,18 @@ def _view(
     data: bytes,
     source: dict[str, Any],
     component: int,
-    count: int,
-    width: int,
+    shape: tuple[int, int],
 ) -> np.ndarray:
-    """(count, width) float64 copies of a buffer view's values."""
+    """A buffer view's values, as float64 copies of this shape."""
     view, dtype = document["bufferViews"][source["bufferView"]], np.dtype(COMPONENTS[component])
     if view.get("buffer", 0) != 0:
         raise ValueError("expected one buffer")
     start = int(view.get("byteOffset", 0)) + int(source.get("byteOffset", 0))
-    stride = int(view.get("byteStride", dtype.itemsize * width))
-    size = dtype.itemsize * width
-    if start < 0 or stride < size or start + stride * (count - 1) + size > len(data):
+    size = dtype.itemsize * shape[1]
+    stride = int(view.get("byteStride", size))
+    if start < 0 or stride < size or start + stride * (shape[0] - 1) + size > len(data):
         raise ValueError("an accessor reaches beyond the file")
-    strides = (stride, dtype.itemsize)
-    return np.ndarray((count, width), dtype, data, start, strides).astype(np.float64)
+    return np.ndarray(shape, dtype, data, start, (stride, dtype.itemsize)).astype(np.float64)
 
 
 def _joined(parts: list[MorphMesh]) -> MorphMesh:
@@ -244,23 +202,18 @@ def _joined(parts: list[MorphMesh]) -> MorphMesh:
     columns = {name: column for column, name in enumerate(names)}
     starts = np.cumsum([0, *(len(part.positions) for part in parts)])
     targets = np.zeros((starts[-1], 3, len(names)))
-    for start, part in zip(starts, parts, strict=False):
+    for start, end, part in zip(starts, starts[1:], parts, strict=False):
         for own, name in enumerate(part.names):
-            targets[start : start + len(part.positions), :, columns[name]] += part.targets[
-                :, :, own
-            ]
+            targets[start:end, :, columns[name]] += part.targets[:, :, own]
     faces = np.concatenate([part.faces + start for start, part in zip(starts, parts, strict=False)])
     return MorphMesh(np.concatenate([part.positions for part in parts]), faces, names, targets)
 
 
 def _merged(mesh: MorphMesh) -> MorphMesh:
-    """The mesh with vertices merged that no target parts, and without triangles that collapse by
-    it."""
-    # no -0
-    rows = np.column_stack([mesh.positions, mesh.targets.reshape(len(mesh.positions), -1)]) + 0.0
-    keys = np.ascontiguousarray(rows).view(
-        np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))
-    )[:, 0]
+    """The mesh with vertices merged that no target parts, without triangles that collapse."""
+    rows = np.column_stack([mesh.positions, mesh.targets.reshape(len(mesh.positions), -1)])
+    rows = np.ascontiguousarray(rows + 0.0)  # no -0
+    keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1])))[:, 0]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)  # vertices in the order of the file
     rank = np.empty(len(order), np.int64)

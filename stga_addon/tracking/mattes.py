@@ -1,4 +1,11 @@
-"""Mattes of a take: those of its footage, or found in its frames once the head is tracked."""
+"""Mattes of a take: those of its footage, or found in its frames once the head is tracked.
+
+A matte is the coverage of each pixel by the person whose head was tracked. What is likely the
+person (by a network, or by the difference from a clean plate) and the tracked head are the seeds of
+OpenCV's GrabCut (Rother et al. 2004), which finds the outline in between. In a band along it,
+coverage is that share of the way from the backdrop's color around the pixel to the person's that
+the pixel's color lies at; where both colors are alike, the band is a smooth edge.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import binary_fill_holes
 
 from ..capture.model import parts_of
 from ..files import read_json, replacing, write_json
@@ -16,16 +24,38 @@ from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
-from .matte import find_matte, probability_by_plate
 
 PART_TIMESTEPS = 24
 """At most, of the parts of a camera that are worked on at once."""
 MIN_HEAD_PROBABILITY = 0.5
 """Median over the tracked head, below which the network does not see the person there."""
+LIKELY, SURE, UNLIKELY = 0.5, 0.9, 0.1
+"""Probabilities of a person."""
+MAX_CUT_SIDE_PX = 400
+"""Of the images that GrabCut works on, whose time grows with the pixels; the band's is full."""
+CUT_ITERATIONS = 2
+CUT_MARGIN_SHARE = 0.04
+"""Error of the network's outline, as a share of the head's size (root of its area in the image)."""
+HEAD_MARGIN_SHARE = 0.06
+"""Error of the tracked head's outline, of the head's size: further inside are surely persons."""
+BAND_SHARE = 0.018
+"""Half of the soft band's width, as a share of the head's size."""
+NEIGHBORHOOD_SHARES = (0.03, 0.12)
+"""Standard deviations of the neighborhoods that colors are means of, of the head's size."""
+FAR_WEIGHT = 0.02
+MIN_NEIGHBORHOOD_PX = 2.0
+"""Standard deviation of the smaller neighborhood, in pixels of the image of the means."""
+REACH_SHARE = 1.0
+"""Distance from the head, of its size, that hair reaches; clothes reach farther, below."""
+SIMILAR_COLORS_LEVELS = 30.0
+"""Difference of both sides' colors at which half of the coverage is a smooth edge's."""
+PLATE_NOISE_LEVELS, PLATE_SURE_LEVELS = 10.0, 40.0
+"""Differences from a clean plate, of 255, that noise makes, and that only a person does."""
+MAX_HOLE_SHARE = 0.01
+"""Area of a hole in the person, of the head's, that is filled: highlights, patterned cloth."""
 
 HeadPixels = Callable[[int, FootageCamera], np.ndarray]
-"""(timestep, camera) -> (H, W) bool: the pixels of the tracked head; can be handed to helping
-processes."""
+"""(timestep, camera) -> (H, W) bool: the tracked head's pixels; helping processes take it."""
 
 
 def with_mattes(
@@ -42,36 +72,31 @@ def with_mattes(
     capture's masks and, where an interrupted call with the same `source` wrote them, read from
     there. A camera's clean plate tells the person from the backdrop, else the network.
     """
-    path, total = out / MATTES_FILE, len(list(footage.views()))
+    path, total, done = out / MATTES_FILE, len(list(footage.views())), 0
     continues = path.exists() and read_json(path) == source
     write_json(path, source)
     unseen: list[str] = []
-    cameras, done = [], 0
+    cameras = []
     for number, camera in enumerate(footage.cameras):
         files = {t: out / mask_name(t, number) for t in camera.timesteps}
         kept = {t: file for t, file in files.items() if continues and file.exists()}
         left = [t for t in camera.timesteps if t not in kept]
-        parts = [
-            (camera, {t: files[t] for t in part}, head_pixels)
-            for part in parts_of(left, PART_TIMESTEPS)
-            if part
-        ]
+        parts = [part for part in parts_of(left, PART_TIMESTEPS) if part]
+        work = [(camera, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
-        found = helpers.map(_write_mattes, parts, partial(_count, report, done, total))
+        found = helpers.map(_write_mattes, work, partial(_count, report, done, total))
         done += len(left)
         report("Mattes", done, total)
         known = {t: is_seen for part in found for t, is_seen in part.items()}
         unseen += [f"{camera.name} at timestep {t}" for t in left if not known.get(t, True)]
-        cameras.append(
-            replace(camera, mattes={t: files[t] for t in files if t in kept or t in known})
-        )
-    result = replace(footage, cameras=tuple(cameras))
-    if not unseen:
-        return result, ()
+        mattes = {t: file for t, file in files.items() if t in kept or t in known}
+        cameras.append(replace(camera, mattes=mattes))
     listed = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
-    return result, (
-        f"no person was recognized in {len(unseen)} frames, whose mattes follow the head alone: {listed}",
+    warning = (
+        f"no person was recognized in {len(unseen)} frames, "
+        f"whose mattes follow the head alone: {listed}"
     )
+    return replace(footage, cameras=tuple(cameras)), (warning,) if unseen else ()
 
 
 def _count(report: Report, done: int, total: int, number: int) -> None:
@@ -82,20 +107,119 @@ def _write_mattes(
     camera: FootageCamera, files: dict[int, Path], head_pixels: HeadPixels, step: Step
 ) -> dict[int, bool]:
     """Write the mattes of timesteps without a mask; by those, whether a person was recognized."""
-    plate, network = camera.clean_plate(), PersonNetwork()
-    recognized = {}
+    plate, network, recognized = camera.clean_plate(), PersonNetwork(), {}
     for timestep, file in files.items():
         if camera.mask(timestep) is None:
             image, head = camera.image(timestep), head_pixels(timestep, camera)
-            probability = (
+            is_person = (
                 network.probability(image) if plate is None else probability_by_plate(image, plate)
             )
-            recognized[timestep] = (
-                not head.any() or float(np.median(probability[head])) >= MIN_HEAD_PROBABILITY
-            )
-            with replacing(file) as partial_file:
-                Image.fromarray(find_matte(image, probability, head)).save(
-                    partial_file, format="PNG"
-                )
+            seen = float(np.median(is_person[head])) if head.any() else 1.0
+            recognized[timestep] = seen >= MIN_HEAD_PROBABILITY
+            with replacing(file) as new:
+                Image.fromarray(find_matte(image, is_person, head)).save(new, format="PNG")
         step()
     return recognized
+
+
+def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> np.ndarray:
+    """Matte (H, W) uint8, 255 on the person, of an image (H, W, 3) uint8 sRGB.
+
+    probability (H, W) float32 in 0…1, of a person; head (H, W) bool, the pixels of the tracked
+    head.
+    """
+    import cv2
+
+    size, whole = np.sqrt(max(head.sum(), 1.0)), image.shape[1::-1]
+    scale = min(1.0, MAX_CUT_SIDE_PX / max(whole))
+    small = tuple(max(1, round(scale * side)) for side in whole)
+    seeds = [image, probability, head.astype(np.float32)]
+    pixels, likely, heads = (cv2.resize(v, small, interpolation=cv2.INTER_AREA) for v in seeds)
+    cut = _cut(cv2, pixels, likely, heads > 0.5, scale * size).astype(np.float32)
+    person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
+    return _soft_edge(cv2, image, person, size)
+
+
+def probability_by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
+    """Probability (H, W) float32 of a person: the difference from a clean plate (H, W, 3) uint8."""
+    import cv2
+
+    smooth, backdrop = (cv2.GaussianBlur(each, (0, 0), 1.0) for each in (image, plate))
+    difference = np.abs(smooth.astype(np.float32) - backdrop).max(axis=2)
+    share = (difference - PLATE_NOISE_LEVELS) / (PLATE_SURE_LEVELS - PLATE_NOISE_LEVELS)
+    return np.asarray(np.clip(share, 0, 1), np.float32)
+
+
+def _cut(
+    cv2: Any, image: np.ndarray, probability: np.ndarray, head: np.ndarray, size: float
+) -> np.ndarray:
+    """(H, W) bool: the person; size: of the head in pixels."""
+    core = _shrunk(cv2, head, HEAD_MARGIN_SHARE * size)
+    margin = max(2.0, CUT_MARGIN_SHARE * size)
+    reach = _grown(cv2, head, REACH_SHARE * size)  # of hair; the body's is all below
+    if head.any():
+        reach[int(np.flatnonzero(head.any(axis=1)).mean()) :] = True
+    surely = core | _shrunk(cv2, probability > SURE, margin)
+    possibly = _grown(cv2, (probability > UNLIKELY) | head, 2 * margin) & reach
+    marks = np.where(probability > LIKELY, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    marks[~possibly], marks[surely] = cv2.GC_BGD, cv2.GC_FGD
+    if 0 < np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).mean() < 1:  # it learns the colors of both
+        cv2.setRNGSeed(0)  # of the clusters that the color models begin with
+        models, colors = (np.zeros((1, 65)), np.zeros((1, 65))), image[..., ::-1].copy()
+        cv2.grabCut(colors, marks, None, *models, CUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    found = np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
+    found = (cv2.medianBlur(found, 3) > 0).astype(np.uint8)
+    _, label = cv2.connectedComponents(found, connectivity=4)
+    of_head = np.setdiff1d(np.unique(label[core]), [0])
+    kept = np.isin(label, of_head) if core.any() else found > 0
+    holes = (binary_fill_holes(kept) & ~kept).astype(np.uint8)
+    _, label, statistics, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
+    filled = statistics[:, cv2.CC_STAT_AREA] <= MAX_HOLE_SHARE * head.sum()
+    filled[0] = False
+    return np.asarray(kept | filled[label])
+
+
+def _soft_edge(cv2: Any, image: np.ndarray, person: np.ndarray, size: float) -> np.ndarray:
+    """(H, W) uint8: coverage in a band along the person's outline, 0 and 255 elsewhere."""
+    band = max(1.0, BAND_SHARE * size)
+    inside, outside = _shrunk(cv2, person, band), ~_grown(cv2, person, band)
+    matte = np.where(inside, 255, 0).astype(np.uint8)
+    unknown = ~inside & ~outside
+    if not (unknown.any() and inside.any() and outside.any()):
+        return np.where(person, 255, 0).astype(np.uint8)
+    backdrop = _mean_around(cv2, image, outside, size)[unknown]
+    towards = _mean_around(cv2, image, inside, size)[unknown] - backdrop
+    contrast = (towards**2).sum(axis=1)
+    share = ((image[unknown] - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
+    smooth = cv2.GaussianBlur(person.astype(np.float32), (0, 0), max(0.7, band / 3))[unknown]
+    trust = contrast / (contrast + 3 * SIMILAR_COLORS_LEVELS**2)
+    coverage = trust * np.clip(share, 0, 1) + (1 - trust) * smooth
+    matte[unknown] = (255 * coverage + 0.5).astype(np.uint8)
+    return matte
+
+
+def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) -> np.ndarray:
+    """(H, W, 3) float32 mean of known pixels around each; those far away where none is near."""
+    # wide neighborhoods need few pixels
+    scale = min(1.0, MIN_NEIGHBORHOOD_PX / (NEIGHBORHOOD_SHARES[0] * size))
+    small = tuple(max(1, round(scale * side)) for side in image.shape[1::-1])
+    weight = known.astype(np.float32)
+    weighted = cv2.resize(image * weight[..., None], small, interpolation=cv2.INTER_AREA)
+    weight = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
+    total, norm = np.zeros_like(weighted), np.full_like(weight, 1e-9)
+    for share, importance in zip(NEIGHBORHOOD_SHARES, (1.0, FAR_WEIGHT), strict=True):
+        sigma = max(0.7, scale * share * size)
+        total += importance * cv2.GaussianBlur(weighted, (0, 0), sigma)
+        norm += importance * cv2.GaussianBlur(weight, (0, 0), sigma)
+    mean = cv2.resize(total / norm[..., None], image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(mean, np.float32)
+
+
+def _shrunk(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:
+    """(H, W) bool: pixels farther than so many from the outside, which the border is not."""
+    distance = cv2.distanceTransform(where.astype(np.uint8), cv2.DIST_L2, 3)
+    return np.asarray(distance > pixels)
+
+
+def _grown(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:
+    return ~_shrunk(cv2, ~where, pixels)

@@ -15,8 +15,7 @@ AMBIENT = 0.38
 def shaded_image(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray | None = None
 ) -> np.ndarray:
-    """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3) from 0 to 1, by default those
-    of skin."""
+    """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3), 0 to 1; None: skin's."""
     triangle, weights = rasterize(vertices, faces, camera)
     seen = triangle >= 0
     corners, inside = faces[triangle[seen]], weights[seen][..., None]
@@ -24,9 +23,8 @@ def shaded_image(
     normal = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T * [1, -1, -1]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
-    brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + (1 - AMBIENT) * np.clip(
-        normal @ light, 0, 1
-    )
+    lit = (1 - AMBIENT) * np.clip(normal @ light, 0, 1)
+    brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + lit
     color = SKIN_RGB if colors is None else (colors[corners] * inside).sum(1)
     image = np.full((camera.height, camera.width, 3), BACKGROUND)
     image[seen] = np.clip(brightness[:, None], 0, 1) * color * 1.15

@@ -1,16 +1,20 @@
-"""Pictures of the head over the footage, for whoever watches the tracking."""
+"""Pictures of the head over the footage: for whoever watches the tracking, and the contact sheet of
+a tracked take, with errors of all views and the mesh drawn over the worst."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from ..capture.camera import Camera
+from ..capture.mesh_geometry import rasterize, vertex_normals
 from ..capture.model import evenly_spread
 from ..errors import StgaError
-from .contact_sheet import head_box, with_mesh
+from ..files import replacing
 from .face_networks import FaceNetworks
 from .fit import HeadFit, TimestepLandmarks, determines_pose, fit_head
 from .footage.model import Footage
@@ -20,11 +24,28 @@ from .write_capture import posed_mesh
 
 SIZE = 256
 """Width and height of a picture in pixels: Blender's icons are square."""
-FIRST_CAMERAS = 3
-"""Most cameras of the first frame's fit."""
-COLUMNS = 2
-"""Most frames of a picture, in each direction."""
+FIRST_CAMERAS, SHOWN_FRAMES = 3, 4
+"""Most cameras of the first frame's fit; most frames of a picture, two in each direction."""
+COLUMNS, ROWS = 4, 5
+"""Of the contact sheet."""
+PICTURE = 200, 250
+"""Width and height in pixels of a view; beside it stands the same with the mesh."""
+GAP, CAPTION, MARGIN = 8, 18, 12
+TILE_SIZE = 2 * PICTURE[0], PICTURE[1] + CAPTION
+NAME_WIDTH, CELL_HEIGHT, MAX_CHART_ROWS = 130, 12, 48
+HEAD_MARGIN = 0.08
+"""Of the head's box in the image, on every side."""
+MESH_OPACITY = 0.6
+MATTE_COLOR, MATTE_OPACITY = (0, 150, 60), 0.75
+"""Drawn over what lies outside a view's matte."""
+BACKGROUND, TEXT, NO_FACE = (24, 26, 30), (225, 228, 232), (70, 74, 80)
+ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
+"""Of no error, half of the color scale and its end."""
+COLOR_SCALE_END = 3.0
+"""In medians of all errors."""
 
+Errors = Mapping[str, Mapping[int, float]]
+"""Camera -> timestep -> reprojection error in pixels; without an entry where no face was found."""
 Show = Callable[[Callable[[], np.ndarray | None], Mapping[str, float]], None]
 """Called with what draws a picture (SIZE, SIZE, 3) uint8 for those who watch, None: there is
 nothing to see; and with figures of how well the head fits (`format.describe_figures`)."""
@@ -37,18 +58,15 @@ def picture_of_first_frame(
     places: SurfacePoints,
     reliable: np.ndarray,
 ) -> np.ndarray | None:
-    """The head on the first frame, found within seconds; None where no face, or several, are seen
-    there."""
+    """The head on the first frame, within seconds; None where no face, or several, are seen."""
     timestep = footage.timesteps[0]
-    seeing = evenly_spread(
-        [camera for camera in footage.cameras if timestep in camera.timesteps], FIRST_CAMERAS
-    )
+    seeing = [camera for camera in footage.cameras if timestep in camera.timesteps]
+    seeing = evenly_spread(seeing, FIRST_CAMERAS)
     found = [(camera, detector.detect(camera.image(timestep))) for camera in seeing]
     alone = [(camera.camera, faces[0]) for camera, faces in found if len(faces) == 1]
+    cameras = tuple(camera for camera, _ in alone)
     points = np.array([face for _, face in alone]).reshape(-1, len(places), 2)
-    seen = TimestepLandmarks(
-        tuple(camera for camera, _ in alone), points, np.ones(points.shape[:2])
-    )
+    seen = TimestepLandmarks(cameras, points, np.ones(points.shape[:2]))
     if not determines_pose(seen, reliable, places.on(head.model.v_template, head.model.faces)):
         return None
     with suppress(StgaError):  # the whole take may still be tracked, and says what is wrong
@@ -57,35 +75,157 @@ def picture_of_first_frame(
 
 
 def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
-    """The head on a few of the frames that it was fitted to."""
-    timesteps = evenly_spread(sorted(fit.parameters), COLUMNS**2)
-    columns = COLUMNS if len(timesteps) == COLUMNS**2 else 1
-    side = SIZE // columns
+    """The head on a few of the frames that it was fitted to; black beyond an image."""
+    timesteps = evenly_spread(sorted(fit.parameters), SHOWN_FRAMES)
+    columns = 2 if len(timesteps) == SHOWN_FRAMES else 1
+    side, faces = SIZE // columns, fit.head.model.faces
     picture = np.zeros((SIZE, SIZE, 3), np.uint8)
     for number, timestep in enumerate(timesteps[: columns**2]):
-        camera = next(camera for camera in footage.cameras if timestep in camera.timesteps)
+        source = next(camera for camera in footage.cameras if timestep in camera.timesteps)
+        camera = fit.to_capture.camera(source.camera)
+        vertices = posed_mesh(fit, fit.parameters[timestep])
+        left, top, right, bottom = _head_box(camera, vertices)
+        size = max(right - left, bottom - top)
+        left, top = (left + right - size) // 2, (top + bottom - size) // 2
+        cut = _cropped(camera, left, top, size, size, side / size)
+        image = Image.fromarray(source.image(timestep))
+        cropped = image.crop((left, top, left + size, top + size))
+        small = cropped.resize((cut.width, cut.height), Image.Resampling.BILINEAR)
+        drawn = with_mesh(np.asarray(small), vertices, faces, cut)
         row, column = side * (number // columns), side * (number % columns)
-        picture[row : row + side, column : column + side] = _square(
-            camera.image(timestep),
-            fit.to_capture.camera(camera.camera),
-            posed_mesh(fit, fit.parameters[timestep]),
-            fit.head.model.faces,
-            side,
-        )
+        square = np.asarray(Image.fromarray(drawn).resize((side, side)))
+        picture[row : row + side, column : column + side] = square
     return picture
 
 
-def _square(
-    image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, side: int
+def write_contact_sheet(
+    path: Path,
+    footage: Footage,
+    cameras: Mapping[str, Camera],
+    mesh: Callable[[int], np.ndarray],
+    faces: np.ndarray,
+    errors: Errors,
+    misfit: Errors | None = None,
+) -> None:
+    """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views
+    with the mesh. What lies outside a view's mask is green.
+
+    cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3).
+    misfit: region of the face -> timestep -> share of the images that is not explained; it is
+    charted below, and counts as much as the reprojection error in which views are the worst. Raises
+    StgaError where the file cannot be written or a frame cannot be read.
+    """
+    misfit = misfit or {}
+    every = {(name, t): px for name, own in errors.items() for t, px in own.items()}
+    unexplained = {t: max(own.get(t, 0.0) for own in misfit.values()) for _, t in every if misfit}
+    median = float(np.median(list(every.values()))) if every else 0.0
+    usual = float(np.median(list(unexplained.values()))) if unexplained else 0.0
+
+    def rank(view: tuple[str, int]) -> tuple[float, str, int]:
+        by_images = unexplained.get(view[1], 0.0) / max(usual, 1e-9)
+        return every[view] / max(median, 1e-9) + by_images, *view
+
+    rows = [*_chart_rows(errors, median), *_chart_rows(misfit, usual)]
+    chart = _chart(rows, footage.timesteps)
+    shown = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
+    (width, height), top = TILE_SIZE, MARGIN + CAPTION + chart.height + MARGIN
+    lines = -(-len(shown) // COLUMNS)
+    size = 2 * MARGIN + COLUMNS * (width + GAP) - GAP, top + lines * (height + GAP) + MARGIN
+    sheet = Image.new("RGB", size, BACKGROUND)
+    red = f"red from {COLOR_SCALE_END * median:.1f} px, gray: no face"
+    _write(sheet, (MARGIN, MARGIN), f"Reprojection error, median {median:.2f} px; {red}")
+    sheet.paste(chart, (MARGIN, MARGIN + CAPTION))
+    by_name = {camera.name: camera for camera in footage.cameras}
+    for number, (name, t) in enumerate(shown):
+        image, mask = by_name[name].image(t), by_name[name].mask(t)
+        if mask is not None:
+            opacity = MATTE_OPACITY * (1 - mask[..., None].astype(np.float32) / 255)
+            image = (image + opacity * (np.array(MATTE_COLOR) - image) + 0.5).astype(np.uint8)
+        caption = f"{name}, timestep {t}: {every[name, t]:.1f} px"
+        caption += f", {unexplained[t]:.0%} unexplained" if t in unexplained else ""
+        row, column = divmod(number, COLUMNS)
+        tile = _tile(image, cameras[name], mesh(t), faces, caption)
+        sheet.paste(tile, (MARGIN + column * (width + GAP), top + row * (height + GAP)))
+    with replacing(path) as partial:
+        sheet.save(partial, format="PNG")
+
+
+def _chart_rows(errors: Errors, median: float) -> list[tuple[str, Mapping[int, float], float]]:
+    """Name, errors and their median: of many, those with the largest errors."""
+    worst = sorted(errors, key=lambda name: -max(errors[name].values(), default=0.0))
+    return [(name, errors[name], median) for name in errors if name in worst[:MAX_CHART_ROWS]]
+
+
+def _chart(
+    rows: list[tuple[str, Mapping[int, float], float]], timesteps: tuple[int, ...]
+) -> Image.Image:
+    """A row a camera or region, and a column a timestep."""
+    width = COLUMNS * (TILE_SIZE[0] + GAP) - GAP
+    chart = Image.new("RGB", (width, CELL_HEIGHT * len(rows)), BACKGROUND)
+    stops = np.linspace(0, COLOR_SCALE_END, len(ERROR_COLORS))
+    for row, (name, errors, median) in enumerate(rows):
+        _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
+        cells = np.empty((1, len(timesteps), 3), np.uint8)
+        for column, timestep in enumerate(timesteps):
+            share = errors.get(timestep, 0.0) / max(median, 1e-9 / COLOR_SCALE_END)
+            color = [np.interp(share, stops, channel) for channel in ERROR_COLORS.T]
+            cells[0, column] = color if timestep in errors else NO_FACE
+        size = width - NAME_WIDTH, CELL_HEIGHT - 1
+        strip = Image.fromarray(cells).resize(size, Image.Resampling.NEAREST)
+        chart.paste(strip, (NAME_WIDTH, row * CELL_HEIGHT))
+    return chart
+
+
+def _tile(
+    image: np.ndarray, camera: Camera, vertices: np.ndarray, faces: np.ndarray, caption: str
+) -> Image.Image:
+    """The head in the image, beside it the same with the mesh; below, the caption."""
+    box = left, top, right, bottom = _head_box(camera, vertices)
+    scale = min(PICTURE[0] / (right - left), PICTURE[1] / (bottom - top))
+    small = _cropped(camera, left, top, right - left, bottom - top, scale)
+    size = small.width, small.height
+    picture = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC, box=box)
+    over = with_mesh(np.asarray(picture), vertices, faces, small)
+    tile = Image.new("RGB", TILE_SIZE, BACKGROUND)
+    tile.paste(picture, (0, 0))
+    tile.paste(Image.fromarray(over), (PICTURE[0], 0))
+    _write(tile, (0, PICTURE[1] + 2), caption)
+    return tile
+
+
+def _cropped(camera: Camera, left: int, top: int, width: int, height: int, scale: float) -> Camera:
+    """The camera of a part of its image, scaled."""
+    cx, cy = camera.cx - left, camera.cy - top
+    return replace(camera, width=width, height=height, cx=cx, cy=cy).scaled(scale)
+
+
+def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the head in the image; the whole image where it is outside."""
+    pixels, depth = camera.project(vertices)
+    whole = 0, 0, camera.width, camera.height
+    if not (depth > 0).all():
+        return whole
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    margin = HEAD_MARGIN * (high - low)
+    left, top = np.floor(np.maximum(low - margin, 0)).astype(int).tolist()
+    right, bottom = np.ceil(np.minimum(high + margin, whole[2:])).astype(int).tolist()
+    return (left, top, right, bottom) if right > left and bottom > top else whole
+
+
+def with_mesh(
+    picture: np.ndarray, vertices: np.ndarray, faces: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """The head in the image with the mesh over it, (side, side, 3); black beyond the image."""
-    left, top, right, bottom = head_box(camera, vertices)
-    size = max(right - left, bottom - top)
-    left, top = (left + right - size) // 2, (top + bottom - size) // 2
-    cut = replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top).scaled(
-        side / size
-    )
-    cropped = Image.fromarray(image).crop((left, top, left + size, top + size))
-    small = cropped.resize((cut.width, cut.height), Image.Resampling.BILINEAR)
-    drawn = with_mesh(np.asarray(small), vertices, faces, cut)
-    return np.asarray(Image.fromarray(drawn).resize((side, side)))
+    """The mesh over the picture, colored by the direction of its surface."""
+    triangle, weights = rasterize(vertices, faces, camera)
+    seen = triangle >= 0
+    normals = vertex_normals(vertices, faces) @ camera.world_to_camera[:3, :3].T
+    smooth = (normals[faces[triangle[seen]]] * weights[seen][..., None]).sum(axis=1)
+    colors = 127.5 * (1 + smooth * [1, -1, -1])
+    drawn = picture.astype(np.float64)
+    drawn[seen] += MESH_OPACITY * (colors - drawn[seen])
+    return np.asarray(np.clip(drawn, 0, 255).round(), np.uint8)
+
+
+def _write(image: Image.Image, position: tuple[int, int], text: str, size: int = 12) -> None:
+    font: Any = ImageFont.load_default(size)
+    ImageDraw.Draw(image).text(position, text, fill=TEXT, font=font)

@@ -1,5 +1,4 @@
-"""Smooth offsets of a mesh's vertices along its normals, from where cameras see points of its
-surface."""
+"""Smooth offsets of vertices along their normals, from where cameras see points of the surface."""
 
 from typing import Any
 
@@ -37,24 +36,21 @@ def smooth_offsets(
 
     count = len(vertices)
     rows = np.repeat(np.arange(len(points)), 3)
-    at = coo_array(
-        (points.barycentric.ravel(), (rows, faces[points.face].ravel())), shape=(len(points), count)
-    ).tocsr()
+    places = rows, faces[points.face].ravel()
+    at = coo_array((points.barycentric.ravel(), places), shape=(len(points), count)).tocsr()
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     share = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     area = np.bincount(faces.ravel(), np.repeat(share, 3), count)
     laplacian = _laplacian(vertices, faces, area)
-    prior = OFFSET_DENSITY * (
-        SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
-        + diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))
-    )
+    smooth = SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
+    small = diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))
+    prior = OFFSET_DENSITY * (smooth + small)
     values, trust = np.zeros(count), weight / SURFACE_SIGMA_M**2
     for _ in range(OFFSET_ITERATIONS):
         miss = (residual - at @ values) / (2 * SURFACE_SIGMA_M)
         robust = trust / (1 + miss**2) ** 2 if values.any() else trust / np.sqrt(1 + miss**2)
-        values = spsolve(
-            (at.T @ diags_array(robust) @ at + prior).tocsc(), at.T @ (robust * residual)
-        )
+        matrix = (at.T @ diags_array(robust) @ at + prior).tocsc()
+        values = spsolve(matrix, at.T @ (robust * residual))
     return np.asarray(values)
 
 
@@ -66,15 +62,12 @@ def _laplacian(vertices: np.ndarray, faces: np.ndarray, area: np.ndarray) -> Any
     size, corners = (len(vertices),) * 2, vertices[faces]
     ends = corners[:, [1, 2, 0]] - corners, corners[:, [2, 0, 1]] - corners
     sine = np.linalg.norm(np.cross(*ends), axis=2)
-    weight = (
-        np.clip((ends[0] * ends[1]).sum(2) / np.maximum(sine, 1e-20), -MAX_COTANGENT, MAX_COTANGENT)
-        / 2
-    )
+    cotangent = (ends[0] * ends[1]).sum(2) / np.maximum(sine, 1e-20)
+    weight = np.clip(cotangent, -MAX_COTANGENT, MAX_COTANGENT) / 2
     across = np.stack([faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()])  # from its angle
     half = coo_array((weight.ravel(), across), shape=size).tocsr()
     around = half + half.T
     edges, count = np.unique(np.sort(across, axis=0), axis=1, return_counts=True)
     inner = ~np.isin(np.arange(len(vertices)), edges[:, count == 1])
-    return (
-        diags_array(inner / np.maximum(area, 1e-9)) @ (around - diags_array(around.sum(axis=1)))
-    ).tocsr()
+    difference = around - diags_array(around.sum(axis=1))
+    return (diags_array(inner / np.maximum(area, 1e-9)) @ difference).tocsr()

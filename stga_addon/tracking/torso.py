@@ -29,27 +29,31 @@ from .dense_terms import (
     projection_derivative,
 )
 from .fit import HeadFit
-from .footage.model import Footage, FootageCamera
+from .folder import TorsoMotion, TorsoPoints
+from .footage.model import Footage
 from .landmarks import Report
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
-from .torso_motion import TorsoMotion, TorsoPoints
-from .torso_points import Carrier, Motion, SeenPoints, at_depth, compared, seen_points
 from .torso_take import (
     NECK,
     BothWays,
+    Carrier,
+    Motion,
     PosedTorso,
+    SeenPoints,
     TorsoPose,
     TorsoShot,
     TorsoTake,
+    at_depth,
     axis_angle,
+    compared,
     head_turn,
     joint_rotation,
+    seen_points,
 )
 
 MIN_TIMESTEPS, MAX_CAMERAS = 4, 4
-"""Below it, there is no motion to tell apart; cameras, spread over the rig, whose images are
-compared."""
+"""Below it, there is no motion to tell apart; cameras over the rig, whose images are compared."""
 TIE = 1e-3
 """Difference in the trace of rotations that time decides."""
 MIN_POINTS = 200
@@ -101,29 +105,33 @@ def follow_torso(
     are where the torso rides on the head, and where its motion cannot be told: without masks, in
     takes shorter than MIN_TIMESTEPS, of models without a neck, and where little of a torso is seen.
     """
-    unchanged = dict(parameters)
-    torso = torso_faces(fit.head.model)
+    unchanged, torso = dict(parameters), torso_faces(fit.head.model)
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
         return FollowedTorso(fit, unchanged)
     middle = _middle_timestep(parameters)
-    take = TorsoTake(fit, unchanged, _cameras(footage, middle), torso)
+    some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
+    present = [camera for camera in footage.cameras if middle in camera.timesteps]
+    masked = [camera for camera in present if camera.mask(middle) is not None]
+    take = TorsoTake(fit, unchanged, evenly_spread(masked, MAX_CAMERAS), torso)
     seen = seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
-    some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
     walk = BothWays(helpers, report, len(some) + 3 * len(unchanged))
     motions = _motions(take, seen, some, walk)
     deep = at_depth(take, seen, motions)
     found = compared(take, deep, motions, some)
     own = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
     misfit = {"head": found["head"], "still": found["still"], "own": found[own]}
-    motion = _chosen(misfit)
+    # what explains the images best; a simpler motion unless the gain is clear
+    motion = "own" if misfit["own"] < (1 - MIN_OWN_GAIN) * misfit["still"] else "still"
+    motion = motion if misfit[motion] < (1 - MIN_GAIN) * misfit["head"] else "head"
+    decided = TorsoMotion(motion, misfit, 0.0)
     if motion == "head":
-        return FollowedTorso(fit, unchanged, motion=TorsoMotion(motion, misfit, 0.0))
+        return FollowedTorso(fit, unchanged, motion=decided)
     name = own if motion == "own" else motion
     points = TorsoPoints(middle, deep[name].at)
     bending = found_bending(take, motions[name], points, some, walk) if name == "shifted" else None
-    return _followed(fit, take, motions[name], bending, TorsoMotion(motion, misfit, 0.0), points)
+    return _followed(fit, take, motions[name], bending, decided, points)
 
 
 def _followed(
@@ -135,16 +143,14 @@ def _followed(
     points: TorsoPoints,
 ) -> FollowedTorso:
     """The take with the motion that was chosen."""
-    turn = max(
-        float(np.degrees(np.linalg.norm(joint_rotation(own.parameters, NECK))))
-        for own in posed.values()
+    turns = [np.linalg.norm(joint_rotation(own.parameters, NECK)) for own in posed.values()]
+    shifts = [np.linalg.norm(own.shift) for own in posed.values() if own.shift is not None]
+    motion = replace(
+        motion,
+        turn_deg=max(float(np.degrees(turn)) for turn in turns),
+        shift_mm=1000 * float(max(shifts, default=0.0)),
+        bend_mm=0.0 if bending is None else 1000 * bending.largest,
     )
-    shift = max(
-        (float(np.linalg.norm(own.shift)) for own in posed.values() if own.shift is not None),
-        default=0.0,
-    )
-    bend = 0.0 if bending is None else bending.largest
-    motion = replace(motion, turn_deg=turn, shift_mm=1000 * shift, bend_mm=1000 * bend)
     shifted = {
         t: take.with_offset(own, 0.0 if bending is None else bending.at(t))
         for t, own in posed.items()
@@ -153,11 +159,8 @@ def _followed(
     heads = {t: shifted[t][0] if t in shifted else own.parameters for t, own in posed.items()}
     offsets = {t: offset for t, (_, offset) in shifted.items()}
     if bending is not None:
-        fit = replace(
-            fit,
-            head=with_offset(fit.head, bending.drape),
-            static_offset=bending.drape + (0 if fit.static_offset is None else fit.static_offset),
-        )
+        static = bending.drape + (0 if fit.static_offset is None else fit.static_offset)
+        fit = replace(fit, head=with_offset(fit.head, bending.drape), static_offset=static)
         offsets = {t: offset - bending.drape for t, offset in offsets.items()}
     return FollowedTorso(fit, heads, offsets, motion, points)
 
@@ -165,8 +168,7 @@ def _followed(
 def _motions(
     take: TorsoTake, seen: SeenPoints, some: Sequence[int], walk: BothWays
 ) -> dict[str, Motion]:
-    """The motions that the torso may have; some: timesteps at which it is followed first, to find
-    the points' depth."""
+    """The motions that a torso may have; some: first followed to find the points' depth."""
     everything = sorted(take.parameters)
     seen = at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [(take, seen, False)], some)
@@ -181,30 +183,13 @@ def _motions(
     }
 
 
-def _chosen(misfit: Mapping[str, float]) -> str:
-    """The motion that explains the images best; a simpler one unless the gain is clear."""
-    best = "own" if misfit["own"] < (1 - MIN_OWN_GAIN) * misfit["still"] else "still"
-    return best if misfit[best] < (1 - MIN_GAIN) * misfit["head"] else "head"
-
-
 def _middle_timestep(parameters: Mapping[int, np.ndarray]) -> int:
-    """The timestep at which the head is turned most nearly as on average: there the torso is taken
-    to be straight."""
+    """The timestep with the head's most average turn, where the torso is taken to be straight."""
     timesteps = sorted(parameters)
     turns = np.stack([head_turn(parameters[timestep]) for timestep in timesteps])
     # of a head that does not turn, the middle of the take
     late = np.abs(np.linspace(-1, 1, len(timesteps)))
     return timesteps[int(((turns * turns.mean(0)).sum((1, 2)) - TIE * late).argmax())]
-
-
-def _cameras(footage: Footage, timestep: int) -> list[FootageCamera]:
-    """Cameras with a masked frame at the timestep."""
-    seen = [
-        camera
-        for camera in footage.cameras
-        if timestep in camera.timesteps and camera.mask(timestep) is not None
-    ]
-    return evenly_spread(seen, MAX_CAMERAS)
 
 
 def _poses(
@@ -219,10 +204,7 @@ def _follow(
     take: TorsoTake, seen: SeenPoints, shifts: bool, way: Sequence[int], step: Step
 ) -> dict[str, np.ndarray]:
     poses = _Follower(take, seen, shifts).follow(way, step)
-    return {
-        "turn": np.stack([pose.turn for pose in poses]),
-        "shift": np.stack([pose.shift for pose in poses]),
-    }
+    return {name: np.stack([getattr(own, name) for own in poses]) for name in ("turn", "shift")}
 
 
 class _Follower:
@@ -253,13 +235,13 @@ class _Follower:
             moved = self._take.pivot(before) - self._take.pivot(timestep)
             starts.append(TorsoPose(pose.turn, pose.shift + moved))
         starts = [self._descended(timestep, shot, start, pose, COARSE_STEPS) for start in starts]
-        misfits = [self._misfit(timestep, shot, start) for start in starts]
+        misfits = []
+        for start in starts:
+            at = self._posed(timestep, start)
+            share, shown = self._seen.unexplained(shot, at, START_LEVEL)
+            use = shown & self._seen.fitted
+            misfits.append(float(share[use].mean()) if use.any() else 1.0)
         return self._descended(timestep, shot, starts[int(np.argmin(misfits))], pose, FINE_STEPS)
-
-    def _misfit(self, timestep: int, shot: TorsoShot, pose: TorsoPose) -> float:
-        share, shown = self._seen.unexplained(shot, self._posed(timestep, pose), START_LEVEL)
-        use = shown & self._seen.fitted
-        return float(share[use].mean()) if use.any() else 1.0
 
     def _descended(
         self,
@@ -280,11 +262,8 @@ class _Follower:
                     pixels, _ = own.camera.project(at[rows])
                     slope = np.stack(sampled(list(own.gradient), pixels), axis=2) / NOISE_LEVELS
                     rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
-                    used = (
-                        POINT_SHARE
-                        / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
-                    )
-                    weight = used[:, None] * CHANNEL_WEIGHTS
+                    share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
+                    weight = (POINT_SHARE / (1 + share) ** 2)[:, None] * CHANNEL_WEIGHTS
                     matrix = matrix + np.einsum("nc,nci,ncj->ij", weight, rate, rate)
                     right = right - np.einsum("nc,nci,nc->i", weight, rate, residual)
                 pose, size = self._stepped(pose, matrix, right)
@@ -299,13 +278,11 @@ class _Follower:
         old, found = self._posed(before, pose), pose
         flows = flow_targets(old, list(shot_before.views.values()), list(shot.views.values()))
         targets = {key[0]: (camera, target) for key, camera, target in flows}
-        shown = [
-            (number, rows) for number, rows in self._visible(shot_before, old) if number in targets
-        ]
+        shown = self._visible(shot_before, old)
         for _ in range(FLOW_ITERATIONS):
             at, by_pose = self._linearized(timestep, found)
             matrix, right = _prior(found, pose)
-            for number, rows in shown:
+            for number, rows in (own for own in shown if own[0] in targets):
                 camera, target = targets[number]
                 miss = camera.project(at[rows])[0] - target[rows]
                 weight = FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
@@ -316,19 +293,18 @@ class _Follower:
         return found
 
     def _visible(self, shot: TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
-        """Number of each camera that sees any of its points that are fitted, and the rows of
-        these."""
+        """Number of each camera that sees any of its fitted points, and the rows of these."""
+        fitted = self._seen.fitted
         chosen = [
-            (number, rows[self._seen.fitted[rows] & shot.shows(number, at[rows])])
+            (number, rows[fitted[rows] & shot.shows(number, at[rows])])
             for number, rows in self._seen.rows.items()
             if number in shot.views
         ]
-        return [(number, rows) for number, rows in chosen if len(rows)]
+        return [own for own in chosen if len(own[1])]
 
     def _posed(self, timestep: int, pose: TorsoPose) -> np.ndarray:
-        return self._carrier.carried(self._take.with_torso(timestep, pose, self._shifts))(
-            self._seen.at
-        )
+        torso = self._take.with_torso(timestep, pose, self._shifts)
+        return self._carrier.carried(torso)(self._seen.at)
 
     def _linearized(self, timestep: int, pose: TorsoPose) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3), and derivatives (N, 3, 6) by a small rotation in front of the
@@ -346,9 +322,8 @@ class _Follower:
         step[:free] = np.linalg.solve(matrix[:free, :free], right[:free])
         size = float(np.linalg.norm(step))
         step *= min(1.0, MAX_STEP / max(size, 1e-12))
-        return TorsoPose(
-            axis_angle_matrices(step[None, :3])[0] @ pose.turn, pose.shift + step[3:]
-        ), size
+        turn = axis_angle_matrices(step[None, :3])[0] @ pose.turn
+        return TorsoPose(turn, pose.shift + step[3:]), size
 
 
 def _prior(pose: TorsoPose, usual: TorsoPose) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,9 @@
 """The torso's surface as it bends: cloth wrinkles and slides, which a rigid torso cannot follow.
 
+FLAME ends in a ring of shoulders of a hand's width. Splats on clothes that hang on such a ring can
+only move as one. Its end is drawn out over the torso as far as cameras see it: then its triangles
+lie where the splats are, and its vertices can bend them.
+
 Each image is brought back to where one timestep shows the torso. Optical flow between the two shows
 what its motion so far misses, and the vertices of its sheet move by that, of all cameras together
 and smoothly.
@@ -14,17 +18,23 @@ import numpy as np
 
 from ..capture.mesh_geometry import rasterize
 from ..flame.forward import axis_angle_matrices
+from ..flame.model import FlameModel, torso_faces
 from ..worker.helpers import Step
 from .appearance import NOISE_LEVELS, sampled
 from .dense_terms import MIN_FLOW_SIDE_PX, inside, projection_derivative
-from .torso_drape import TorsoSheet, draped, torso_sheet
-from .torso_motion import TorsoPoints
-from .torso_points import HELD_OUT
-from .torso_take import ROOT, BothWays, PosedTorso, TorsoShot, TorsoTake, joint_rotation
+from .folder import TorsoPoints
+from .torso_take import (
+    HELD_OUT,
+    ROOT,
+    BothWays,
+    PosedTorso,
+    TorsoShot,
+    TorsoTake,
+    joint_rotation,
+)
 
 BLOCK_PX = 12
-"""Side of the blocks of pixels of which one in HELD_OUT is not fitted, and tells whether bending is
-right."""
+"""Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether bending is right."""
 ROUGHNESS_M, BEND_SIGMA_M = 0.0005, 0.02
 """Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
 FLOW_SIGMA_PX, FLOW_SHARE = 0.5, 0.15
@@ -39,6 +49,95 @@ STEPS = 4
 """Gauss–Newton steps for each timestep."""
 HELD = 1e10
 """Precision that holds a vertex."""
+DEPTH_SIGMA_M, MIN_WEIGHT = 0.02, 0.5
+"""Over which points' depths are averaged; sum of weights from which the surface is seen."""
+DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
+"""From the base of the neck, as seen from the front: from straight down to the person's left."""
+SLOPE = 0.8
+"""Of the angle around the neck: shoulders slope down."""
+REACH_RAD, DIRECTION_SIGMA = np.radians(10), 1.0
+"""Of a direction to both sides; smoothing of what is found in them, in steps."""
+MIN_POINTS, FARTHEST_SHARE, BEYOND_M = 5, 0.98, 0.015
+"""Of a direction: points from which it is seen, share that the mesh reaches, how far beyond."""
+FULL_HEIGHT = 0.5
+"""Height (see `TorsoSheet`) from which vertices lie on the surface alone."""
+
+
+@dataclass(frozen=True)
+class TorsoSheet:
+    """The torso's part of a head model's mesh.
+
+    vertices   (N,) ids
+    triangles  (F,) bool of the whole mesh
+    laplacian  sparse (N, N): number of a vertex's neighbors, and −1 for each
+    height     (N,) from 0 where it joins the head to 1 at the mesh's end
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    laplacian: Any
+    height: np.ndarray
+
+
+def torso_sheet(model: FlameModel) -> TorsoSheet | None:
+    """The torso of a head model; None where it does not end in an open rim below the head."""
+    from scipy.sparse import coo_array, csgraph
+    from scipy.sparse.linalg import spsolve
+
+    torso = torso_faces(model)
+    vertices = np.unique(model.faces[torso])
+    used, count = np.unique(_edges(model.faces), axis=0, return_counts=True)
+    rim = np.intersect1d(used[count == 1], vertices)
+    top = np.setdiff1d(np.intersect1d(model.faces[~torso], vertices), rim)
+    if not len(rim) or not len(top):
+        return None
+    a, b = np.searchsorted(vertices, np.unique(_edges(model.faces[torso]), axis=0)).T
+    near = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(len(vertices),) * 2)
+    if csgraph.connected_components(near)[0] > 1:
+        return None
+    laplacian = csgraph.laplacian(near).tocsr()
+    height = np.zeros(len(vertices))
+    height[np.searchsorted(vertices, rim)] = 1
+    inner = np.flatnonzero(~np.isin(vertices, np.concatenate([rim, top])))
+    height[inner] = spsolve(laplacian[inner][:, inner].tocsc(), -(laplacian[inner] @ height))
+    return TorsoSheet(vertices, torso, laplacian, height)
+
+
+def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Where the sheet's vertices (N, 3) lie when it is drawn over the surface that points (P, 3)
+    show.
+
+    Both in the torso's axes, from the base of the neck: x to the person's left, y up, z forward.
+    What lies around the neck, from its front to its sides, is unrolled as seen from the front, from
+    straight down to the shoulders. Vertices where nothing is seen, as at the back, stay.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    # how far the points reach in directions around the neck, and how surely these are seen
+    angle, distance = np.arctan2(points[:, 0], -points[:, 1]), np.linalg.norm(points[:, :2], axis=1)
+    found, seen = np.zeros(len(DIRECTIONS_RAD)), np.zeros(len(DIRECTIONS_RAD))
+    for number, own in enumerate(DIRECTIONS_RAD):
+        near = np.abs(angle - own) < REACH_RAD
+        if near.sum() >= MIN_POINTS:
+            found[number], seen[number] = np.quantile(distance[near], FARTHEST_SHARE) + BEYOND_M, 1
+    sure = gaussian_filter1d(seen, DIRECTION_SIGMA, mode="constant")
+    found = gaussian_filter1d(found, DIRECTION_SIGMA, mode="constant") / np.maximum(sure, 1e-6)
+    around = SLOPE * np.arctan2(at[:, 0], at[:, 2])
+    directions = (np.interp(around, DIRECTIONS_RAD, own, 0, 0) for own in (seen, found, sure))
+    known, farthest, share = directions
+    trust = np.where(known > 0.5, share, 0.0)
+    outer = farthest[:, None] * np.stack([np.sin(around), -np.cos(around)], axis=1)
+    flat = at[:, :2] + sheet.height[:, None] * (outer - at[:, :2])
+    near = np.exp(-((flat[:, None] - points[:, :2]) ** 2).sum(2) / (2 * DEPTH_SIGMA_M**2))
+    weight = near.sum(1)
+    target = np.column_stack([flat, near @ points[:, 2] / np.maximum(weight, 1e-9)])
+    share = np.minimum(sheet.height / FULL_HEIGHT, 1) * trust * (weight > MIN_WEIGHT)
+    return np.asarray(at + share[:, None] * (target - at))
+
+
+def _edges(faces: np.ndarray) -> np.ndarray:
+    """(3 F, 2) vertex ids, the smaller one first."""
+    return np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
 
 
 @dataclass(frozen=True)
@@ -73,8 +172,7 @@ def found_bending(
     some: Sequence[int],
     walk: BothWays,
 ) -> Bending | None:
-    """How a torso with a rigid motion bends; None where the images of some timesteps are not
-    explained better by it."""
+    """How a torso with a rigid motion bends; None where images are not explained better so."""
     sheet = torso_sheet(take.model)
     if sheet is None:
         return None
@@ -86,9 +184,7 @@ def found_bending(
     cloth = _Cloth(take, sheet, motion, points.timestep, drape)
     (found,) = walk.along(_bend, [(cloth,)], points.timestep, sorted(motion))
     bends = {timestep: arrays["bend"] for timestep, arrays in found.items()}
-    rigid, bent = cloth.misfit(
-        bends, [timestep for timestep in some if timestep != points.timestep]
-    )
+    rigid, bent = cloth.misfit(bends, [t for t in some if t != points.timestep])
     if not bent < (1 - MIN_GAIN) * rigid:
         return None
     whole = np.zeros_like(take.model.v_template)
@@ -147,8 +243,7 @@ def _bend(cloth: "_Cloth", way: Sequence[int], step: Step) -> dict[str, np.ndarr
 
 
 class _Cloth:
-    """How the sheet bends over a take, as (N, 3) offsets of its vertices in the torso's axes, in
-    meters."""
+    """How the sheet bends: (N, 3) offsets of its vertices in the torso's axes, in meters."""
 
     def __init__(
         self,
@@ -162,13 +257,8 @@ class _Cloth:
         torso's axes; first: the timestep that the others are compared with."""
         from scipy.sparse import diags_array, eye_array, kron
 
-        self._take, self._sheet, self._motion, self._first, self._drape = (
-            take,
-            sheet,
-            motion,
-            first,
-            drape,
-        )
+        self._take, self._sheet, self._motion = take, sheet, motion
+        self._first, self._drape = first, drape
         mean = diags_array(1 / sheet.laplacian.diagonal()) @ sheet.laplacian
         held = HELD * ~drape.any(1)
         own = mean.T @ mean / ROUGHNESS_M**2 + diags_array(BEND_SIGMA_M**-2 + held)
@@ -190,38 +280,30 @@ class _Cloth:
     def misfit(
         self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]
     ) -> tuple[float, float]:
-        """Share, from 0 to 1, of the pixels that were not fitted that images do not explain: rigid,
-        and bent."""
+        """Share, 0 to 1, of pixels that were not fitted that is not explained: rigid, and bent."""
         total, count, rigid = np.zeros(2), 0, np.zeros_like(self._drape)
         for timestep in timesteps:
             shot = self._take.shot(timestep)
             for number in self._numbers(shot):
                 reference = self._references[number]
-                both = [
-                    self._returned(timestep, shot, number, bend)
-                    for bend in (rigid, bends[timestep])
-                ]
+                each = (rigid, bends[timestep])
+                both = [self._returned(timestep, shot, number, bend) for bend in each]
                 use = both[0].visible & both[1].visible & ~reference.fitted
-                changed = np.array(
-                    [
-                        (own.luma.astype(float) - reference.luma)[reference.pixels][use]
-                        for own in both
-                    ]
-                )
-                total += (changed**2 / (CHANGE_OUTLIER_LEVELS**2 + changed**2)).sum(1)
+                change = np.stack([own.luma.astype(float) - reference.luma for own in both])
+                squared = change[:, *reference.pixels][:, use] ** 2
+                total += (squared / (CHANGE_OUTLIER_LEVELS**2 + squared)).sum(1)
                 count += int(use.sum())
         return float(total[0] / max(count, 1)), float(total[1] / max(count, 1))
 
     def _numbers(self, shot: TorsoShot) -> list[int]:
-        """Of the cameras that see the sheet at the first timestep and now, in images of one
-        size."""
+        """Of the cameras that see the sheet at first and now, in images of one size."""
+        known = [(n, self._references[n]) for n in shot.views if n in self._references]
         return [
             number
-            for number, view in shot.views.items()
-            if number in self._references
-            and self._references[number].corners.size
-            and view.levels[0].channels.shape[:2] == self._references[number].shown.shape
-            and min(self._references[number].shown.shape) >= MIN_FLOW_SIDE_PX
+            for number, own in known
+            if own.corners.size
+            and shot.views[number].levels[0].channels.shape[:2] == own.shown.shape
+            and min(own.shown.shape) >= MIN_FLOW_SIDE_PX
         ]
 
     def _reference(self, shot: TorsoShot, number: int) -> _Reference:
@@ -231,24 +313,20 @@ class _Cloth:
         triangle, barycentric = rasterize(mesh, model.faces, camera)
         shown = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
         rows, columns = np.nonzero(shown)
-        corners, weights = (
-            sheet.rows(model.faces[triangle[rows, columns]]),
-            barycentric[rows, columns],
-        )
+        corners = np.searchsorted(sheet.vertices, model.faces[triangle[rows, columns]])
+        weights = barycentric[rows, columns]
         at = np.einsum("pk,pki->pi", weights, mesh[sheet.vertices][corners])
         visible = self._visible(shot, number, at)
         shown[rows, columns] = visible
         fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
-        return _Reference(
-            shown, _luma(shot, number), corners[visible], weights[visible], fitted[visible]
-        )
+        luma, points = _luma(shot, number), (corners[visible], weights[visible])
+        return _Reference(shown, luma, *points, fitted[visible])
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
         """(N, 3) of the sheet's vertices."""
         torso = self._motion[timestep]
-        return np.asarray(
-            _rigid(self._take, torso, self._sheet.vertices) + (self._drape + bend) @ _axes(torso).T
-        )
+        rigid = _rigid(self._take, torso, self._sheet.vertices)
+        return np.asarray(rigid + (self._drape + bend) @ _axes(torso).T)
 
     @staticmethod
     def _visible(shot: TorsoShot, number: int, at: np.ndarray) -> np.ndarray:
@@ -256,15 +334,13 @@ class _Cloth:
         view = shot.views[number]
         share = sampled([shot.masks[number].astype(np.float32)], view.camera.project(at)[0])[0]
         finest = view.levels[0].camera
-        return np.asarray(
-            shot.shows(number, at) & inside(finest, *finest.project(at)) & (share > 127)
-        )
+        within = inside(finest, *finest.project(at)) & (share > 127)
+        return np.asarray(shot.shows(number, at) & within)
 
     def _returned(self, timestep: int, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
         reference = self._references[number]
-        at = np.einsum(
-            "pk,pki->pi", reference.barycentric, self._positions(timestep, bend)[reference.corners]
-        )
+        corners = self._positions(timestep, bend)[reference.corners]
+        at = np.einsum("pk,pki->pi", reference.barycentric, corners)
         source, _ = shot.views[number].levels[0].camera.project(at)
         luma = reference.luma.copy()
         values = sampled([_luma(shot, number).astype(np.float32)], source)[0]
@@ -284,15 +360,11 @@ class _Cloth:
             turned = projection_derivative(shot.views[number].levels[0].camera, now.at[used]) @ axes
             rates = turned[:, :, None, :] * reference.barycentric[used][:, None, :, None]
             rows = np.broadcast_to(np.arange(2 * len(used)).reshape(-1, 2, 1, 1), rates.shape)
-            columns = np.broadcast_to(
-                (3 * reference.corners[used][..., None] + np.arange(3))[:, None], rates.shape
-            )
-            rate = csr_array(
-                (rates.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * len(used), bend.size)
-            )
-            weighted = rate.T @ diags_array(
-                np.repeat(FLOW_SHARE / FLOW_SIGMA_PX**2 * weight[used], 2)
-            )
+            moved = 3 * reference.corners[used][..., None] + np.arange(3)
+            places = rows.ravel(), np.broadcast_to(moved[:, None], rates.shape).ravel()
+            rate = csr_array((rates.ravel(), places), shape=(2 * len(used), bend.size))
+            precision = np.repeat(FLOW_SHARE / FLOW_SIGMA_PX**2 * weight[used], 2)
+            weighted = rate.T @ diags_array(precision)
             matrix, right = matrix + weighted @ rate, right + weighted @ miss[used].ravel()
         return np.asarray(bend + _solved(matrix.tocsr(), right).reshape(-1, 3))
 
@@ -315,8 +387,7 @@ def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:
 
 
 def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarray]:
-    """By how many pixels (P, 2) the images show points beside where they are, and weights (P,) from
-    0 to 1."""
+    """Pixels (P, 2) from points to where the images show them, and weights (P,), 0 to 1."""
     import cv2
 
     opencv: Any = cv2  # whose type stubs lack DIS
@@ -331,12 +402,9 @@ def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarr
     weight = now.visible & reference.fitted & np.isfinite(found).all(1)
     found = np.where(weight[:, None], found, 0)
     miss = np.where(weight[:, None], found[:, :2] - now.source, 0)
-    changed = found[:, 2] - reference.luma[rows, columns]
-    distance = np.linalg.norm(miss, axis=1)
-    share = 1 / (
-        (1 + (distance / FLOW_OUTLIER_PX) ** 2) * (1 + (changed / CHANGE_OUTLIER_LEVELS) ** 2)
-    )
-    return miss, weight * share
+    far = np.linalg.norm(miss, axis=1) / FLOW_OUTLIER_PX
+    changed = (found[:, 2] - reference.luma[rows, columns]) / CHANGE_OUTLIER_LEVELS
+    return miss, weight * (1 / ((1 + far**2) * (1 + changed**2)))
 
 
 def _luma(shot: TorsoShot, number: int) -> np.ndarray:

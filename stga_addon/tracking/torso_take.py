@@ -1,23 +1,26 @@
-"""The frames of a tracked take in which the torso is followed, and the head's parameters with any
-orientation of it."""
+"""A tracked take in which the torso is followed: its frames, the head's parameters with any
+orientation of it, the points that cameras see at it, and which motion the images agree with."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from ..avatar.embedding import FaceFrames, face_frames
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import silhouette
+from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..worker.helpers import Helpers
-from .appearance import pyramid
-from .dense_terms import PyramidView, inside
+from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
+from .dense_terms import OUTLIER_SQUARED, PyramidView, inside
 from .fit import HeadFit
 from .footage.model import FootageCamera
 from .landmarks import Report
+from .posed_points import PosedPoints, SurfacePoints
 from .write_capture import posed_mesh
 
 ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")
@@ -29,6 +32,18 @@ OFFSET_STEPS = 6
 """After which offsets, which move joints, which move vertices, are those wanted."""
 EVIDENCE_LEVEL = 1
 """Level of the pyramid in which motions are compared."""
+POINT_STEP_M, MAX_POINTS = 0.005, 800
+"""Distance between points at the torso, and how many of them a camera has at most."""
+BLOCK_POINTS, HELD_OUT = 4, 3
+"""Side of blocks in points; one of so many is not fitted, and tells which motion is right."""
+MASK_MARGIN = 0.01
+"""Around the mask, whose edge is compared as well; share of the image's height."""
+DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
+"""Along a ray, from the mesh's depth beside it, that are tried: a chest is before the neck."""
+DEPTH_TIMESTEPS, NEIGHBORS, UNSEEN_COST = 8, 25, 0.5
+"""Timesteps at which depths are compared; points that count for each other; cost unseen."""
+ALONG_CAMERAS = CHANNEL_WEIGHTS * [0, 1, 1]
+"""Weights of channels between cameras, from which surfaces are not equally bright."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +58,13 @@ class PosedTorso:
     shift: np.ndarray | None = None
 
 
+Motion = Mapping[int, PosedTorso]
+"""By timestep."""
+
+
 @dataclass(frozen=True)
 class TorsoPose:
-    """Orientation (3, 3) of the torso in the world, and its shift (3,) in meters, 0 where it is
-    only turned."""
+    """Orientation (3, 3) of the torso in the world, and shift (3,) in meters, 0 if only turned."""
 
     turn: np.ndarray
     shift: np.ndarray
@@ -62,18 +80,15 @@ class TorsoShot:
     heads: Mapping[int, np.ndarray]
 
     def shows(self, number: int, at: np.ndarray) -> np.ndarray:
-        """(N,) bool: points (N, 3) that lie in the camera's image, and not behind or before the
-        head."""
+        """(N,) bool: points (N, 3) in the camera's image, not behind or before the head."""
         camera, head = self.views[number].levels[EVIDENCE_LEVEL].camera, self.heads[number]
-        x, y = np.clip(
-            camera.project(at)[0].astype(int), 0, [camera.width - 1, camera.height - 1]
-        ).T
-        return np.asarray(inside(camera, *camera.project(at)) & ~head[y, x])
+        pixels, depth = camera.project(at)
+        x, y = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
+        return np.asarray(inside(camera, pixels, depth) & ~head[y, x])
 
 
 class TorsoTake:
-    """The tracked take: images by timestep, and the head's parameters with any orientation of the
-    torso."""
+    """The take: images by timestep, and the head's parameters with any turn of the torso."""
 
     def __init__(
         self,
@@ -82,13 +97,8 @@ class TorsoTake:
         cameras: Sequence[FootageCamera],
         torso: np.ndarray,
     ) -> None:
-        self.model, self.parameters, self.cameras, self.torso = (
-            fit.head.model,
-            parameters,
-            cameras,
-            torso,
-        )
-        self._fit = fit
+        self.model, self.parameters = fit.head.model, parameters
+        self.cameras, self.torso, self._fit = cameras, torso, fit
         regressor = self.model.j_regressor[[ROOT, NECK]]
         self._joints = regressor @ self.model.v_template
         self._joint_dirs = np.einsum("jv,vak->jak", regressor, self.model.shapedirs)
@@ -102,18 +112,15 @@ class TorsoTake:
 
     def motion(self, poses: Mapping[int, TorsoPose], rigid: bool) -> dict[int, PosedTorso]:
         """The torso posed at each timestep."""
-        return {
-            timestep: self.with_torso(timestep, pose, rigid) for timestep, pose in poses.items()
-        }
+        return {t: self.with_torso(t, pose, rigid) for t, pose in poses.items()}
 
     def rigid(self, parameters: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """(N, 3) where the root joint alone carries some vertices (N,)."""
         expr, rigid = parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
         root = self._joints[0] + self._joint_dirs[0] @ expr
         rest = self.model.v_template[vertices] + self.model.shapedirs[vertices] @ expr
-        return np.asarray(
-            (rest - root) @ axis_angle_matrices(rigid[None, :3])[0].T + root + rigid[-3:]
-        )
+        turn = axis_angle_matrices(rigid[None, :3])[0]
+        return np.asarray((rest - root) @ turn.T + root + rigid[-3:])
 
     def with_offset(
         self, torso: PosedTorso, bend: np.ndarray | float = 0.0
@@ -126,17 +133,13 @@ class TorsoTake:
         the head.
         """
         assert torso.shift is not None
-        model, parameters, offset = (
-            self.model,
-            torso.parameters.copy(),
-            np.zeros_like(self.model.v_template),
-        )
+        model, parameters = self.model, torso.parameters.copy()
+        offset = np.zeros_like(model.v_template)
         share = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
         moved = np.flatnonzero(share)
         before = posed_mesh(self._fit, parameters)[moved]
-        wanted = before + share[moved, None] * (
-            self.rigid(parameters, moved) + torso.shift - before
-        )
+        apart = self.rigid(parameters, moved) + torso.shift - before
+        wanted = before + share[moved, None] * apart
         root = axis_angle_matrices(joint_rotation(parameters, ROOT)[None])[0]
         wanted += np.broadcast_to(bend, offset.shape)[moved] @ root.T
         turns = axis_angle_matrices(parameters[-RIGID_SIZE:-3].reshape(-1, 3))
@@ -153,9 +156,8 @@ class TorsoTake:
 
     def base(self, parameters: np.ndarray) -> np.ndarray:
         """(3,) the root joint, inside the base of the neck."""
-        return np.asarray(
-            self._joints[0] + self._joint_dirs[0] @ parameters[:-RIGID_SIZE] + parameters[-3:]
-        )
+        root = self._joints[0] + self._joint_dirs[0] @ parameters[:-RIGID_SIZE]
+        return np.asarray(root + parameters[-3:])
 
     def pivot(self, timestep: int) -> np.ndarray:
         """(3,) what the torso turns about: the joint of the neck."""
@@ -177,13 +179,14 @@ class TorsoTake:
         for number, source in enumerate(self.cameras):
             mask = source.mask(timestep) if timestep in source.timesteps else None
             if mask is not None:
+                image, edge = source.image(timestep).copy(), (mask > 0) & (mask < 255)
+                share = mask[edge][:, None].astype(np.float32) / 255
+                image[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
+                image[mask == 0] = PLAIN_LEVEL
                 camera = self._fit.to_capture.camera(source.camera)
-                levels = pyramid(camera, _masked(source.image(timestep), mask), self._center)
-                views[number] = PyramidView(bytes([number]), camera, levels)
-                heads[number], masks[number] = (
-                    self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera),
-                    mask,
-                )
+                levels = pyramid(camera, image, self._center)
+                views[number], masks[number] = PyramidView(bytes([number]), camera, levels), mask
+                heads[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera)
         return TorsoShot(views, masks, heads)
 
     def head_pixels(self, mesh: np.ndarray, camera: Camera) -> np.ndarray:
@@ -205,22 +208,24 @@ class BothWays:
         first: int,
         timesteps: Sequence[int],
     ) -> list[dict[int, dict[str, np.ndarray]]]:
-        """For each part, by timestep, the rows of the arrays that work(*part, way, step) gives for
-        both ways."""
+        """For each part, by timestep, rows of the arrays that work(*part, way, step) gives."""
         later = [first, *(t for t in timesteps if t > first)]
         earlier = [first, *(t for t in reversed(timesteps) if t < first)]
         every, done = [(*part, way) for part in parts for way in (later, earlier)], self._done
-        found = self._helpers.map(
-            work, every, lambda n: self._report("Torso", done + n, self._total), keep=True
-        )
+
+        def count(number: int) -> None:
+            self._report("Torso", done + number, self._total)
+
+        found, results = self._helpers.map(work, every, count, keep=True), []
         self._done += len(parts) * (len(later) + len(earlier) - 2)
-        rows = [
-            {t: {name: array[row] for name, array in own.items()} for row, t in enumerate(way)}
-            for (*_, way), own in zip(every, found, strict=True)
-        ]
-        return [
-            dict(sorted({**a, **b}.items())) for a, b in zip(rows[::2], rows[1::2], strict=True)
-        ]
+        for both in zip(found[::2], found[1::2], strict=True):
+            rows = {
+                t: {name: array[row] for name, array in own.items()}
+                for way, own in zip((later, earlier), both, strict=True)
+                for row, t in enumerate(way)
+            }
+            results.append(dict(sorted(rows.items())))
+        return results
 
 
 def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:
@@ -229,9 +234,7 @@ def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> 
 
     arm (3,): from the root joint to the neck's, before posing.
     """
-    before, neck = axis_angle_matrices(
-        np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)])
-    )
+    before, neck = _root_and_neck(parameters)
     changed = parameters.copy()
     rigid = changed[-RIGID_SIZE:]
     rigid[3 * ROOT : 3 * ROOT + 3] = axis_angle(rotation)
@@ -242,10 +245,13 @@ def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> 
 
 def head_turn(parameters: np.ndarray) -> np.ndarray:
     """(3, 3) orientation of the head in the world."""
-    root, neck = axis_angle_matrices(
-        np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)])
-    )
+    root, neck = _root_and_neck(parameters)
     return np.asarray(root @ neck)
+
+
+def _root_and_neck(parameters: np.ndarray) -> np.ndarray:
+    both = np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)])
+    return axis_angle_matrices(both)
 
 
 def joint_rotation(parameters: np.ndarray, joint: int) -> np.ndarray:
@@ -263,10 +269,184 @@ def grown(where: np.ndarray, share: float) -> np.ndarray:
     return np.asarray(binary_dilation(where, iterations=max(1, round(share * len(where)))))
 
 
-def _masked(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The image (H, W, 3) uint8 over plain gray."""
-    laid, edge = image.copy(), (mask > 0) & (mask < 255)
-    share = mask[edge][:, None].astype(np.float32) / 255
-    laid[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
-    laid[mask == 0] = PLAIN_LEVEL
-    return laid
+# Points
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """N points below the head as the cameras see them at one timestep.
+
+    rows       number of a camera -> the rows of its own points: how deep they lie is a guess that
+               other cameras lack
+    at, ray    (N, 3) meters; unit vectors away from their camera
+    fitted     (N,) bool: points that the motion is fitted to
+    reference  by level, the images' channels (N, 3)
+    """
+
+    timestep: int
+    rows: Mapping[int, np.ndarray]
+    at: np.ndarray
+    ray: np.ndarray
+    fitted: np.ndarray
+    reference: Sequence[np.ndarray]
+
+    def unexplained(
+        self, shot: TorsoShot, at: np.ndarray, level: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Share (N,) from 0 to 1 of each point, moved to `at` (N, 3), that the images do not
+        explain, and (N,) bool whether it is seen."""
+        share, seen = np.zeros(len(at)), np.zeros(len(at), bool)
+        for number, rows in self.rows.items():
+            if number in shot.views:
+                share[rows] = self.share(shot, number, rows, at[rows], level)
+                seen[rows] = shot.shows(number, at[rows])
+        return share, seen
+
+    def share(
+        self,
+        shot: TorsoShot,
+        number: int,
+        rows: np.ndarray,
+        at: np.ndarray,
+        level: int,
+        weights: np.ndarray = CHANNEL_WEIGHTS,
+    ) -> np.ndarray:
+        """(M,), 0 to 1: how little a camera's image at points (M, 3) looks like the reference."""
+        squared = self.residual(shot, number, rows, at, level) ** 2 @ weights
+        return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
+
+    def residual(
+        self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int
+    ) -> np.ndarray:
+        """Channels (M, 3) of a camera's image at points less the reference's, in NOISE_LEVELS."""
+        own = shot.views[number].levels[level]
+        values = sampled([own.channels], own.camera.project(at)[0])[0]
+        return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
+
+
+def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
+    """What cameras see below the head: points on pixels' rays, as deep as the mesh beside."""
+    from scipy.spatial import cKDTree
+
+    shot, mesh = take.shot(timestep), take.mesh(take.parameters[timestep])
+    at, rays, fitted = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, bool)]
+    reference: list[list[np.ndarray]] = [[np.zeros((0, 3), np.float32)] for _ in OUTLIER_SQUARED]
+    numbers, count = {}, 0
+    for number, view in shot.views.items():
+        camera, mask = view.camera, shot.masks[number]
+        pixels, depth = camera.project(mesh[take.model.faces].mean(1))
+        step = max(1.0, POINT_STEP_M * camera.fl_x / float(np.median(depth)))
+        rows, columns = np.indices((int(camera.height / step), int(camera.width / step)))
+        places = (np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5) * step
+        x, y = places.astype(int).T
+        _, nearest = cKDTree(pixels).query(places)
+        shown = grown(mask > 127, MASK_MARGIN) & ~take.head_pixels(mesh, camera)
+        kept = np.flatnonzero(shown[y, x] & take.torso[nearest])
+        kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
+        if not len(kept):
+            continue
+        own = camera.unproject(places[kept], depth[nearest[kept]])
+        block = (rows // BLOCK_POINTS + columns // BLOCK_POINTS).ravel()[kept]
+        away = own - camera.position
+        at, fitted = [*at, own], [*fitted, block % HELD_OUT != 0]
+        rays.append(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))
+        for values, level in zip(reference, view.levels, strict=False):
+            values += sampled([level.channels], level.camera.project(own)[0])
+        numbers[number] = count + np.arange(len(own))
+        count += len(own)
+    every, ray, use = np.concatenate(at), np.concatenate(rays), np.concatenate(fitted)
+    return SeenPoints(timestep, numbers, every, ray, use, list(map(np.concatenate, reference)))
+
+
+class Carrier:
+    """The torso's triangles, which carry points as they carry splats: each the nearest one."""
+
+    def __init__(self, take: TorsoTake, first: PosedTorso, at: np.ndarray) -> None:
+        """at (N, 3): where the points are at first."""
+        from scipy.spatial import cKDTree
+
+        candidates = np.flatnonzero(take.torso)
+        centers = take.mesh(first.parameters)[take.model.faces[candidates]].mean(1)
+        used, self._face = np.unique(candidates[cKDTree(centers).query(at)[1]], return_inverse=True)
+        corners = SurfacePoints(np.repeat(used, 3), np.tile(np.eye(3), (len(used), 1)))
+        self._corners = PosedPoints(take.model, corners)
+        self._take, self._vertices = take, take.model.faces[used].ravel()
+        self._neutral = take.model.v_template[self._vertices]
+        self._triangles = np.arange(3 * len(used)).reshape(-1, 3)
+        self._first = self._frames(first)
+
+    def carried(self, torso: PosedTorso) -> Callable[[np.ndarray], np.ndarray]:
+        """What brings points (N, 3) from where they are at first to where this torso has them."""
+        before, after, face = self._first, self._frames(torso), self._face
+        size = (after.scale / before.scale)[:, None, None]
+        turn = (size * after.rotation @ before.rotation.swapaxes(1, 2))[face]
+        start, end = before.origin[face], after.origin[face]
+        return lambda at: np.einsum("nij,nj->ni", turn, at - start) + end
+
+    def _frames(self, torso: PosedTorso) -> FaceFrames:
+        values = torso.parameters
+        if torso.shift is None:
+            corners = self._corners.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+        else:
+            corners = self._take.rigid(values, self._vertices) + torso.shift
+        return face_frames(corners, self._triangles, self._neutral)
+
+
+def compared(
+    take: TorsoTake,
+    seen: Mapping[str, SeenPoints],
+    motions: Mapping[str, Motion],
+    timesteps: Sequence[int],
+) -> dict[str, float]:
+    """Motion -> mean misfit of held-out points, where all motions leave them in sight."""
+    first, total, count = seen["head"], dict.fromkeys(motions, 0.0), 0
+    start = first.timestep
+    carriers = {name: Carrier(take, own[start], seen[name].at) for name, own in motions.items()}
+    for timestep in (t for t in timesteps if t != start):
+        shot, use, shares = take.shot(timestep), ~first.fitted, {}
+        for name, own in motions.items():
+            at = carriers[name].carried(own[timestep])(seen[name].at)
+            shares[name], shown = seen[name].unexplained(shot, at, EVIDENCE_LEVEL)
+            use = use & shown
+        count += int(use.sum())
+        total = {name: total[name] + float(share[use].sum()) for name, share in shares.items()}
+    return {name: value / max(count, 1) for name, value in total.items()}
+
+
+def at_depth(
+    take: TorsoTake, seen: SeenPoints, motions: Mapping[str, Motion]
+) -> dict[str, SeenPoints]:
+    """Motion -> the points at the depths along their rays at which other cameras, and other
+    timesteps of the motion, look like them; "stereo": of other cameras alone."""
+    candidates = [seen.at + depth * seen.ray for depth in DEPTHS_M]
+    shot, stereo = take.shot(seen.timestep), np.zeros((len(DEPTHS_M), len(seen.at)))
+    for number, rows in seen.rows.items():
+        for other in shot.views.keys() - {number}:
+            for cost, at in zip(stereo, candidates, strict=True):
+                share = seen.share(shot, other, rows, at[rows], EVIDENCE_LEVEL, ALONG_CAMERAS)
+                cost[rows] += np.where(shot.shows(other, at[rows]), share, UNSEEN_COST)
+    costs = {"stereo": stereo, **{name: stereo.copy() for name in motions}}
+    carriers = {name: Carrier(take, own[seen.timestep], seen.at) for name, own in motions.items()}
+    known = sorted(set.intersection(*(set(own) for own in motions.values()))) if motions else []
+    for timestep in evenly_spread([t for t in known if t != seen.timestep], DEPTH_TIMESTEPS):
+        shot = take.shot(timestep)
+        for name, own in motions.items():
+            carried = carriers[name].carried(own[timestep])
+            for cost, at in zip(costs[name], candidates, strict=True):
+                share, shown = seen.unexplained(shot, carried(at), EVIDENCE_LEVEL)
+                cost += np.where(shown, share, UNSEEN_COST)
+    return {name: _moved_in_depth(seen, cost) for name, cost in costs.items()}
+
+
+def _moved_in_depth(seen: SeenPoints, cost: np.ndarray) -> SeenPoints:
+    """The points where the cost (DEPTHS_M, N), averaged over neighbors, is least, if it tells."""
+    from scipy.spatial import cKDTree
+
+    moved = seen.at.copy()
+    for rows in seen.rows.values():
+        if len(rows) >= NEIGHBORS and np.ptp(cost[:, rows]) > 0:
+            near = rows[cKDTree(seen.at[rows]).query(seen.at[rows], NEIGHBORS)[1]]
+            depth = np.zeros(len(moved))
+            depth[rows] = np.array(DEPTHS_M)[cost[:, near].mean(2).argmin(0)]
+            moved[rows] += np.median(depth[near], axis=1)[:, None] * seen.ray[rows]
+    return replace(seen, at=moved)

@@ -22,8 +22,6 @@ from ..flame.forward import RIGID_SIZE
 from ..flame.model import BUNDLED_HEAD
 from ..schema import to_json
 from ..worker.helpers import Helpers
-from .camera_scale import scale_warnings
-from .contact_sheet import write_contact_sheet
 from .correspondence import calibrate
 from .dense import fit_dense
 from .dense_head import REGIONS
@@ -40,18 +38,20 @@ from .fit import (
     is_face,
     is_metric,
 )
-from .focal_length import solved_focal
+from .focal_length import scale_warnings, solved_focal
 from .folder import (
     KEPT_FOLDER,
     LANDMARKS_FOLDER,
     PLACES_FILE,
     REPORT_FILE,
     SHEET_FILE,
+    TORSO_KEY,
+    TorsoMotion,
     image_name,
     is_written,
+    write_torso_points,
 )
 from .footage.model import Footage, FootageCamera
-from .footage.stored import StoredFrames, with_stored
 from .head_model import HeadModel, read_head_model
 from .landmarks import (
     CameraLandmarks,
@@ -64,12 +64,11 @@ from .landmarks import (
     write_places,
 )
 from .mattes import with_mattes
-from .pictures import Show, picture_of_first_frame, picture_of_fit
+from .pictures import Show, picture_of_first_frame, picture_of_fit, write_contact_sheet
 from .posed_points import PosedPoints, SurfacePoints
 from .seen_surface import RecordedTake
 from .surface import fit_surface
 from .torso import follow_torso
-from .torso_motion import TORSO_KEY, TorsoMotion, write_torso_points
 from .write_capture import posed_mesh, write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
@@ -81,8 +80,7 @@ demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 
 
 LONG_TAKE = 50
-"""Timesteps from which the fit to landmarks is worth a helping process: its small matrices are
-slower in threads."""
+"""From which the fit is worth a helping process: its small matrices are slower in threads."""
 
 
 @dataclass(frozen=True)
@@ -150,13 +148,47 @@ def track(
         if landmarks is None:
             seen = _detected(head, head_file, footage, source, out, helpers, report, show)
         else:
-            seen = _given(head, footage, landmarks)
+            detected = read_landmarks(footage, landmarks)
+            _check_faces(footage, detected)
+            places, reliable = read_places(landmarks / PLACES_FILE, len(head.model.faces))
+            seen = _Seen(places, reliable, detected)
+            for timestep, camera in footage.views():
+                if camera.kept:
+                    camera.image(timestep)  # in order, before helping processes ask for some
             _begin(out, source)
-        _check_seen(head, seen, (landmarks or out / LANDMARKS_FOLDER) / PLACES_FILE)
-        footage, take = _with_take(head, footage, seen, report)
+        check_count(seen.detected, seen.places)
+        neutral = seen.places.on(head.model.v_template, head.model.faces)
+        if np.ptp(neutral[seen.reliable], axis=0).max() < MIN_FACE_M:
+            raise StgaError(
+                f"{(landmarks or out / LANDMARKS_FOLDER) / PLACES_FILE}: face: its landmarks lie "
+                "in one point of the head model; expected a face"
+            )
+        take = _take(footage, seen, neutral)
+        if not take:
+            raise StgaError(
+                f"{footage.root}: shows too few landmarks of a face in each of its frames"
+            )
+        if footage.focal == "usual":  # of one camera
+            report("Focal length", 0, 1)
+            pixels = solved_focal(head, seen.places, seen.reliable, take)
+            if pixels is not None:
+                (camera,) = footage.cameras
+                moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
+                footage = replace(footage, cameras=(moved,), focal="solved")
+            take = _take(footage, seen, neutral)
         keep = world == "keep" or (world == "auto" and footage.keeps_world)
         metric = keep and is_metric(head, seen.places, seen.reliable, take)
-        fit = _fitted(head, seen, take, metric, helpers, report)
+        part = head, seen.places, seen.reliable, take, metric
+        report("Fit", 0, ROUNDS)
+
+        def count(rounds: int) -> None:
+            report("Fit", rounds, ROUNDS)
+
+        fit: HeadFit = (
+            helpers.map(fit_head, [part], count)[0]
+            if len(take) < LONG_TAKE
+            else helpers.run(fit_head, part, count)
+        )
         errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
         _check_cameras(footage, errors)
         show(partial(picture_of_fit, fit, footage), {"error_px": _median_px(errors)})
@@ -166,9 +198,8 @@ def track(
         fit = in_cameras_world(fit) if keep else fit
         errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
         shares = [share for own in misfits.values() for share in own.values()]
-        quality = {"error_px": _median_px(errors)} | (
-            {"unexplained": float(np.mean(shares))} if shares else {}
-        )
+        quality = {"error_px": _median_px(errors)}
+        quality |= {"unexplained": float(np.mean(shares))} if shares else {}
         show(partial(picture_of_fit, fit, footage), quality)
         parameters = interpolated(fit.parameters, footage.timesteps)
         matte_warnings: tuple[str, ...] = ()
@@ -192,19 +223,29 @@ def track(
         None if footage.focal == "calibration" else footage.cameras[0].camera.fl_x,
         footage.focal,
     )
-    write_json(out / REPORT_FILE, _as_json(result))
-    report("Contact sheet", 0, 1)
-    write_contact_sheet(
-        out / SHEET_FILE,
-        footage,
-        {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras},
-        lambda timestep: posed_mesh(
-            torso.fit, torso.parameters[timestep], torso.offsets.get(timestep)
-        ),
-        fit.head.model.faces,
-        result.reprojection_px,
-        result.image_misfit,
+    write_json(
+        out / REPORT_FILE,
+        {
+            "median_reprojection_px": round(result.median_px, 3),
+            "meters_per_unit": result.scale,
+            "interpolated": list(result.interpolated),
+            "warnings": list(result.warnings),
+            "reprojection_px": _rounded(result.reprojection_px),
+            "image_misfit": _rounded(result.image_misfit),
+            "focal_length_px": None if result.focal_px is None else round(result.focal_px, 1),
+            "focal_length_from": result.focal,
+            TORSO_KEY: None if result.torso is None else to_json(result.torso),
+        },
     )
+    report("Contact sheet", 0, 1)
+    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
+    pixels_of, misfit_of = result.reprojection_px, result.image_misfit
+
+    def mesh(timestep: int) -> np.ndarray:
+        return posed_mesh(torso.fit, torso.parameters[timestep], torso.offsets.get(timestep))
+
+    faces = fit.head.model.faces
+    write_contact_sheet(out / SHEET_FILE, footage, cameras, mesh, faces, pixels_of, misfit_of)
     if landmarks is not None:  # what a correction of the capture starts from
         write_landmarks(out / LANDMARKS_FOLDER, seen.detected, seen.places, seen.reliable)
     if torso.points is not None:
@@ -219,8 +260,7 @@ def track(
 
 @dataclass(frozen=True)
 class _Seen:
-    """Landmarks: their places on the head model, which are reliable, and by camera, as detected and
-    as used."""
+    """Landmarks: places on the head model, which are reliable, and by camera as detected."""
 
     places: SurfacePoints
     reliable: np.ndarray
@@ -228,8 +268,7 @@ class _Seen:
 
     @cached_property
     def found(self) -> dict[str, CameraLandmarks]:
-        """With confidence 0 for those that are not reliable; cameras without a face have none at
-        all."""
+        """Confidence 0 for those that are not reliable; cameras without a face have none."""
         return {
             name: replace(own, confidence=own.confidence * self.reliable)
             if own.confidence.any()
@@ -238,20 +277,9 @@ class _Seen:
         }
 
 
-def _given(head: HeadModel, footage: Footage, folder: Path) -> _Seen:
-    """The landmarks of a folder."""
-    detected = read_landmarks(footage, folder)
-    _check_faces(footage, detected)
-    seen = _Seen(*read_places(folder / PLACES_FILE, len(head.model.faces)), detected)
-    for timestep, camera in footage.views():
-        if isinstance(camera.frames, StoredFrames):
-            camera.image(timestep)  # in order, before helping processes ask for some
-    return seen
-
-
 def _detected(
-    head: HeadModel, head_file: Path | None, footage: Footage, source: dict[str, Any], out: Path, helpers: Helpers,
-    report: Report, show: Show,
+    head: HeadModel, head_file: Path | None, footage: Footage, source: dict[str, Any], out: Path,
+    helpers: Helpers, report: Report, show: Show,
 ) -> _Seen:  # fmt: skip
     """The landmarks that the networks find, kept in `out`."""
     is_new, detector = not out.exists(), FaceNetworks()
@@ -269,54 +297,6 @@ def _detected(
             shutil.rmtree(out)
         raise
     return _Seen(places, reliable, detected)
-
-
-def _check_seen(head: HeadModel, seen: _Seen, places_file: Path) -> None:
-    """Raise StgaError for landmarks of another number than on the head, and for places that are no
-    face."""
-    check_count(seen.detected, seen.places)
-    neutral = seen.places.on(head.model.v_template, head.model.faces)
-    if np.ptp(neutral[seen.reliable], axis=0).max() < MIN_FACE_M:
-        raise StgaError(
-            f"{places_file}: face: its landmarks lie in one point of the head model; expected a face"
-        )
-
-
-def _with_take(
-    head: HeadModel, footage: Footage, seen: _Seen, report: Report
-) -> tuple[Footage, dict[int, TimestepLandmarks]]:
-    """The footage with the focal length of a camera that says none, and the timesteps that the head
-    is fitted to."""
-    take = _take(head, footage, seen)
-    if not take:
-        raise StgaError(f"{footage.root}: shows too few landmarks of a face in each of its frames")
-    if footage.focal != "usual":
-        return footage, take
-    report("Focal length", 0, 1)
-    footage = _with_focal(footage, solved_focal(head, seen.places, seen.reliable, take))
-    return footage, _take(head, footage, seen)
-
-
-def _fitted(
-    head: HeadModel,
-    seen: _Seen,
-    take: Mapping[int, TimestepLandmarks],
-    metric: bool,
-    helpers: Helpers,
-    report: Report,
-) -> HeadFit:
-    """The fit to the landmarks."""
-    part, done = (
-        (head, seen.places, seen.reliable, take, metric),
-        lambda rounds: report("Fit", rounds, ROUNDS),
-    )
-    report("Fit", 0, ROUNDS)
-    fit: HeadFit = (
-        helpers.map(fit_head, [part], done)[0]
-        if len(take) < LONG_TAKE
-        else helpers.run(fit_head, part, done)
-    )
-    return fit
 
 
 @dataclass(frozen=True)
@@ -357,19 +337,17 @@ def by_images(
 
 def _median_px(errors: Mapping[str, Mapping[int, float | tuple[float, float]]]) -> float:
     """Of `reprojection_errors`, or of the pixels in them."""
-    return float(
-        np.median([np.ravel(error)[0] for own in errors.values() for error in own.values()])
-    )
+    every = [np.ravel(error)[0] for own in errors.values() for error in own.values()]
+    return float(np.median(every))
 
 
 def interpolated(
     parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]
 ) -> dict[int, np.ndarray]:
-    """Parameters of all timesteps: linear between the known ones, constant before the first and
-    after the last."""
+    """Parameters of all timesteps: linear between the known ones, constant before and after."""
     known = sorted(parameters)
-    values = np.stack([parameters[timestep] for timestep in known])
-    columns = np.stack([np.interp(timesteps, known, column) for column in values.T], axis=1)
+    values = np.stack([parameters[timestep] for timestep in known]).T
+    columns = np.stack([np.interp(timesteps, known, column) for column in values], axis=1)
     return dict(zip(timesteps, columns, strict=True))
 
 
@@ -381,22 +359,16 @@ def reprojection_errors(
     footage: Footage,
     found: Mapping[str, CameraLandmarks],
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Camera -> timestep -> median distance of its landmarks from the fitted head's, in pixels and
-    in face sizes."""
+    """Camera -> timestep -> landmarks' median distance from the head's: pixels, face sizes."""
     points = PosedPoints(fit.head.model, places)
-    errors: dict[str, dict[int, tuple[float, float]]] = {
-        camera.name: {} for camera in footage.cameras
-    }
+    errors: dict[str, dict[int, tuple[float, float]]]
+    errors = {camera.name: {} for camera in footage.cameras}
     for timestep, parameters in fit.parameters.items():
         head = points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
         cameras = [name for name, own in found.items() if _row(own, timestep) is not None]
-        for name, camera, pixels, confidence in zip(
-            cameras,
-            take[timestep].cameras,
-            take[timestep].points,
-            take[timestep].confidence,
-            strict=True,
-        ):
+        own = take[timestep]
+        seen = zip(cameras, own.cameras, own.points, own.confidence, strict=True)
+        for name, camera, pixels, confidence in seen:
             use = reliable & (confidence > 0)
             projected, _ = fit.to_capture.camera(camera).project(head[use])
             distance = float(np.median(np.linalg.norm(projected - pixels[use], axis=1)))
@@ -409,21 +381,18 @@ def _source(
     footage: Footage, head_file: Path | None, landmarks: Path | None = None
 ) -> dict[str, Any]:
     """What landmarks and mattes are of; landmarks: the folder that they were read from."""
+    model = str(head_file.resolve()) if head_file else ""
     return {
         "footage": str(footage.root),
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
-        "head_model": [
-            str(head_file.resolve()) if head_file else "",
-            _state([head_file or BUNDLED_HEAD]),
-        ],
+        "head_model": [model, _state([head_file or BUNDLED_HEAD])],
         "landmarks": None if landmarks is None else realpath(landmarks),
     }
 
 
 def _begin(out: Path, source: dict[str, Any]) -> None:
-    """Record what the landmarks in `out` are of. Raises StgaError where it holds those of other
-    footage."""
+    """Record what the landmarks in `out` are of. Raises StgaError for other footage's."""
     path = out / LANDMARKS_FOLDER / "footage.json"
     if path.exists() and read_json(path) != source:
         raise StgaError(
@@ -433,29 +402,25 @@ def _begin(out: Path, source: dict[str, Any]) -> None:
 
 
 def _stored(footage: Footage, out: Path) -> Footage:
-    """The footage whose videos are decoded once: their frames are kept as the capture's images."""
-    images = {
-        camera.name: {t: out / image_name(t, number) for t in camera.timesteps}
-        for number, camera in enumerate(footage.cameras)
-    }
-    return with_stored(footage, images)
+    """The footage whose undistorted frames that are no files yet are decoded once: they are kept as
+    the capture's images. A file that exists is that of the frame."""
+    cameras = []
+    for number, camera in enumerate(footage.cameras):
+        if camera.undistortion is None and camera.file(camera.timesteps[0]) is None:
+            kept = {t: out / image_name(t, number) for t in camera.timesteps}
+            camera = replace(camera, kept=kept)
+        cameras.append(camera)
+    return replace(footage, cameras=tuple(cameras))
 
 
 def _recording(camera: FootageCamera) -> list[Any]:
-    """The first frame, the state of all files, and how frames are undistorted; it changes with
-    offset and lens."""
+    """The first frame, the state of all files, and the undistortion; offsets change it."""
     pinhole = camera.camera
     first = [camera.source(camera.timesteps[0]), _state(camera.frames.files)]
     if camera.undistortion is None:
         return first
-    return [
-        *first,
-        repr(camera.undistortion.lens),
-        pinhole.fl_x,
-        pinhole.fl_y,
-        pinhole.cx,
-        pinhole.cy,
-    ]
+    intrinsics = pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy
+    return [*first, repr(camera.undistortion.lens), *intrinsics]
 
 
 def _state(files: Iterable[Path]) -> str:
@@ -473,38 +438,23 @@ def _row(camera: CameraLandmarks, timestep: int) -> int | None:
     return int(rows[0])
 
 
-def _take(head: HeadModel, footage: Footage, seen: _Seen) -> dict[int, TimestepLandmarks]:
-    """The timesteps that the head is fitted to."""
-    neutral = seen.places.on(head.model.v_template, head.model.faces)
-    everything = {
-        timestep: _at(footage, seen.found, timestep, len(neutral)) for timestep in footage.timesteps
-    }
-    return {
-        timestep: own
-        for timestep, own in everything.items()
-        if determines_pose(own, seen.reliable, neutral)
-    }
-
-
-def _with_focal(footage: Footage, pixels: float | None) -> Footage:
-    """Footage of one camera with a solved focal length; as it is where there is none."""
-    if pixels is None:
-        return footage
-    (camera,) = footage.cameras
-    moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
-    return replace(footage, cameras=(moved,), focal="solved")
-
-
-def _at(
-    footage: Footage, found: Mapping[str, CameraLandmarks], timestep: int, count: int
-) -> TimestepLandmarks:
+def _take(footage: Footage, seen: _Seen, neutral: np.ndarray) -> dict[int, TimestepLandmarks]:
+    """The timesteps that the head is fitted to. neutral (N, 3): landmarks on the neutral head."""
     cameras = {camera.name: camera.camera for camera in footage.cameras}
-    rows = {name: row for name, own in found.items() if (row := _row(own, timestep)) is not None}
-    return TimestepLandmarks(
-        tuple(cameras[name] for name in rows),
-        np.array([found[name].points[row] for name, row in rows.items()]).reshape(-1, count, 2),
-        np.array([found[name].confidence[row] for name, row in rows.items()]).reshape(-1, count),
-    )
+    take = {}
+    for timestep in footage.timesteps:
+        rows = {name: _row(own, timestep) for name, own in seen.found.items()}
+        found = [(name, row) for name, row in rows.items() if row is not None]
+        points = np.array([seen.found[name].points[row] for name, row in found])
+        confidence = np.array([seen.found[name].confidence[row] for name, row in found])
+        own = TimestepLandmarks(
+            tuple(cameras[name] for name, _ in found),
+            points.reshape(-1, len(neutral), 2),
+            confidence.reshape(-1, len(neutral)),
+        )
+        if determines_pose(own, seen.reliable, neutral):
+            take[timestep] = own
+    return take
 
 
 def _images(
@@ -533,25 +483,21 @@ def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
     """Raise StgaError where no camera ever sees a face."""
     if not any(camera.confidence.any() for camera in found.values()):
         views = list(footage.views())
-        raise StgaError(
-            f"{views[0][1].source(views[0][0])}: shows no face, nor does any other of {len(views)} frames"
-        )
+        first = views[0][1].source(views[0][0])
+        raise StgaError(f"{first}: shows no face, nor does any other of {len(views)} frames")
 
 
 def _check_cameras(
     footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]
 ) -> None:
-    """Raise StgaError for a camera whose landmarks do not fit the head that the others see, or
-    where none fits."""
-    share = {
-        name: float(np.median([part for _, part in own.values()]))
-        for name, own in errors.items()
-        if own
-    }
+    """Raise StgaError for a camera that does not fit what others see, or where none fits."""
+    shares = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
+    share = {name: float(np.median(own)) for name, own in shares.items()}
 
     def at_worst(name: str) -> str:
         worst = max(errors[name], key=lambda timestep: errors[name][timestep][1])
-        return f"camera {name}: its landmarks are off by {errors[name][worst][0]:.0f} pixels at timestep {worst}"
+        pixels = errors[name][worst][0]
+        return f"camera {name}: its landmarks are off by {pixels:.0f} pixels at timestep {worst}"
 
     for name, value in share.items():
         others = [other for other_name, other in share.items() if other_name != name] or [value]
@@ -562,8 +508,8 @@ def _check_cameras(
             )
     if len(share) > 1 and float(np.median(list(share.values()))) > MAX_USUAL_SHARE:
         raise StgaError(
-            f"{at_worst(max(share, key=share.__getitem__))}, and those of the other cameras are too; "
-            "check the calibration, and whether all are synchronized and none mirrored"
+            f"{at_worst(max(share, key=share.__getitem__))}, and those of the other cameras are "
+            "too; check the calibration, and whether all are synchronized and none mirrored"
         )
 
 
@@ -574,48 +520,34 @@ def _warnings(
     blind = [name for name, own in found.items() if not own.confidence.any()]
     warnings = list(footage.warnings)
     if missing:
+        share = f"{len(missing)} of {len(footage.timesteps)} timesteps"
         listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
-        warnings.append(
-            f"no face at {len(missing)} of {len(footage.timesteps)} timesteps, interpolated: {listed}"
-        )
+        warnings.append(f"no face at {share}, interpolated: {listed}")
     if blind:
         warnings.append(f"no face in any frame of: {', '.join(blind)}")
     if len(footage.cameras) == 1:
         warnings.append(
-            "one camera: size and distance of the head, and its depth, are those of the average head"
+            "one camera: size and distance of the head, and its depth, are those of the average "
+            "head"
         )
     elif fit.static_offset is None:
         warnings.append(
-            "the images do not show the skin's surface sharply enough: the head is fitted to landmarks alone"
+            "the images do not show the skin's surface sharply enough: the head is fitted to "
+            "landmarks alone"
         )
     if is_scaled:
         warnings.append(
-            f"the cameras' world is kept but for its scale: in meters, the head would be more than "
-            f"{MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by {fit.to_capture.scale:.4g}"
+            "the cameras' world is kept but for its scale: in meters, the head would be more than "
+            f"{MAX_HEAD_SCALE - 1:.0%} off people's; "
+            f"positions are multiplied by {fit.to_capture.scale:.4g}"
         )
     if footage.focal == "usual":
         warnings.append(
-            "the focal length is a guess, as the head turns too little to tell; give it if it is known"
+            "the focal length is a guess, as the head turns too little to tell; "
+            "give it if it is known"
         )
     return tuple(warnings)
 
 
-def _as_json(result: TrackingReport) -> dict[str, Any]:
-    return {
-        "median_reprojection_px": round(result.median_px, 3),
-        "meters_per_unit": result.scale,
-        "interpolated": list(result.interpolated),
-        "warnings": list(result.warnings),
-        "reprojection_px": _rounded(result.reprojection_px),
-        "image_misfit": _rounded(result.image_misfit),
-        "focal_length_px": None if result.focal_px is None else round(result.focal_px, 1),
-        "focal_length_from": result.focal,
-        TORSO_KEY: None if result.torso is None else to_json(result.torso),
-    }
-
-
 def _rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
-    return {
-        name: {str(timestep): round(value, 3) for timestep, value in own.items()}
-        for name, own in values.items()
-    }
+    return {name: {str(t): round(v, 3) for t, v in own.items()} for name, own in values.items()}

@@ -9,11 +9,9 @@ from ..capture.camera import Camera
 
 ITERATIONS = 15
 OUTLIER_SCALE = 1.5
-"""Distances from a ray, in medians of the landmark's rays, at which its weight has fallen to a
-quarter."""
+"""Distances from a ray, in medians of the landmark's, at which its weight is a quarter."""
 MIN_DISTANCE_SHARE = 1e-5
-"""Smallest scale of outliers, as a share of the distance to the cameras: below it, residuals are
-rounding."""
+"""Of outliers' scale, as a share of the distance to the cameras; below is rounding."""
 RANK_GUARD = 1e-9
 
 
@@ -37,9 +35,8 @@ class Triangulation:
 
 def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and unit directions (N, 3) in the world of pixels (N, 2)."""
-    local = np.column_stack(
-        [(points - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y], np.ones(len(points))]
-    )
+    flat = (points - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
+    local = np.column_stack([flat, np.ones(len(points))])
     directions = local @ camera.world_to_camera[:3, :3]
     return camera.position, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -54,10 +51,7 @@ def triangulate(
     median residual.
     """
     pairs = [rays(camera, pixels) for camera, pixels in zip(cameras, points, strict=True)]
-    origins, directions = (
-        np.stack([pair[0] for pair in pairs]),
-        np.stack([pair[1] for pair in pairs]),
-    )
+    origins, directions = map(np.stack, zip(*pairs, strict=True))
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]  # (C, N, 3, 3)
     offsets = np.einsum("cnij,cj->cni", across, origins)
     guess = origins.mean(0) + (directions * confidence[..., None]).sum(0)
@@ -75,10 +69,8 @@ def triangulate(
         scale = OUTLIER_SCALE * _median(distance, confidence > 0)
         floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
         # a point without a ray may lie in a camera, at distance 0 from its ray
-        smallest = np.finfo(np.float64).tiny
-        weights = (
-            confidence / (1 + (distance / np.maximum(np.maximum(scale, floor), smallest)) ** 2) ** 2
-        )
+        usual = np.maximum(np.maximum(scale, floor), np.finfo(np.float64).tiny)
+        weights = confidence / (1 + (distance / usual) ** 2) ** 2
     seen = (confidence > 0).sum(0) >= min(2, len(cameras))
     return Triangulation(position, information, _median(distance, confidence > 0), seen)
 

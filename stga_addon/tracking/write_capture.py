@@ -1,5 +1,4 @@
-"""Writing of a tracked take as a capture: VHAP's layout for FLAME, the mesh layout for other
-models."""
+"""Writing of a tracked take: VHAP's layout for FLAME, the mesh layout for other models."""
 
 import shutil
 from collections.abc import Mapping
@@ -41,33 +40,51 @@ def write_capture(
     """
     views = [view for view in footage.views() if view[0] in parameters]
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
-    frames: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
-    held_out = _middle_camera(footage) if len(footage.cameras) >= MIN_CAMERAS_TO_HOLD_OUT else None
-    for number, (timestep, camera) in enumerate(views):
-        entry = _entry(
-            out, timestep, camera, index[camera.name], fit.to_capture.camera(camera.camera)
-        )
-        folder = (f"{PARAMETERS}", "npz") if fit.head.layout == "flame" else ("meshes", "obj")
-        entry["flame_param_path" if folder[1] == "npz" else "mesh_path"] = (
-            f"{folder[0]}/{timestep:05d}.{folder[1]}"
-        )
-        frames["val" if camera.name == held_out else "train"].append(entry)
+    splits: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
+    centers, held_out = np.array([own.camera.position for own in footage.cameras]), None
+    if len(centers) >= MIN_CAMERAS_TO_HOLD_OUT:
+        nearest = np.linalg.norm(centers - centers.mean(0), axis=1).argmin()
+        held_out = footage.cameras[int(nearest)].name
+    flame, model = fit.head.layout == "flame", fit.head.model
+    for number, (timestep, source) in enumerate(views):
+        camera = fit.to_capture.camera(source.camera)
+        entry = _entry(out, timestep, source, index[source.name], camera)
+        if flame:
+            entry["flame_param_path"] = f"{PARAMETERS}/{timestep:05d}.npz"
+        else:
+            entry["mesh_path"] = f"meshes/{timestep:05d}.obj"
+        splits["val" if source.name == held_out else "train"].append(entry)
         report("Images", number + 1, len(views))
-    top: dict[str, Any] = {
-        **_write_heads(out, fit, parameters, offsets, meshes or fit.head.layout == "mesh", report)
-    }
+    top: dict[str, Any] = {} if flame else {"canonical_mesh_path": "meshes/neutral.obj"}
     if footage.fps is not None:
         top["fps"] = footage.fps
+    neutral, own = np.zeros_like(next(iter(parameters.values()))), fit.static_offset
+    person = {} if own is None else {"static_offset": own.astype(np.float32)}
+    person["shape"] = fit.shape.astype(np.float32)
+    for number, (timestep, values) in enumerate(parameters.items()):
+        offset = offsets.get(timestep)
+        if flame:
+            arrays = {**moving_arrays(values), **person}
+            if offset is not None:
+                arrays["dynamic_offset"] = offset[None].astype(np.float32)
+            write_npz(out / PARAMETERS / f"{timestep:05d}.npz", arrays)
+        if meshes or not flame:
+            mesh = posed_mesh(fit, values, offset)
+            write_obj(out / "meshes" / f"{timestep:05d}.obj", mesh, model.faces)
+        report("Heads", number + 1, len(parameters))
+    if meshes or not flame:
+        write_obj(out / "meshes" / "neutral.obj", posed_mesh(fit, neutral), model.faces)
+    if flame:
+        write_npz(out / CANONICAL_NAME, {**moving_arrays(neutral), **person})
     # train last: see is_written
-    for name, entries in reversed(list(zip(SPLIT_FILES, frames.values(), strict=True))):
+    for name, entries in reversed(list(zip(SPLIT_FILES, splits.values(), strict=True))):
         write_json(out / name, {**top, "frames": entries})
 
 
 def posed_mesh(
     fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:
-    """The head's vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this
-    timestep."""
+    """Vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this timestep."""
     return flame_forward(fit.head.model, np.zeros(0), frame_of(parameters, offset))
 
 
@@ -77,11 +94,6 @@ def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
-def _middle_camera(footage: Footage) -> str:
-    centers = np.array([camera.camera.position for camera in footage.cameras])
-    return footage.cameras[int(np.linalg.norm(centers - centers.mean(0), axis=1).argmin())].name
 
 
 def _entry(
@@ -113,43 +125,7 @@ def _entry(
     return entry
 
 
-def _write_heads(
-    out: Path,
-    fit: HeadFit,
-    parameters: Mapping[int, np.ndarray],
-    offsets: Mapping[int, np.ndarray],
-    meshes: bool,
-    report: Report,
-) -> dict[str, str]:
-    """Write every timestep's head; returns the top level of the transforms."""
-    faces, neutral = fit.head.model.faces, np.zeros_like(next(iter(parameters.values())))
-    for number, (timestep, values) in enumerate(parameters.items()):
-        if fit.head.layout == "flame":
-            arrays = _flame_arrays(fit, values)
-            if timestep in offsets:
-                arrays["dynamic_offset"] = offsets[timestep][None].astype(np.float32)
-            write_npz(out / PARAMETERS / f"{timestep:05d}.npz", arrays)
-        if meshes:
-            mesh = posed_mesh(fit, values, offsets.get(timestep))
-            write_obj(out / "meshes" / f"{timestep:05d}.obj", mesh, faces)
-        report("Heads", number + 1, len(parameters))
-    if meshes:
-        write_obj(out / "meshes" / "neutral.obj", posed_mesh(fit, neutral), faces)
-    if fit.head.layout == "flame":
-        write_npz(out / CANONICAL_NAME, _flame_arrays(fit, neutral))
-        return {}
-    return {"canonical_mesh_path": "meshes/neutral.obj"}
-
-
 def moving_arrays(parameters: np.ndarray) -> dict[str, np.ndarray]:
-    """What changes from timestep to timestep of (E + 18,) parameters, as in VHAP's files: (1, …)
-    float32."""
+    """What changes from timestep to timestep of (E + 18,), as in VHAP's files: (1, …) float32."""
     frame = frame_of(parameters)
     return {name: getattr(frame, name)[None].astype(np.float32) for name in FRAME_FIELDS}
-
-
-def _flame_arrays(fit: HeadFit, parameters: np.ndarray) -> dict[str, np.ndarray]:
-    arrays = moving_arrays(parameters)
-    if fit.static_offset is not None:
-        arrays["static_offset"] = fit.static_offset.astype(np.float32)
-    return arrays | {"shape": fit.shape.astype(np.float32)}

@@ -26,10 +26,8 @@ def pose(camera: int) -> np.ndarray:
     angle = 0.4 * camera - 0.5
     matrix = np.eye(4)
     matrix[:3, :3] = [
-        [np.cos(angle), 0, np.sin(angle)],
-        [0, 1, 0],
-        [-np.sin(angle), 0, np.cos(angle)],
-    ]
+        [np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)],
+    ]  # fmt: skip
     matrix[:3, 3] = matrix[:3, 2]
     return matrix
 

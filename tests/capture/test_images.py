@@ -30,13 +30,6 @@ def saved(path: Path, pixels: np.ndarray) -> Path:
     return path
 
 
-def test_plain_color(tmp_path: Path) -> None:
-    """Catches swapped channels or a transposed image."""
-    image = read_image(view_of(saved(tmp_path / "x.png", COLOUR)))
-    np.testing.assert_array_equal(image, COLOUR)
-    assert image.dtype == np.uint8
-
-
 @pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (10, 200, 90)])
 def test_transparency_is_laid_over_the_background(
     tmp_path: Path, background: tuple[int, int, int]

@@ -3,7 +3,6 @@
 import itertools
 import threading
 import time
-import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -62,13 +61,6 @@ def test_order_and_content(views: list[View]) -> None:
         np.testing.assert_array_equal(mask, factory.silhouette() * 255)
 
 
-def test_small_capture_is_decoded_once(views: list[View], decoded: list[str]) -> None:
-    """Catches a cache that misses: three rounds over nine views must decode nine."""
-    with ViewLoader(views * 3) as loader:
-        assert sum(1 for _ in loader) == 27
-    assert len(decoded) == 9
-
-
 def test_cache_is_bounded(views: list[View], decoded: list[str]) -> None:
     """Catches a cache that outgrows its limit, or throws out what the next epoch asks for."""
     sequence = [views[i] for i in (0, 1, 0, 2, 2, 1)]
@@ -101,21 +93,6 @@ def test_one_view_larger_than_the_queue(views: list[View]) -> None:
     """Catches a deadlock where a single view exceeds the bound."""
     with ViewLoader(views, queue_bytes=1) as loader:
         assert sum(1 for _ in loader) == 9
-
-
-def test_memory_does_not_grow(views: list[View]) -> None:
-    """Catches arrays held after use: 600 views of 10 kB pass through 10 views' worth of memory."""
-    with ViewLoader(
-        itertools.cycle(views), queue_bytes=4 * VIEW_BYTES, cache_bytes=4 * VIEW_BYTES
-    ) as loader:
-        for _ in range(20):
-            next(loader)
-        tracemalloc.start()
-        for _ in range(600):
-            next(loader)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < 20 * VIEW_BYTES
 
 
 def test_errors_come_where_their_view_would(views: list[View]) -> None:
@@ -217,9 +194,3 @@ def test_meshes_are_read_in_the_thread_and_bounded(views: list[View]) -> None:
             assert loaded.mesh is not None
             assert (loaded.mesh == loaded.view.timestep).all()
     assert {thread for _, thread in read} == {"view loader"}
-
-
-def test_without_meshes_none_is_read(views: list[View]) -> None:
-    """Catches a loader that yields a mesh where the trainer has a refined one of its own."""
-    with ViewLoader(views[:1]) as loader:
-        assert next(loader).mesh is None

@@ -130,6 +130,10 @@ def chunk(name, data):
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
+def icc(data):
+    return chunk(b"iCCP", b"p\0\0" + zlib.compress(data))
+
+
 def png(path, color, *chunks, mode="RGB"):
     """A PNG of one color with chunks before its pixels."""
     stream = io.BytesIO()
@@ -142,24 +146,26 @@ def png(path, color, *chunks, mode="RGB"):
 # exponent of 2.2 as well.
 RED_IN_P3 = (234, 51, 35)
 STORED = {
-    "profile": (RED_IN_P3, [chunk(b"iCCP", b"p\0\0" + zlib.compress(DISPLAY_P3))], (255, 0, 0)),
+    "profile": (RED_IN_P3, [icc(DISPLAY_P3)], (255, 0, 0)),
     "sRGB's profile": (
         RED_IN_P3,
-        [chunk(b"iCCP", b"p\0\0" + zlib.compress(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()))],
+        [icc(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())],
         RED_IN_P3,
     ),
-    "damaged profile": (RED_IN_P3, [chunk(b"iCCP", b"p\0\0" + zlib.compress(DISPLAY_P3[:140]))], RED_IN_P3),
+    "damaged profile": (RED_IN_P3, [icc(DISPLAY_P3[:140])], RED_IN_P3),
     "cICP of Display P3": (RED_IN_P3, [chunk(b"cICP", bytes([12, 13, 0, 1]))], (255, 0, 0)),
     "cICP of sRGB before a profile": (
         RED_IN_P3,
-        [chunk(b"cICP", bytes([1, 13, 0, 1])), chunk(b"iCCP", b"p\0\0" + zlib.compress(DISPLAY_P3))],
+        [chunk(b"cICP", bytes([1, 13, 0, 1])), icc(DISPLAY_P3)],
         RED_IN_P3,
     ),
     "cICP of PQ": ((148, 148, 148), [chunk(b"cICP", bytes([9, 16, 0, 1]))], (255, 255, 255)),
     "linear gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 100000))], (128, 128, 128)),
     "usual gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 45455))], (55, 55, 55)),
     "gAMA beside sRGB": (
-        (55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 100000)), chunk(b"sRGB", b"\0")], (55, 55, 55),
+        (55, 55, 55),
+        [chunk(b"gAMA", struct.pack(">I", 100000)), chunk(b"sRGB", b"\0")],
+        (55, 55, 55),
     ),
 }  # fmt: skip
 
@@ -181,7 +187,7 @@ def test_profile_beside_transparency_and_in_jpeg(tmp_path):
     """Catches alpha lost in the conversion, a mask that is converted, and profiles of JPEG left
     out."""
     path = tmp_path / "x.png"
-    png(path, (*RED_IN_P3, 128), chunk(b"iCCP", b"p\0\0" + zlib.compress(DISPLAY_P3)), mode="RGBA")
+    png(path, (*RED_IN_P3, 128), icc(DISPLAY_P3), mode="RGBA")
     np.testing.assert_allclose(read_image(view_of(path), (0, 0, 0))[5, 5], (128, 0, 0), atol=4)
     assert read_mask(view_of(path))[5, 5] == 128
     Image.new("RGB", (WIDTH, HEIGHT), RED_IN_P3).save(

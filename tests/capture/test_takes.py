@@ -87,7 +87,8 @@ def test_takes_of_other_heads_are_refused(toy: Capture) -> None:
 def test_frame_rate_of_takes(toy: Capture) -> None:
     """Catches a rate of one take given to another that was recorded at a different one."""
     for first, second, expected in (
-        (60.0, 60.0, 60.0), (None, 60.0, 60.0), (60.0, None, 60.0), (None, None, None), (60.0, 25.0, None),
+        (60.0, 60.0, 60.0), (None, 60.0, 60.0), (60.0, None, 60.0), (None, None, None),
+        (60.0, 25.0, None),
     ):  # fmt: skip
         joined = join_takes([replace(toy, fps=first), replace(moved(toy, 0.1), fps=second)])
         assert joined.fps == expected, (first, second)

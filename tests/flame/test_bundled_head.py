@@ -128,10 +128,8 @@ def test_arkits_weights_are_its_coefficients(head):
     sequence = FlameSequence(head, np.zeros(head.n_identity), None, (), {}.__getitem__)
     weights = np.zeros((2, COUNT))
     weights[0, [COLUMN["jawOpen"], COLUMN["mouthSmileLeft"], COLUMN["eyeLookOutLeft"]]] = (
-        0.7,
-        0.4,
-        1.0,
-    )
+        0.7, 0.4, 1.0,
+    )  # fmt: skip
     weights[1, COLUMN["browInnerUp"]] = 0.9
     found = head_map(sequence, "bundled")
     frames = found.frames(Performance(np.arange(2.0), weights, None, 1.0))

@@ -192,19 +192,14 @@ class _Attack:
         return self.call, self.arguments
 
 
-@pytest.mark.parametrize(
-    ("attack", "name"),
-    [
-        (_Attack(os.system, "touch {}"), "posix.system"),
-        (_Attack(eval, "open('{}', 'w')"), "builtins.eval"),
-        (_Attack(getattr, "text", "format"), "builtins.getattr"),
-        (_Attack(np.load, "{}"), "numpy.load"),
-        (_Attack(scipy.sparse.load_npz, "{}"), "load_npz"),
-        (_Attack(pickle.loads, b"N."), "_pickle.loads"),
-        (_Attack(bytearray, 10**15), "builtins.bytearray"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
+@pytest.mark.parametrize(("attack", "name"), [
+    (_Attack(os.system, "touch {}"), "posix.system"),
+    (_Attack(eval, "open('{}', 'w')"), "builtins.eval"),
+    (_Attack(getattr, "text", "format"), "builtins.getattr"),
+    (_Attack(np.load, "{}"), "numpy.load"), (_Attack(scipy.sparse.load_npz, "{}"), "load_npz"),
+    (_Attack(pickle.loads, b"N."), "_pickle.loads"),
+    (_Attack(bytearray, 10**15), "builtins.bytearray"),
+], ids=lambda value: value if isinstance(value, str) else "")  # fmt: skip
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_other_classes_are_refused_by_name(
     tmp_path: Path, attack: _Attack, name: str, protocol: int
@@ -224,86 +219,10 @@ def test_other_classes_are_refused_by_name(
     assert not witness.exists()
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"", "not a readable pickle"),
-        (b"hello there", "not a readable pickle"),
-        (pickle.dumps([1, 2]), "expected a dictionary"),
-        (b"\x80\x02Nr\xff\xff\xff\x7f.", "memo slot"),  # would make the C unpickler allocate 16 GB
-        (
-            b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(J\xff\xff\xff\x7ft",
-            "not a readable",
-        ),
-        (
-            b"\x80\x02ccopy_reg\n_reconstructor\n(c__builtin__\nset\nc__builtin__\nobject\nNtR.",
-            "not a readable",
-        ),
-        (b"\x80\x02P1\n.", "not a readable pickle"),
-    ],
-)
-def test_broken_pickles(tmp_path: Path, data: bytes, message: str) -> None:
-    # Catches tracebacks, hangs and allocations on damaged or hostile bytes.
-    path = tmp_path / "broken.pkl"
-    path.write_bytes(data)
-    with pytest.raises(StgaError, match=f"broken.pkl.*{message}"):
-        read_pickled_arrays(path)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("v_template", None, "has no v_template"),
-        ("kintree_table", None, "has no kintree_table"),
-        ("v_template", np.zeros((40, 2)), r"v_template has shape \(40, 2\), expected \(any, 3\)"),
-        (
-            "shapedirs",
-            np.zeros((39, 3, 12)),
-            r"shapedirs has shape \(39, 3, 12\), expected \(40, 3, any\)",
-        ),
-        ("posedirs", np.zeros((40, 3, 27)), r"posedirs .*expected \(40, 3, 36\)"),
-        ("J_regressor", np.zeros((4, 40)), r"J_regressor .*expected \(5, 40\)"),
-        ("weights", np.full((40, 5), np.nan), "weights holds values that are not finite"),
-        ("weights", np.full((40, 5), "x"), "weights"),
-        ("f", np.full((3, 3), 40), "f names vertices 40 to 40, expected 0 to 39"),
-        ("f", np.full((3, 3), 0.5), "f holds float64, expected whole numbers"),
-        ("f", np.full((3, 3), 1e30), "f holds float64, expected whole numbers"),
-        ("kintree_table", np.array([[0, 4, 1, 1, 1], range(5)]), "kintree_table names the parents"),
-        ("n_identity", np.array(13), "n_identity is 13, expected one number from 0 to 12"),
-        ("masks/nose", np.array([40]), "mask nose"),
-    ],
-)
-def test_malformed_models(tmp_path: Path, key: str, value: np.ndarray | None, message: str) -> None:
-    # Catches a wrong field that is accepted, or reported without its file and name; in both file
-    # formats.
-    arrays = random_arrays()
-    arrays.pop(key, None)
-    if value is not None:
-        arrays[key] = value
-    np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(StgaError, match=f"bad.npz: .*{message}"):
-        read_flame(tmp_path / "bad.npz")
-    if not key.startswith("masks"):
-        (tmp_path / "bad.pkl").write_bytes(pickle.dumps(arrays))
-        with pytest.raises(StgaError, match=r"bad\.pkl: "):
-            read_flame(tmp_path / "bad.pkl")
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    for name in ("none.npz", "none.pkl"):
-        with pytest.raises(StgaError, match=name):
-            read_flame(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "_codecs\nencode",
-        "copy_reg\n_reconstructor",
-        "numpy.core.multiarray\n_reconstruct",
-        "__builtin__\nset",
-    ],
-)
+@pytest.mark.parametrize("name", [
+    "_codecs\nencode", "copy_reg\n_reconstructor", "numpy.core.multiarray\n_reconstruct",
+    "__builtin__\nset",
+])  # fmt: skip
 @pytest.mark.parametrize("state", [b"}S'left'\nI1\ns", b"N}S'_call'\nI1\ns\x86"])
 def test_functions_cannot_be_changed(tmp_path: Path, name: str, state: bytes) -> None:
     """Catches a pickle that sets attributes of a function by BUILD, which would outlive its
@@ -312,8 +231,6 @@ def test_functions_cannot_be_changed(tmp_path: Path, name: str, state: bytes) ->
     path.write_bytes(b"\x80\x02c" + name.encode() + b"\n" + state + b"b.")
     with pytest.raises(StgaError, match="sets attributes of a function"):
         read_pickled_arrays(path)
-    for method in (
-        vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild", "array_shell")
-    ):
+    for method in (vars(_RestrictedUnpickler)[name] for name in ("encode", "rebuild")):
         assert vars(method) == {}
     assert not hasattr(codecs.encode, "left")

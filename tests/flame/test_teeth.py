@@ -23,8 +23,8 @@ from .mouths import (
 # The added vertices stand in this order, in rows of 15.
 UR, LR, UE, LE, URB, UEB, LRB, LEB = range(8)
 STRIP_ROWS = {
-    "upper front": (UR, UE), "upper back": (URB, UEB), "upper bottom": (UE, UEB), "lower front": (LR, LE),
-    "lower back": (LRB, LEB), "lower top": (LE, LEB),
+    "upper front": (UR, UE), "upper back": (URB, UEB), "upper bottom": (UE, UEB),
+    "lower front": (LR, LE), "lower back": (LRB, LEB), "lower top": (LE, LEB),
 }  # fmt: skip
 LAYOUT_CRC32 = 0xB43FE122
 

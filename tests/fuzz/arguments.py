@@ -9,11 +9,12 @@ from stga_addon.jobs import table as ask
 
 REQUESTS = tuple(kind.__name__ for kind in get_args(ask.Request))
 NUMBERS = [
-    "0", "1", "2", "-1", "nan", "inf", "-inf", "1e308", "1e-320", "0x10", "1_0", "٣", " 1", "", "9" * 400, "many",
+    "0", "1", "2", "-1", "nan", "inf", "-inf", "1e308", "1e-320", "0x10", "1_0", "٣", " 1", "",
+    "9" * 400, "many",
 ]  # fmt: skip
 TEXTS = [
-    "", " ", ".", "..", "/", "//", "a\0b", "\ud800", "a" * 300, "a/" * 3000, "ä²−", "\n", "\x1b[2J", "-", "--", "=",
-    "~",
+    "", " ", ".", "..", "/", "//", "a\0b", "\ud800", "a" * 300, "a/" * 3000, "ä²−", "\n", "\x1b[2J",
+    "-", "--", "=", "~",
 ]  # fmt: skip
 
 
@@ -310,9 +311,11 @@ def drive(rng: random.Random, case: Path) -> list[str]:
 
 
 BATCH_PLANS = (
-    'out = "{new}"\n[job.a]\nrequest = "train"\ncapture = "mesh"\nsettings = {{ preset = "draft" }}\n'
+    'out = "{new}"\n[job.a]\nrequest = "train"\ncapture = "mesh"\n'
+    'settings = {{ preset = "draft" }}\n'
     '[job.b]\nrequest = "evaluate"\nrun = "{new}/a"\nsplit = {value}\n',
-    'out = "{new}"\n[resources]\nthreads = {value}\n[job.a]\nrequest = "track"\nminutes = {value}\n',
+    'out = "{new}"\n[resources]\nthreads = {value}\n'
+    '[job.a]\nrequest = "track"\nminutes = {value}\n',
     "[job.a]\nrequest = {value}\nafter = [{value}]\n",
     "{value}",
 )
@@ -336,10 +339,11 @@ def batch(rng: random.Random, case: Path) -> list[str]:
 
 
 COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = {
-    "info": (3, info), "select": (3, select), "export": (3, export), "drive": (1, drive), "render": (3, render),
-    "eval": (2, evaluate), "train": (1, train), "refine": (0.5, refine), "extend": (0.5, extend),
+    "info": (3, info), "select": (3, select), "export": (3, export), "drive": (1, drive),
+    "render": (3, render), "eval": (2, evaluate), "train": (1, train), "refine": (0.5, refine),
+    "extend": (0.5, extend),
     "relight": (0.5, relight), "track": (1, track), "avatar": (0.5, avatar),
-    "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{name}" for name in REQUESTS))]),
+    "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{n}" for n in REQUESTS))]),
     "batch": (1, batch), "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
     "benchmark": (0.5, benchmark), "demo": (0.2, demo),
     "x": (0.1, lambda rng, case: []),

@@ -61,28 +61,18 @@ JSON_VALUES: list[Any] = [
 ]
 ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
     lambda a: a[:-1] if a.ndim else a.reshape(1), lambda a: a[None], lambda a: a.astype(np.float16),
-    lambda a: np.zeros(0, a.dtype), lambda a: np.zeros((0, *a.shape[1:]), a.dtype), lambda a: np.full_like(a, 0),
-    lambda a: -a if a.dtype.kind in "if" else ~a if a.dtype.kind == "b" else a, lambda a: np.full(a.shape, np.nan),
-    lambda a: np.full(a.shape, 1e30), lambda a: np.full(a.shape, np.inf, np.float32),
-    lambda a: np.full(a.shape, 2**62), lambda a: np.full(a.shape, "x"),
-    lambda a: a.astype(complex) if a.dtype.kind in "if" else a, lambda a: a.astype(bool), lambda a: a.T,
-    lambda a: np.concatenate([a, a]) if a.ndim else a,
+    lambda a: np.zeros(0, a.dtype), lambda a: np.zeros((0, *a.shape[1:]), a.dtype),
+    lambda a: np.full_like(a, 0),
+    lambda a: -a if a.dtype.kind in "if" else ~a if a.dtype.kind == "b" else a,
+    lambda a: np.full(a.shape, np.nan), lambda a: np.full(a.shape, 1e30),
+    lambda a: np.full(a.shape, np.inf, np.float32), lambda a: np.full(a.shape, 2**62),
+    lambda a: np.full(a.shape, "x"), lambda a: a.astype(complex) if a.dtype.kind in "if" else a,
+    lambda a: a.astype(bool), lambda a: a.T, lambda a: np.concatenate([a, a]) if a.ndim else a,
 ]  # fmt: skip
 BYTES = [
-    b"\xff" * 8,
-    b"\0" * 8,
-    b"-1",
-    b"1e999",
-    b"NaN",
-    b"[",
-    b"]",
-    b'"',
-    b"{}",
-    b"\n",
-    b".",
-    b"\x80",
+    b"\xff" * 8, b"\0" * 8, b"-1", b"1e999", b"NaN", b"[", b"]", b'"', b"{}", b"\n", b".", b"\x80",
     b"99999999999",
-]
+]  # fmt: skip
 
 
 def damage(rng: random.Random, case: Path, arguments: list[str]) -> str:
@@ -97,11 +87,8 @@ def damage(rng: random.Random, case: Path, arguments: list[str]) -> str:
     small = [path for path in named if path.suffix in (".json", ".npz", ".ply", ".jsonl", ".obj")]
     path = rng.choice(rng.choice([small, small, named, files]) or files)
     special = {
-        ".json": mutate_json,
-        ".jsonl": mutate_json,
-        ".npz": mutate_npz,
-        ".png": mutate_picture,
-    }
+        ".json": mutate_json, ".jsonl": mutate_json, ".npz": mutate_npz, ".png": mutate_picture,
+    }  # fmt: skip
     kind = rng.choice(
         [special.get(path.suffix, mutate_bytes)] * 6 + [mutate_bytes] * 2 + [replace_file]
     )

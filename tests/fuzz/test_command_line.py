@@ -69,15 +69,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(case / "run", case / "unfinished")
     (case / "unfinished/avatar.npz").unlink()
     splats = [
-        "--iterations",
-        2,
-        "--device",
-        "cpu",
-        "--effect",
-        "hull-points=off",
-        "--out",
+        "--iterations", 2, "--device", "cpu", "--effect", "hull-points=off", "--out",
         case / "splats",
-    ]
+    ]  # fmt: skip
     assert call(["train", capture, *splats])[0] == 0
     factory.write_mesh_capture(case / "take", (0, 1), range(2))
     record(case / "footage", HeadModel(small_head(0), "flame"))
@@ -89,12 +83,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert call(["export", case / "run", "--format", "ply", "--out", case / "splats.ply"])[0] == 0
     (case / "head").mkdir()
     head = {
-        "capture": str(capture),
-        "flame": None,
-        "avatar": str(case / "run/avatar.npz"),
-        "principal_point": "vhap",
-        "fps": 24.0,
-    }
+        "capture": str(capture), "flame": None, "avatar": str(case / "run/avatar.npz"),
+        "principal_point": "vhap", "fps": 24.0,
+    }  # fmt: skip
     (case / "head/head.json").write_text(json.dumps(head))
     (case / "take.blend").write_bytes(b"BLENDER")
     write_performance(
@@ -109,11 +100,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def requests_about(case: Path) -> dict[str, ask.Request]:
     """A request of each kind, by its name, about the files of the case."""
     capture, run, footage, once = (
-        case / "mesh",
-        case / "splats",
-        case / "footage",
-        {"iterations": 1, "device": "cpu"},
-    )
+        case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"},
+    )  # fmt: skip
     settings = read_run(case / "run").settings
     key = np.zeros(small_head(0).n_expression + 18)
     avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
@@ -193,7 +181,8 @@ def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch, part: int) 
                 patch.setenv(name, value)
             problem = find_problem(arguments, [case, scratch])
         if problem:
-            tell = f"case {number}: {variables!a} stga {ascii(arguments)[:600]}\n  after {ascii(damages)[:600]}"
+            tell = f"case {number}: {variables!a} stga {ascii(arguments)[:600]}"
+            tell += f"\n  after {ascii(damages)[:600]}"
             failures.setdefault(problem, []).append(tell)
             print(f"{tell}\n  {problem}", flush=True)
     report = [f"{len(found)} x {problem}\n{found[0]}" for problem, found in failures.items()]

@@ -48,12 +48,9 @@ class Driver:
             factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4))
         )
         busy = {
-            "density_interval": 5,
-            "density_span": (0.0, 1.0),
-            "stray_reset_interval": 4,
-            "stray_limit": 0.3,
-            "lattice": 1,
-        }
+            "density_interval": 5, "density_span": (0.0, 1.0), "stray_reset_interval": 4,
+            "stray_limit": 0.3, "lattice": 1,
+        }  # fmt: skip
         self.run = Run(
             self.capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, **busy)
         )

@@ -29,11 +29,9 @@ def write_footage(folder, cameras, timesteps, picture):
             Image.fromarray(picture(camera, timestep)).save(folder / name)
             entry = {"file_path": name, "timestep_index": timestep, "camera_id": f"cam{number}"}
             intrinsics = {
-                "fl_x": camera.fl_x,
-                "fl_y": camera.fl_y,
-                "cx": camera.cx,
+                "fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx,
                 "cy": camera.height - camera.cy,
-            }
+            }  # fmt: skip
             pose = {
                 "transform_matrix": camera.camera_to_world_gl.tolist(),
                 "w": camera.width,

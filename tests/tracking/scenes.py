@@ -55,9 +55,8 @@ def write_colmap_text(folder, cameras, names, model="PINHOLE", parameters=None):
     lines, images = ["# Camera list"], ["# Image list with two lines of data per image:"]
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
         values = parameters or (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
-        lines.append(
-            f"{number} {model} {camera.width} {camera.height} {' '.join(map(repr, map(float, values)))}"
-        )
+        words = " ".join(map(repr, map(float, values)))
+        lines.append(f"{number} {model} {camera.width} {camera.height} {words}")
         pose = *quaternion(camera.world_to_camera[:3, :3]), *camera.world_to_camera[:3, 3]
         images += [
             f"{number} {' '.join(map(repr, map(float, pose)))} {number} {name}",

@@ -68,14 +68,10 @@ def footage(folder, starts, silent=(), codec="pcm_s16le", suffix=".mkv", seeds=(
     return folder
 
 
-@pytest.mark.parametrize(
-    ("silent", "sync", "codec", "suffix"),
-    [
-        ((), "sound", "pcm_s16le", ".mkv"),
-        ((), "auto", "aac", ".mp4"),
-        (("b",), "auto", "pcm_s16le", ".mkv"),
-    ],
-)
+@pytest.mark.parametrize(("silent", "sync", "codec", "suffix"), [
+    ((), "sound", "pcm_s16le", ".mkv"), ((), "auto", "aac", ".mp4"),
+    (("b",), "auto", "pcm_s16le", ".mkv"),
+])  # fmt: skip
 def test_clocks_that_differ(tmp_path, silent, sync, codec, suffix):
     """Catches an offset with the wrong sign, one that ignores where sound begins, and silence that
     stops it."""

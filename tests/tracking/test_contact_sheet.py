@@ -9,9 +9,8 @@ from PIL import Image
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.model import View
-from stga_addon.tracking.contact_sheet import COLUMNS, MESH_OPACITY, PICTURE, write_contact_sheet
-from stga_addon.tracking.footage.image_frames import ImageFrames
-from stga_addon.tracking.footage.model import Footage, FootageCamera
+from stga_addon.tracking.footage.model import Footage, FootageCamera, ImageFrames
+from stga_addon.tracking.pictures import COLUMNS, MESH_OPACITY, PICTURE, write_contact_sheet
 
 SIZE = 120
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.1)

@@ -146,6 +146,10 @@ def replaced(name, content):
     return lambda out: (out / name).write_bytes(content)
 
 
+def solved(**arrays):
+    return lambda out: write_npz(out / SOLVED_FILE, arrays)
+
+
 def unconfident(out):
     """No landmark that counts in any file of a camera."""
     for path in (out / LANDMARKS_FOLDER).glob("cam*.npz"):
@@ -157,90 +161,32 @@ SIZE = TAKE.shape[1]
 MISFIT = "image_misfit: expected shares by region and timestep"
 INTERPOLATED = r"interpolated: expected timesteps"
 PARAMETERS = rf"parameters: expected \(5, {SIZE}\) finite numbers"
+OTHERS = "timesteps: expected those of the capture"
+FIVE, POSES = np.arange(5), TAKE[:5]
 DAMAGES = {
     "report missing": (lambda out: (out / REPORT_FILE).unlink(), REPORT_FILE, "cannot be read"),
-    "report cut": (replaced(REPORT_FILE, b'{"interpolated": ['), REPORT_FILE, "is not valid JSON"),
-    "report of another kind": (replaced(REPORT_FILE, b"[1]"), REPORT_FILE, INTERPOLATED),
-    "report of null": (replaced(REPORT_FILE, b"null"), REPORT_FILE, INTERPOLATED),
-    "no interpolated": (changed(REPORT_FILE, interpolated=None), REPORT_FILE, INTERPOLATED),
-    "interpolated number": (changed(REPORT_FILE, interpolated=3), REPORT_FILE, INTERPOLATED),
-    "interpolated lists": (changed(REPORT_FILE, interpolated=[[1]]), REPORT_FILE, INTERPOLATED),
-    "interpolated texts": (changed(REPORT_FILE, interpolated=["2"]), REPORT_FILE, INTERPOLATED),
-    "misfit of lists": (
-        changed(REPORT_FILE, image_misfit={"lower face": [0.1]}),
-        REPORT_FILE,
-        MISFIT,
-    ),
-    "misfit of texts": (
-        changed(REPORT_FILE, image_misfit={"lower face": {"0": "much"}}),
-        REPORT_FILE,
-        MISFIT,
-    ),
-    "interpolated not a number": (
-        changed(REPORT_FILE, interpolated=[float("nan")]),
-        REPORT_FILE,
-        INTERPOLATED,
-    ),
-    "solved empty": (replaced(SOLVED_FILE, b""), SOLVED_FILE, "is not a readable npz"),
-    "solved folder": (
-        lambda out: (out / SOLVED_FILE).mkdir(),
-        SOLVED_FILE,
-        "is not a regular file",
-    ),
-    **{
-        f"solved {name}": (
-            lambda out, arrays=arrays: write_npz(out / SOLVED_FILE, arrays),
-            SOLVED_FILE,
-            message,
-        )
-        for name, arrays, message in (
-            ("without parameters", {"timesteps": np.arange(5)}, PARAMETERS),
-            ("of fewer timesteps", {"timesteps": np.arange(5), "parameters": TAKE[:4]}, PARAMETERS),
-            ("flat", {"timesteps": np.arange(5), "parameters": TAKE[:5].ravel()}, PARAMETERS),
-            (
-                "as text",
-                {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(str)},
-                PARAMETERS,
-            ),
-            (
-                "as complex",
-                {"timesteps": np.arange(5), "parameters": TAKE[:5].astype(complex)},
-                PARAMETERS,
-            ),
-            (
-                "not a number",
-                {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.nan)},
-                PARAMETERS,
-            ),
-            (
-                "infinite",
-                {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), np.inf, "f4")},
-                PARAMETERS,
-            ),
-            (
-                "astronomic",
-                {"timesteps": np.arange(5), "parameters": np.full((5, SIZE), 1e300)},
-                PARAMETERS,
-            ),
-            (
-                "without timesteps",
-                {"parameters": TAKE[:5]},
-                "timesteps: expected those of the capture",
-            ),
-            (
-                "of others",
-                {"timesteps": np.arange(5) + 7, "parameters": TAKE[:5]},
-                "timesteps: expected those",
-            ),
-            (
-                "of names",
-                {"timesteps": np.array(list("01234")), "parameters": TAKE[:5]},
-                "timesteps: expected those",
-            ),
-        )
-    },
     "no landmark counts": (unconfident, LANDMARKS_FOLDER, "has no landmarks of a face"),
-}
+    "solved folder": (lambda out: (out / SOLVED_FILE).mkdir(), SOLVED_FILE, "is not a regular"),
+    "solved empty": (replaced(SOLVED_FILE, b""), SOLVED_FILE, "is not a readable npz"),
+    **{f"report {content}": (replaced(REPORT_FILE, content), REPORT_FILE, INTERPOLATED)
+       for content in (b"[1]", b"null")},
+    "report cut": (replaced(REPORT_FILE, b'{"interpolated": ['), REPORT_FILE, "is not valid JSON"),
+    **{f"interpolated {own}": (changed(REPORT_FILE, interpolated=own), REPORT_FILE, INTERPOLATED)
+       for own in (None, 3, [[1]], ["2"], [float("nan")])},
+    **{f"misfit {own}": (changed(REPORT_FILE, image_misfit={"face": own}), REPORT_FILE, MISFIT)
+       for own in ([0.1], {"0": "much"})},
+    **{f"solved {name}": (solved(**arrays), SOLVED_FILE, message) for name, arrays, message in (
+        ("without parameters", {"timesteps": FIVE}, PARAMETERS),
+        ("of fewer timesteps", {"timesteps": FIVE, "parameters": TAKE[:4]}, PARAMETERS),
+        ("as text", {"timesteps": FIVE, "parameters": POSES.astype(str)}, PARAMETERS),
+        ("as complex", {"timesteps": FIVE, "parameters": POSES.astype(complex)}, PARAMETERS),
+        ("not a number", {"timesteps": FIVE, "parameters": np.nan * POSES}, PARAMETERS),
+        ("astronomic", {"timesteps": FIVE, "parameters": POSES + 1e300}, PARAMETERS),
+        ("without timesteps", {"parameters": POSES}, OTHERS),
+        ("of others", {"timesteps": FIVE + 7, "parameters": POSES}, OTHERS),
+        ("of names", {"timesteps": np.array(list("01234")), "parameters": POSES}, OTHERS),
+    )},
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DAMAGES)

@@ -100,16 +100,10 @@ def with_metadata(path, value, kind, where, versioned):
 
 
 @pytest.mark.parametrize("where", ["moov", "trak"])
-@pytest.mark.parametrize(
-    ("name", "value", "kind"),
-    [
-        ("a.mov", b"28", 1),
-        ("a.mov", b"28.00mm", 1),
-        ("a.mov", struct.pack(">i", 28), 21),
-        ("a.mp4", struct.pack(">f", 28), 23),
-        ("a.mp4", struct.pack(">d", 28), 24),
-    ],
-)
+@pytest.mark.parametrize(("name", "value", "kind"), [
+    ("a.mov", b"28", 1), ("a.mov", b"28.00mm", 1), ("a.mov", struct.pack(">i", 28), 21),
+    ("a.mp4", struct.pack(">f", 28), 23), ("a.mp4", struct.pack(">d", 28), 24),
+])  # fmt: skip
 def test_focal_length_of_videos(tmp_path, name, value, kind, where):
     """Catches a phone's lens that is not read, as by FFmpeg, which leaves out the metadata of
     tracks."""

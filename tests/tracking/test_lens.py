@@ -7,8 +7,7 @@ import pytest
 
 from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
-from stga_addon.tracking.footage.lens import Lens
-from stga_addon.tracking.footage.undistort import undistortion
+from stga_addon.tracking.footage.lens import Lens, undistortion
 
 POINTS = np.stack(
     np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7)), axis=-1

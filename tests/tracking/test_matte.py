@@ -8,7 +8,7 @@ from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.mesh_geometry import silhouette
 from stga_addon.capture.open import open_capture
 from stga_addon.tracking.face_networks import PersonNetwork
-from stga_addon.tracking.matte import find_matte, probability_by_plate
+from stga_addon.tracking.mattes import find_matte, probability_by_plate
 
 pytest.importorskip("cv2")
 

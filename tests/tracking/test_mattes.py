@@ -173,7 +173,8 @@ def test_a_folder_that_is_none(tmp_path, capsys):
     """Catches a traceback for a folder that does not exist."""
     take(tmp_path)
     more = [
-        "--model", str(tmp_path / "none.npz"), "--out", str(tmp_path / "out"), "--mattes", str(tmp_path / "nowhere"),
+        "--model", str(tmp_path / "none.npz"), "--out", str(tmp_path / "out"), "--mattes",
+        str(tmp_path / "nowhere"),
     ]  # fmt: skip
     assert main(["track", str(tmp_path / "footage"), *more]) == 2
     assert "nowhere: is not a folder; expected one of mattes" in capsys.readouterr().err

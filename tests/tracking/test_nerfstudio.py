@@ -81,33 +81,13 @@ def test_splits_are_one_rig(tmp_path):
     assert [camera.timesteps for camera in footage.cameras] == [(0, 1), (0,)]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"k1": "much"}, r"transforms.json: frames\[1\].k1: expected a finite number, not 'much'"),
-        (
-            {"camera_model": "EQUIRECTANGULAR"},
-            r"frames\[1\].camera_model: 'EQUIRECTANGULAR' is not one of",
-        ),
-        (
-            {"file_path": "images/none.png"},
-            r"frames\[1\]: .* has no image, folder or video of the name 'images/none.png'",
-        ),
-        (
-            {"mask_path": "masks/none.png"},
-            r"masks/none.png: does not exist, but .*frames\[1\] names it",
-        ),
-        ({"k1": -40.0}, r"frames\[1\]: the distortion of its lens folds the image"),
-        ({"k1": 1e308, "k2": -1e308}, r"frames\[1\]: the distortion of its lens folds the image"),
-        ({"k1": 10**400}, r"frames\[1\].k1: expected a finite number"),
-        ({"cx": 1e6, "k1": 0.1}, r"frames\[1\]: the distortion of its lens folds the image"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"file_path": "images/none.png"}, r"frames\[1\]: .* has no image, folder or video of"),
+    ({"mask_path": "masks/none.png"}, r"masks/none.png: does not .*frames\[1\] names it"),
+])  # fmt: skip
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_bad_entries_are_named(tmp_path, change, message):
     """Catches a traceback, or a message without file and field."""
-    if "folds" in message:
-        pytest.importorskip("cv2")
     first, second = rig(2)
     write_transforms(tmp_path, [entry(first, "images/0.png"), entry(second, "images/1.png")])
     values = json.loads((tmp_path / "transforms.json").read_text(encoding="utf-8"))

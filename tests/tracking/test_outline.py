@@ -13,11 +13,11 @@ from stga_addon.capture.mesh_geometry import Similarity, rasterize
 from stga_addon.flame.forward import flame_forward
 from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.outline import outline_offsets
 from stga_addon.tracking.seen_surface import (
     RecordedTake,
     near_landmarks,
     no_masks,
+    outline_offsets,
     outlines_agree,
     surface_points,
 )

@@ -5,7 +5,7 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.realitycapture import (
+from stga_addon.tracking.footage.photogrammetry import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
@@ -136,90 +136,6 @@ def test_level_camera_of_a_csv(tmp_path):
         [right, down, forward], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12
     )
     np.testing.assert_allclose(shot.camera.position, [1, 2, 3], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            '"brown4t2"',
-            '"division"',
-            r"a.xmp: xcr:DistortionModel 'division' is not one of perspective, brown3",
-        ),
-        (
-            "<xcr:Rotation>",
-            "<xcr:Rotation>1 ",
-            r"a.xmp: xcr:Rotation: expected 9 finite numbers, not",
-        ),
-        ('xcr:FocalLength35mm="24.3765359225552"', "", r"a.xmp: xcr:FocalLength35mm is missing"),
-        (
-            "24.3765359225552",
-            "long",
-            r"a.xmp: xcr:FocalLength35mm: expected 1 finite number, not 'long'",
-        ),
-        ("</x:xmpmeta>", "", r"a.xmp: is not valid XML"),
-        ("xcr:Position>", "xcr:Other>", r"has no camera with a pose"),
-        ("24.3765359225552", "1e-320", r"a.xmp: expected a focal length of 1 to 1e7 pixels, not "),
-        ("24.3765359225552", "1e308", r"a.xmp: expected a focal length of 1 to 1e7 pixels, not "),
-        (
-            'AspectRatio="1"',
-            'AspectRatio="1e308"',
-            r"a.xmp: expected a focal length of 1 to 1e7 pixels, not ",
-        ),
-        ("-0.0046", "-1e308", r"a.xmp: expected a principal point within 1e\+07 pixels"),
-        (COEFFICIENTS, "1e308 -1e308", r"a.xmp: the distortion of its lens folds the image"),
-    ],
-)
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_damaged_xmp_is_named(tmp_path, old, new, message):
-    """Catches a traceback, a message without file and field, and a distortion model read as
-    another."""
-    write_xmp(tmp_path / "a.xmp", rig()[0])
-    write_image(tmp_path / "a.png")
-    text = (tmp_path / "a.xmp").read_text(encoding="utf-8")
-    assert old in text
-    (tmp_path / "a.xmp").write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(StgaError, match=message):
-        open_footage(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("a.png,1,2,3,0,0,0", r"cameras.csv: line 2: expected 16 columns, not 7"),
-        (
-            "a.png,1,2,3,0,0,west,18,0,0,0,0,0,0,0,0",
-            r"cameras.csv: line 2: roll: expected 1 finite number, not 'west'",
-        ),
-        (
-            "z.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0",
-            r"camera z.png: .* has no image, folder or video of the name 'z.png'",
-        ),
-        (
-            "a.png,1e308,-1e308,1e308,9,9,9,18,0,0,0,0,0,0,0,0",
-            r"line 2: expected a camera within 1e\+12 units",
-        ),
-        (
-            "a.png,1,2,3,1e308,0,0,18,0,0,1e308,-1e308,0,0,0,0",
-            r"line 2: the distortion of its lens folds the image",
-        ),
-        (
-            "a" * 200_000 + ".png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0",
-            r"cameras.csv: line 2: is not readable CSV",
-        ),
-        (
-            "z" * 5000 + ".png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0",
-            r"camera zzz.*: .* has no image, folder or video",
-        ),
-    ],
-)
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_damaged_csv_is_named(tmp_path, line, message):
-    """Catches a traceback, or a message without file and line."""
-    (tmp_path / "cameras.csv").write_text(f"{HEADER}\n{line}\n", encoding="utf-8")
-    write_image(tmp_path / "a.png")
-    with pytest.raises(StgaError, match=message):
-        open_footage(tmp_path)
 
 
 def test_two_calibrations(tmp_path):

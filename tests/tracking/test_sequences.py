@@ -1,6 +1,5 @@
 """Frames of folders and videos, in step."""
 
-import struct
 import sys
 
 import numpy as np
@@ -160,45 +159,6 @@ def write_videos(root, counts=(12, 12), rates=(25, 25), **options):
             rate=rate,
             **options,
         )
-
-
-@pytest.mark.parametrize("order", [range(12), [11, 3, 4, 5, 0, 10, 2], [6, 6, 5]])
-def test_frames_of_a_video_in_any_order(tmp_path, order):
-    """Catches key frames shown for the frames after them, and frames in the order of decoding."""
-    write_videos(tmp_path)
-    footage = open_footage(tmp_path, cameras=tmp_path / "calibration")
-    assert footage.fps == 25
-    assert footage.timesteps == tuple(range(12))
-    second = footage.cameras[1]
-    found = values_of(second.image(t) for t in order)
-    np.testing.assert_allclose(found, [65 + 10 * t for t in order], atol=3)
-    assert second.source(3) == f"{tmp_path / 'videos/b.mp4'}: frame 3"
-    assert second.file(3) is None
-
-
-def test_upright_phone_video(tmp_path):
-    """Catches a video that a phone recorded on its side, shown lying or upside down."""
-    av = pytest.importorskip("av")
-    path = tmp_path / "phone.mp4"
-    image = np.full((HEIGHT, WIDTH, 3), 40, np.uint8)
-    image[:, WIDTH // 2 :] = 200
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream.encode())
-    data = bytearray(path.read_bytes())
-    matrix = data.index(b"tkhd") + 44  # of the track header, version 0: 16.16 and 2.30 fixed point
-    data[matrix : matrix + 36] = struct.pack(
-        ">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, HEIGHT << 16, 0, 1 << 30
-    )
-    path.write_bytes(data)  # a quarter turn clockwise, as players show it
-    camera = open_footage(path).cameras[0]
-    assert (camera.camera.width, camera.camera.height) == (HEIGHT, WIDTH)
-    upright = camera.image(0)
-    assert upright.shape == (WIDTH, HEIGHT, 3)
-    assert upright[:15].mean() < 60
-    assert upright[-15:].mean() > 180
 
 
 def test_range_of_videos(tmp_path):

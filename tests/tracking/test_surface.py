@@ -261,10 +261,8 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
         flame_forward(model, np.zeros(model.n_identity), frame_at(head, t)) for t in (0, 3, 6)
     ]
     places, reliable, front = (
-        places_on(head, 150),
-        np.ones(150, bool),
-        model.v_template[:, 2] > 0.04,
-    )
+        places_on(head, 150), np.ones(150, bool), model.v_template[:, 2] > 0.04,
+    )  # fmt: skip
     lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]
     right = {t: seen(cameras, places.on(mesh, model.faces)) for t, mesh in enumerate(meshes)}
     wrong = {

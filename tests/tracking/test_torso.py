@@ -24,7 +24,14 @@ from stga_addon.flame.forward import (
 from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
 from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import HeadFit
-from stga_addon.tracking.folder import PLACES_FILE, REPORT_FILE
+from stga_addon.tracking.folder import (
+    PLACES_FILE,
+    REPORT_FILE,
+    TorsoMotion,
+    TorsoPoints,
+    read_torso_motion,
+    read_torso_points,
+)
 from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
@@ -33,14 +40,7 @@ from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
-from stga_addon.tracking.torso_cloth import Bending, found_bending
-from stga_addon.tracking.torso_drape import draped, torso_sheet
-from stga_addon.tracking.torso_motion import (
-    TorsoMotion,
-    TorsoPoints,
-    read_torso_motion,
-    read_torso_points,
-)
+from stga_addon.tracking.torso_cloth import Bending, draped, found_bending, torso_sheet
 from stga_addon.tracking.torso_take import (
     NECK,
     ROOT,
@@ -145,10 +145,9 @@ def take(head, heads, torsos, size=SIZE, shifts=None):
         zip(np.radians(heads), np.radians(torsos), strict=True)
     ):
         zero = np.zeros(3)
-        frame = FlameFrame(
-            np.zeros(one.model.n_expression), np.array([0, carried, 0]), np.array([0, turned - carried, 0]),
-            zero, np.array([0.002 * timestep, 0, 0]), np.zeros(6),
-        )  # fmt: skip
+        expr, moved = np.zeros(one.model.n_expression), np.array([0.002 * timestep, 0, 0])
+        root, neck = np.array([0, carried, 0]), np.array([0, turned - carried, 0])
+        frame = FlameFrame(expr, root, neck, zero, moved, np.zeros(6))
         turn = axis_angle_matrices(frame.rotation[None])[0]
         shoulders = (cloth - joints[ROOT]) @ turn.T + joints[ROOT] + frame.translation
         shoulders += 0 if shifts is None else shifts[timestep]
@@ -322,9 +321,9 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
 def test_turning_the_root_leaves_the_head_in_its_place(head):
     """Catches a neck that turns about another point than the model's."""
     one, rng = person(head, np.zeros(head.model.n_identity)), np.random.default_rng(0)
-    zero = np.zeros(3)
-    frame = FlameFrame(rng.normal(0, 0.3, one.model.n_expression), rng.normal(0, 0.4, 3), rng.normal(0, 0.2, 3),
-                       zero, rng.normal(0, 1, 3), np.zeros(6))  # fmt: skip
+    expr = rng.normal(0, 0.3, one.model.n_expression)
+    root, neck = rng.normal(0, 0.4, 3), rng.normal(0, 0.2, 3)
+    frame = FlameFrame(expr, root, neck, np.zeros(3), rng.normal(0, 1, 3), np.zeros(6))
     # the throat's correctives are another thing
     model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))
     joints = joint_positions(model, model.v_template + model.shapedirs @ frame.expr)

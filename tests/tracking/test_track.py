@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flame.small_head import small_head, write_flame
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
@@ -23,9 +22,9 @@ from stga_addon.flame.forward import RIGID_SIZE, flame_forward
 from stga_addon.flame.teeth import flame_model
 from stga_addon.jobs.perform import perform
 from stga_addon.jobs.track import STAGES, Track
-from stga_addon.tracking.camera_scale import scale_warnings
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import HeadFit
+from stga_addon.tracking.focal_length import scale_warnings
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
@@ -312,93 +311,6 @@ def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
     )
 
 
-def full(value, dtype=None):
-    return lambda array: np.full(array.shape, value, dtype)
-
-
-def with_first(value, dtype=float):
-    """The array with another first element."""
-    return lambda array: np.concatenate([[value], array.ravel()[1:].astype(dtype)]).reshape(
-        array.shape
-    )
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize(
-    ("file", "field", "change", "expected"),
-    [
-        (
-            "cam0",
-            "points",
-            lambda _: np.zeros((5, 3)),
-            "points has shape (5, 3), expected (5, any, 2)",
-        ),
-        ("cam0", "points", full("x"), "points holds <U1, expected floating-point numbers"),
-        ("cam0", "points", full(1e300), "points: expected pixels of at most 100000"),
-        (
-            "cam0",
-            "points",
-            full(np.longdouble("1e4000")),
-            "points: expected finite pixels where confidence is not 0",
-        ),
-        (
-            "cam0",
-            "points",
-            with_first(np.nan),
-            "points: expected finite pixels where confidence is not 0",
-        ),
-        (
-            "cam0",
-            "points",
-            lambda _: np.zeros((5, 7, 2)),
-            "confidence has shape (5, 120), expected (5, 7)",
-        ),
-        (
-            "cam0",
-            "timesteps",
-            lambda _: np.array([0, 1, 2, 3, 99]),
-            "timesteps: expected timesteps of camera cam0",
-        ),
-        (
-            "cam0",
-            "timesteps",
-            lambda _: np.array([0, 1, 2, 3, 3]),
-            "timesteps: expected timesteps of camera cam0",
-        ),
-        ("cam0", "confidence", full(-1.0), "confidence: expected numbers from 0 to 1e+06"),
-        ("cam0", "confidence", full(1e308), "confidence: expected numbers from 0 to 1e+06"),
-        ("cam0", "confidence", full(np.nan), "confidence: expected numbers from 0 to 1e+06"),
-        ("cam0", "confidence", full("high"), "confidence holds <U4, expected numbers"),
-        ("head_model", "face", full(-1), "face: uses 0 landmarks, expected at least 4"),
-        ("head_model", "face", full("x"), "face: expected triangles from 0 to"),
-        ("head_model", "face", full(10**6), "face: expected triangles from 0 to"),
-        ("head_model", "barycentric", full("x"), "barycentric holds <U1, expected numbers"),
-        (
-            "head_model",
-            "barycentric",
-            lambda _: np.ones((7, 3)),
-            "barycentric has shape (7, 3), expected (120, 3)",
-        ),
-        ("head_model", "barycentric", full(np.nan), "barycentric: expected finite numbers"),
-        ("head_model", "barycentric", with_first(np.inf), "barycentric: expected finite numbers"),
-        ("head_model", "barycentric", full(-1.0), "barycentric: expected numbers from 0 up"),
-        ("head_model", "barycentric", full(0.5), "barycentric: expected rows that add up to 1"),
-    ],
-)
-def test_wrong_landmark_files_are_named(recorded, capsys, file, field, change, expected):
-    """Catches landmark files that are read as something else, end in a traceback, or are refused
-    for a wrong reason."""
-    path = recorded[0] / f"points/{file}.npz"
-    arrays = dict(np.load(path))
-    if file == "head_model":
-        arrays["face"][0] = -1  # an infinite number is refused in a row that is not used, too
-    write_npz(path, arrays | {field: change(arrays[field])})
-    assert command(recorded[0]) == 2
-    message = capsys.readouterr().err
-    assert f"{path}: {expected}" in message
-    assert message.count("\n") == 1
-
-
 def test_landmark_files_of_different_detectors(recorded, capsys):
     """Catches landmarks of one camera taken for those of another number."""
     path = recorded[0] / "points/cam0.npz"
@@ -441,16 +353,6 @@ def test_places_in_one_point_are_no_face(recorded, capsys):
     )
 
 
-def test_a_resolution_that_changes_is_named(recorded, capsys):
-    """Catches a capture that is half written when an image of another size is met."""
-    folder, _ = recorded
-    Image.new("RGB", (SIZE // 2, SIZE // 2)).save(folder / "footage/images/3_4.png")
-    assert command(folder) == 2
-    message = capsys.readouterr().err
-    assert re.search(rf"3_4.png: .*{SIZE // 2} x {SIZE // 2}", message)
-    assert not (folder / "out").exists()
-
-
 @pytest.mark.parametrize(("side_deg", "is_told"), [(68, False), (45, True)])
 def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
     head, side_deg, is_told
@@ -483,18 +385,6 @@ def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
     assert [text[:40] for text in warnings] == (
         ["camera cam4: shows the head 7.0% smaller"] if is_told else []
     )
-
-
-def test_footage_without_a_face(recorded, capsys):
-    """Catches a crash, or a capture of nothing, where nobody is in the picture."""
-    folder, _ = recorded
-    for number in range(5):
-        arrays = dict(np.load(folder / f"points/cam{number}.npz"))
-        write_npz(
-            folder / f"points/cam{number}.npz", arrays | {"confidence": np.zeros((5, LANDMARKS))}
-        )
-    assert command(folder) == 2
-    assert "shows no face, nor does any other of 25 frames" in capsys.readouterr().err
 
 
 class Counting:
@@ -692,13 +582,9 @@ def test_no_face_is_found_on_the_back_of_a_head(recorded, capsys, head):
         replace(head.model, v_template=head.model.v_template * [-1, 1, -1]), folder / "turned.npz"
     )
     words = [
-        "track",
-        str(folder / "footage"),
-        "--model",
-        str(folder / "turned.npz"),
-        "--out",
+        "track", str(folder / "footage"), "--model", str(folder / "turned.npz"), "--out",
         str(folder / "out"),
-    ]
+    ]  # fmt: skip
     assert main(words) == 2
     assert re.search(r"turned\.npz: shows a face in . of 9 pictures", capsys.readouterr().err)
     assert not (folder / "out").exists()

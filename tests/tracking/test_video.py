@@ -17,16 +17,12 @@ av = pytest.importorskip("av")
 BLOCK, COLUMNS, ROWS = 16, 6, 4
 FRAMES = 52
 X264 = {
-    "bf": "3",
-    "b_strategy": "0",
-    "g": "12",
-    "keyint_min": "12",
-    "sc_threshold": "0",
-    "crf": "12",
-}
+    "bf": "3", "b_strategy": "0", "g": "12", "keyint_min": "12", "sc_threshold": "0", "crf": "12",
+}  # fmt: skip
 OPEN_X264 = X264 | {"x264-params": "open-gop=1:b-adapt=0"}
 OPEN_X265 = {
-    "x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:log-level=0"
+    "x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:"
+    "log-level=0"
 }
 MPEG4 = {"g": "12", "bf": "2", "b": "4000000"}
 
@@ -44,9 +40,13 @@ VIDEOS = {
     "MPEG-2 in a transport stream": ("a.mts", "mpeg2video", MPEG4),
     "MPEG-2 in MXF": ("a.mxf", "mpeg2video", MPEG4),
     "Motion JPEG in AVI": ("a.avi", "mjpeg", {"qmin": "2", "qmax": "3"}),
-    "VP9": ("a.webm", "libvpx-vp9", {"g": "12", "b": "2000000", "cpu-used": "8", "deadline": "realtime"}),
+    "VP9": (
+        "a.webm", "libvpx-vp9",
+        {"g": "12", "b": "2000000", "cpu-used": "8", "deadline": "realtime"},
+    ),
     "VP8 with hidden reference frames": (
-        "a.webm", "libvpx", {"g": "40", "b": "2000000", "auto-alt-ref": "1", "lag-in-frames": "10", "cpu-used": "4"},
+        "a.webm", "libvpx",
+        {"g": "40", "b": "2000000", "auto-alt-ref": "1", "lag-in-frames": "10", "cpu-used": "4"},
     ),
 }  # fmt: skip
 
@@ -149,15 +149,10 @@ def test_frames_hidden_by_an_edit_list(tmp_path, codec, suffix):
     assert_numbers(path, list(range(7, FRAMES)))
 
 
-@pytest.mark.parametrize(
-    ("codec", "options", "name"),
-    [
-        ("libx265", OPEN_X265, "a.mov"),
-        ("libx265", OPEN_X265, "a.mkv"),
-        ("libx265", OPEN_X265, "a.mts"),
-        ("libx264", OPEN_X264, "a.mts"),
-    ],
-)
+@pytest.mark.parametrize(("codec", "options", "name"), [
+    ("libx265", OPEN_X265, "a.mov"), ("libx265", OPEN_X265, "a.mkv"),
+    ("libx265", OPEN_X265, "a.mts"), ("libx264", OPEN_X264, "a.mts"),
+])  # fmt: skip
 def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
     """Catches pictures counted whose references were cut away, and frames shown in their place."""
     whole = tmp_path / f"whole{name[1:]}"
@@ -224,14 +219,12 @@ def test_cameras_whose_rate_varies_apart(tmp_path):
 # A display matrix in the file's track header, and how a player shows the corners a b / c d of the
 # stored picture.
 TURNS = {
-    "as stored": ((1, 0, 0, 1), "ab cd"),
-    "mirrored": ((-1, 0, 0, 1), "ba dc"),
-    "upside down": ((-1, 0, 0, -1), "dc ba"),
-    "mirrored top to bottom": ((1, 0, 0, -1), "cd ab"),
+    "as stored": ((1, 0, 0, 1), "ab cd"), "mirrored": ((-1, 0, 0, 1), "ba dc"),
+    "upside down": ((-1, 0, 0, -1), "dc ba"), "mirrored top to bottom": ((1, 0, 0, -1), "cd ab"),
     "turned clockwise": ((0, 1, -1, 0), "ca db"),
     "turned counterclockwise": ((0, -1, 1, 0), "bd ac"),
     "mirrored and turned": ((0, 1, 1, 0), "ac bd"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("turn", TURNS)

@@ -17,7 +17,7 @@ from stga_addon.capture.model import Capture, View
 from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
-from stga_addon.tracking.torso_motion import TorsoPoints, write_torso_points
+from stga_addon.tracking.folder import TorsoPoints, write_torso_points
 from stga_addon.training.optimize.hull_points import (
     MIN_MESH_DISTANCE_M,
     SEEN_COPIES,

@@ -1,24 +1,34 @@
-"""Which calibration a footage folder has, and its cameras."""
+"""Which calibration a footage folder has, and its cameras; those of nerfstudio, instant-ngp and
+VHAP (`transforms.json`, with lens distortion) are read here."""
 
 from os.path import isdir, isfile
 from pathlib import Path
+from typing import Any
 
-from ...capture.transforms import SPLITS
-from ...errors import StgaError
+from ...capture.transforms import MAX_NUMBER, SPLITS, frame_rate, inside, read_transforms
+from ...errors import StgaError, shorten
+from ...files import read_json
 from .colmap import find_colmap, read_colmap
-from .metashape import read_metashape
-from .nerfstudio import read_nerfstudio
-from .realitycapture import (
+from .lens import Lens
+from .photogrammetry import (
     ImageSize,
+    is_metashape,
     is_realitycapture_csv,
+    read_metashape,
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
 from .shots import Shot
 
 TRANSFORMS = ("transforms.json", *(f"transforms_{split}.json" for split in SPLITS))
-EXPECTED = "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, RealityCapture's CSV or XMP files"
+EXPECTED = (
+    "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, "
+    "RealityCapture's CSV or XMP files"
+)
 NAMES_IN_WARNING = 5
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+PERSPECTIVE_MODELS = (*PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def find_calibration(root: Path) -> Path | None:
@@ -34,16 +44,16 @@ def find_calibration(root: Path) -> Path | None:
     colmap = find_colmap(root)
     if colmap is not None:
         return colmap
-    xml = [path for path in sorted(root.glob("*.xml")) if isfile(path) and _is_metashape(path)]
-    tables = [
-        path for path in sorted(root.glob("*.csv")) if isfile(path) and is_realitycapture_csv(path)
+    found = [
+        path
+        for pattern, is_own in (("*.xml", is_metashape), ("*.csv", is_realitycapture_csv))
+        for path in sorted(root.glob(pattern))
+        if isfile(path) and is_own(path)
     ]
-    if len(xml + tables) > 1:
-        raise StgaError(
-            f"{root}: {(xml + tables)[0].name} and {(xml + tables)[1].name} are calibrations; choose one"
-        )
+    if len(found) > 1:
+        raise StgaError(f"{root}: {found[0].name} and {found[1].name} are calibrations; choose one")
     folders = [folder for folder in (root, root / "images") if any(folder.glob("*.xmp"))]
-    return next(iter(xml + tables + folders), None)
+    return next(iter(found + folders), None)
 
 
 def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tuple[str, ...]]:
@@ -58,13 +68,9 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
         raise StgaError(f"{path}: has no camera with a pose")
     if not without_pose:
         return shots, ()
-    more = (
-        ""
-        if len(without_pose) <= NAMES_IN_WARNING
-        else f" and {len(without_pose) - NAMES_IN_WARNING} more"
-    )
-    names = ", ".join(without_pose[:NAMES_IN_WARNING])
-    return shots, (f"{path}: left out cameras without a pose: {names}{more}",)
+    names, more = ", ".join(without_pose[:NAMES_IN_WARNING]), len(without_pose) - NAMES_IN_WARNING
+    rest = f" and {more} more" if more > 0 else ""
+    return shots, (f"{path}: left out cameras without a pose: {names}{rest}",)
 
 
 def _read(path: Path, image_size: ImageSize) -> tuple[list[Shot], list[str]]:
@@ -92,9 +98,51 @@ def _read(path: Path, image_size: ImageSize) -> tuple[list[Shot], list[str]]:
     raise StgaError(f"{path}: is no calibration; expected {EXPECTED}")
 
 
-def _is_metashape(path: Path) -> bool:
-    """Whether it begins as Metashape's export; other programs write XML files beside images,
-    too."""
-    with path.open("rb") as stream:
-        start = stream.read(1024)
-    return b"<document" in start and b"<chunk" in start
+def read_nerfstudio(path: Path) -> list[Shot]:
+    """Entries of a transforms file; `file_path` is the label. Raises StgaError.
+
+    Their `cy` means what VHAP's does where frames have `timestep_index`, else what OpenCV's does
+    (`read_transforms`).
+    """
+    top = read_json(path)
+    found = top.get("frames") if isinstance(top, dict) else None
+    entries = [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
+    timed = any("timestep_index" in entry for entry in entries)
+    frames = read_transforms(path, "vhap" if timed else "opencv")
+    timed = timed or any("keyframe" in entry for entry in entries)
+    folder, fps, shots = path.parent.resolve(), frame_rate(path, top), []
+    for frame, entry in zip(frames, entries, strict=True):
+        values, view, where = {**top, **entry}, frame.view, frame.where
+        lens, mask, mask_path = _lens(values, where), view.mask, values.get("mask_path")
+        if mask is None and isinstance(mask_path, str):  # nerfstudio's
+            mask = inside(folder, mask_path, f"{where}.mask_path")
+        number = f"{view.camera_index:02d}" if "camera_index" in values else None
+        timestep, name = view.timestep if timed else None, frame.camera_id or number
+        keeps = top.get("world") == "keep"
+        shots.append(
+            Shot(view.name, view.camera, lens, where, view.image, timestep, mask, name, fps, keeps)
+        )
+    return shots
+
+
+def _lens(values: dict[str, Any], where: str) -> Lens:
+    """The lens of a frame, whose fields come before those at the top level."""
+    usual = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"
+    model, known = values.get("camera_model") or usual, PERSPECTIVE_MODELS + FISHEYE_MODELS
+    if model not in known:
+        raise StgaError(f"{where}.camera_model: {shorten(model)} is not one of {', '.join(known)}")
+    if model in PINHOLE_MODELS:
+        return Lens()
+    coefficients = []
+    for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):
+        value = values.get(key) or 0.0
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not abs(value) <= MAX_NUMBER:
+            raise StgaError(f"{where}.{key}: expected a finite number, not {shorten(value)}")
+        coefficients.append(float(value))
+    k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
+    if model in FISHEYE_MODELS:
+        return Lens("fisheye", radial=(k1, k2, k3, k4))
+    if model == "FULL_OPENCV":
+        return Lens(radial=(k1, k2, k3), rational=(k4, k5, k6), tangential=(p1, p2))
+    return Lens(radial=(k1, k2, k3, k4), tangential=(p1, p2))  # nerfstudio's k4 is that of r⁸

@@ -1,8 +1,7 @@
-"""How many frames later one camera's video shows the same moment than another's: from their sound,
-or from motion."""
+"""How many frames later a camera's video shows the same moment: from sound, or from motion."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from itertools import chain
 
 import numpy as np
 
@@ -18,8 +17,7 @@ MOTION_SIZE = 32
 MIN_CORRELATION = 0.2
 """Correlation below which nothing is shared."""
 MIN_DISTINCTION = 1.5
-"""How many times the best lag's score has to exceed that of any that is more than NEIGHBORHOOD_S
-away."""
+"""Times that the best lag's score exceeds that of any farther than NEIGHBORHOOD_S away."""
 NEIGHBORHOOD_S = 0.2
 
 
@@ -32,7 +30,11 @@ def clock_offsets(
     by: "sound"; "motion": how much changes from frame to frame; "auto": sound where all have it.
     Raises StgaError where a video has no sound, or where the recordings do not agree on one offset.
     """
-    by = by if by != "auto" else "sound" if all(map(has_sound, videos.values())) else "motion"
+    if by == "auto":
+        by = "sound"
+        for video in videos.values():
+            with opened_video(video.path) as container:
+                by = by if container.streams.audio else "motion"
     read: Callable[[Video], tuple[np.ndarray, float]] = _loudness if by == "sound" else _motion
     first, *others = videos
     reference, start = read(videos[first])
@@ -43,7 +45,8 @@ def clock_offsets(
         lag, correlation, distinction = best_lag(reference, signal, rate)
         if correlation < MIN_CORRELATION or distinction < MIN_DISTINCTION:
             raise StgaError(
-                f"{videos[name].path}: its {by} does not say when camera {first} recorded the same; give --offset"
+                f"{videos[name].path}: its {by} does not say when camera {first} recorded the "
+                "same; give --offset"
             )
         offsets[name] = round((lag / rate + begins - start) * fps)
         frames = f"{abs(offsets[name])} frames {'later' if offsets[name] >= 0 else 'earlier'}"
@@ -73,13 +76,10 @@ def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[in
     count = np.maximum(np.round(sums(one, other)), 1)
     mean, means = sums(reference, other) / count, sums(one, signal) / count
     shared = sums(reference, signal) / count - mean * means
-    spread = (sums(reference**2, other) / count - mean**2) * (
-        sums(one, signal**2) / count - means**2
-    )
-    smallest = 1e-6 * reference.var() * signal.var()
-    correlation = np.where(
-        (count >= least) & (spread > smallest), shared / np.sqrt(np.maximum(spread, 1e-30)), -1.0
-    )
+    spread = sums(reference**2, other) / count - mean**2
+    spread = spread * (sums(one, signal**2) / count - means**2)
+    known = (count >= least) & (spread > 1e-6 * reference.var() * signal.var())
+    correlation = np.where(known, shared / np.sqrt(np.maximum(spread, 1e-30)), -1.0)
     score = correlation * np.sqrt(count)
     best = int(score.argmax())
     far = np.abs(np.arange(size) - best) > NEIGHBORHOOD_S * rate
@@ -87,14 +87,8 @@ def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[in
     return best - (len(reference) - 1), float(correlation[best]), distinction
 
 
-def has_sound(video: Video) -> bool:
-    with opened_video(video.path) as container:
-        return bool(container.streams.audio)
-
-
 def _loudness(video: Video) -> tuple[np.ndarray, float]:
-    """Rise of the sound's loudness every SOUND_HOP samples, and its begin in seconds after that of
-    the pictures."""
+    """Rise of loudness every SOUND_HOP samples; seconds by which it begins after the pictures."""
     from av import AudioResampler
 
     with opened_video(video.path) as container:
@@ -102,20 +96,16 @@ def _loudness(video: Video) -> tuple[np.ndarray, float]:
             raise StgaError(f"{video.path}: has no sound; expected it for --sync sound")
         stream, pictures = container.streams.audio[0], container.streams.video[0]
         resampler = AudioResampler(format="flt", layout="mono", rate=SOUND_RATE_HZ)
-        parts, begin = [np.zeros(0, np.float32)], None
-        for frame in container.decode(stream):
-            begin = float(frame.time or 0) if begin is None else begin
-            parts += [_samples(each) for each in resampler.resample(frame)]
-        parts += [_samples(each) for each in resampler.resample(None)]
+        parts: list[np.ndarray] = [np.zeros(0, np.float32)]
+        begin = None
+        for frame in chain(container.decode(stream), [None]):  # which ends the sound
+            begin = float(frame.time or 0) if frame and begin is None else begin
+            parts += [np.ravel(each.to_ndarray()) for each in resampler.resample(frame)]
         first_picture = video.times[0] * float(pictures.time_base) if video.seekable else 0.0
     sound = np.concatenate(parts).astype(np.float64)
     blocks = sound[: len(sound) // SOUND_HOP * SOUND_HOP].reshape(-1, SOUND_HOP)
     energy = np.log((blocks**2).mean(axis=1) + 1e-7)
     return np.maximum(np.diff(energy, prepend=energy[:1]), 0), (begin or 0.0) - first_picture
-
-
-def _samples(frame: Any) -> np.ndarray:
-    return np.asarray(frame.to_ndarray()).ravel()
 
 
 def _motion(video: Video) -> tuple[np.ndarray, float]:
@@ -125,12 +115,8 @@ def _motion(video: Video) -> tuple[np.ndarray, float]:
     frames = VideoFrames(video, dict(enumerate(range(len(video.times)))))
     changes, last = [0.0], None
     for number in frames.timesteps:
-        small = (
-            Image.fromarray(frames.image(number))
-            .convert("L")
-            .resize((MOTION_SIZE, MOTION_SIZE), Image.Resampling.BOX)
-        )
-        gray = np.asarray(small, np.float64)
+        image = Image.fromarray(frames.image(number)).convert("L")
+        gray = np.asarray(image.resize((MOTION_SIZE,) * 2, Image.Resampling.BOX), np.float64)
         if last is not None:
             changes.append(float(np.abs(gray - last).mean()))
         last = gray

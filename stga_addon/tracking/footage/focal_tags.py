@@ -1,5 +1,4 @@
-"""Focal lengths that recordings state: EXIF of photos, metadata of the tracks of QuickTime and MP4
-files."""
+"""Focal lengths that recordings state: photos' EXIF, metadata of QuickTime's and MP4's tracks."""
 
 import re
 import struct
@@ -12,20 +11,12 @@ from PIL import Image
 from ...capture.images import FORMATS
 
 FULL_FRAME_DIAGONAL_MM = 43.27
-"""Of 36 x 24 mm; equivalent focal lengths have the same angle of view over the diagonal (CIPA
-DCG-001)."""
+"""Of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA DCG-001)."""
 MIN_EQUIVALENT_MM, MAX_EQUIVALENT_MM = 5.0, 2000.0
-EXIF, EQUIVALENT, FOCAL, PER_UNIT, UNIT, WIDTH, HEIGHT = (
-    0x8769,
-    0xA405,
-    0x920A,
-    0xA20E,
-    0xA210,
-    0xA002,
-    0xA003,
-)
+EXIF, EQUIVALENT, FOCAL, PER_UNIT, UNIT = 0x8769, 0xA405, 0x920A, 0xA20E, 0xA210
+WIDTH, HEIGHT = 0xA002, 0xA003
 """Tags of EXIF 2.32: the directory, FocalLengthIn35mmFilm, FocalLength, FocalPlaneXResolution and
-its unit, and the size of the picture as taken."""
+its unit; and the size of the picture as taken."""
 UNITS_MM = {2: 25.4, 3: 10.0}
 MAX_ASPECT_DIFFERENCE = 0.01
 """Relative; beyond it, a photo has been cropped, and its tags are those of the whole picture."""
@@ -90,8 +81,7 @@ def _movie(path: Path) -> bytes:
 
 
 def _boxes(data: bytes, start: int = 0) -> Iterator[tuple[bytes, int, int]]:
-    """(kind, first byte of the content, end) of the boxes that follow each other from `start`
-    on."""
+    """(kind, first byte of the content, end) of the boxes one after another from `start` on."""
     while start + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, start)
         if size < 8:
@@ -112,14 +102,11 @@ def _equivalent(data: bytes) -> float | None:
         if EQUIVALENT_KEY in keys:
             number = struct.pack(">I", keys.index(EQUIVALENT_KEY) + 1)
             entries = parts.get(b"ilst", b"")
-            return next((_value(entries[f:e]) for k, f, e in _boxes(entries) if k == number), None)
+            for item in (entries[f:e] for k, f, e in _boxes(entries) if k == number):
+                form, value = struct.unpack_from(">I", item, 8)[0], item[16:]  # of its box "data"
+                if form in VALUE_FORMATS:
+                    return float(struct.unpack_from(VALUE_FORMATS[form], value)[0])
+                text = re.match(rb"[0-9.]+", value)
+                is_number = text and text[0].count(b".") < 2 and text[0] != b"."
+                return float(text[0]) if text and is_number else None
     return None
-
-
-def _value(item: bytes) -> float | None:
-    """The number in an entry of a list of metadata: one box "data"."""
-    kind, value = struct.unpack_from(">I", item, 8)[0], item[16:]
-    if kind in VALUE_FORMATS:
-        return float(struct.unpack_from(VALUE_FORMATS[kind], value)[0])
-    found = re.match(rb"[0-9.]+", value)
-    return float(found[0]) if found and found[0].count(b".") < 2 and found[0] != b"." else None

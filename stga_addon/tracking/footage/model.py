@@ -1,70 +1,64 @@
-"""Footage: the cameras of a rig and their synchronized frames, undistorted and decoded on
-request."""
+"""Footage: a rig's cameras and synchronized frames, undistorted and decoded on request."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from ...capture.camera import Camera
-from ...capture.images import read_image, read_mask
+from ...capture.images import image_size, is_plain, read_image, read_mask
 from ...capture.model import View
-from .undistort import Undistortion
-
-
-class Frames(Protocol):
-    """The frames of one camera as they were recorded. Not thread-safe: a video has one decoder."""
-
-    @property
-    def timesteps(self) -> tuple[int, ...]:
-        """Timesteps that have a frame, ascending."""
-
-    def image(self, timestep: int) -> np.ndarray:
-        """(H, W, 3) uint8 sRGB. Raises StgaError that names the file; KeyError for a timestep
-        without a frame."""
-
-    def mask(self, timestep: int) -> np.ndarray | None:
-        """(H, W) uint8, 255 inside; None where the frame has none. Raises as `image` does."""
-
-    def source(self, timestep: int) -> str:
-        """What a message calls the frame: its file, in a video with the number of the frame."""
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """What the frames are read from: their image files, or the video."""
-
-    def file(self, timestep: int) -> Path | None:
-        """The image file whose stored pixels are the frame; None in a video, and where they are
-        turned or converted."""
+from ...errors import StgaError
+from ...files import replacing
+from .lens import Undistortion
+from .video import VideoFrames
 
 
 @dataclass(frozen=True)
-class DerivedFrames:
-    """`frames`, of which a subclass changes something."""
+class ImageFrames:
+    """Frames that are image files, with the attributes of `VideoFrames`.
 
-    frames: Frames
+    views  timestep -> the image as recorded, ascending; its camera says how large it must be
+    """
+
+    views: Mapping[int, View]
 
     @property
     def timesteps(self) -> tuple[int, ...]:
-        return self.frames.timesteps
+        return tuple(self.views)
+
+    def require_sizes(self, name: str) -> None:
+        """Read all headers. Raises StgaError for an image of another size than the camera's."""
+        for timestep, view in self.views.items():
+            width, height = image_size(view.image)
+            expected = view.camera.width, view.camera.height
+            if (width, height) != expected:
+                raise StgaError(
+                    f"{view.image}: has {width} x {height} pixels at timestep {timestep}, "
+                    f"but camera {name} has {expected[0]} x {expected[1]}"
+                )
 
     def image(self, timestep: int) -> np.ndarray:
-        return self.frames.image(timestep)
+        return read_image(self.views[timestep])
 
     def mask(self, timestep: int) -> np.ndarray | None:
-        return self.frames.mask(timestep)
+        return read_mask(self.views[timestep])
 
     def source(self, timestep: int) -> str:
-        return self.frames.source(timestep)
+        return str(self.views[timestep].image)
 
     @property
     def files(self) -> tuple[Path, ...]:
-        return self.frames.files
+        return tuple(view.image for view in self.views.values())
 
     def file(self, timestep: int) -> Path | None:
-        return self.frames.file(timestep)
+        image = self.views[timestep].image
+        return image if is_plain(image) else None
+
+
+Frames = ImageFrames | VideoFrames
+"""The frames of one camera as they were recorded."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +68,12 @@ class FootageCamera:
     name       unique in the footage
     camera     of the undistorted images, with OpenCV axes; its world has the scale and orientation
                of the calibration
-    frames     as recorded
+    frames     as recorded. Not thread-safe: a video has one decoder
     undistortion  from the recorded frames to those of `camera`; None where the lens has no
                   distortion
     plate      image file of what the camera records without the person
     mattes     timestep -> mask file of the undistorted frame, which stands in for the recorded mask
+    kept       timestep -> PNG that a frame is kept in from its first use, where that is no file yet
     """
 
     name: str
@@ -87,6 +82,7 @@ class FootageCamera:
     undistortion: Undistortion | None = None
     plate: Path | None = None
     mattes: Mapping[int, Path] = field(default_factory=dict)
+    kept: Mapping[int, Path] = field(default_factory=dict)
 
     @property
     def timesteps(self) -> tuple[int, ...]:
@@ -100,26 +96,33 @@ class FootageCamera:
         Raises StgaError that names the file; KeyError where the camera has no frame at the
         timestep.
         """
-        image = self.frames.image(timestep)
-        return image if self.undistortion is None else self.undistortion(image)
+        kept = self.kept.get(timestep)
+        if kept is not None and kept.exists():
+            return read_image(View(timestep, 0, self.camera, self.name, kept))
+        image = self._undistorted(self.frames.image(timestep))
+        if kept is not None:
+            import cv2  # writes PNGs in a fifth of Pillow's time
+
+            with replacing(kept) as partial:
+                partial.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+        return image
 
     def mask(self, timestep: int) -> np.ndarray | None:
-        """The undistorted foreground mask (H, W) uint8, 255 inside; None where there is none.
-        Raises as `image`."""
+        """The undistorted mask (H, W) uint8, 255 inside; None without. Raises as `image`."""
         if timestep in self.mattes:
-            return read_mask(
-                View(timestep, 0, self.camera, self.name, Path(self.name), self.mattes[timestep])
-            )
+            name, matte = self.name, self.mattes[timestep]
+            return read_mask(View(timestep, 0, self.camera, name, Path(name), matte))
         mask = self.frames.mask(timestep)
-        return mask if mask is None or self.undistortion is None else self.undistortion(mask)
+        return None if mask is None else self._undistorted(mask)
 
     def clean_plate(self) -> np.ndarray | None:
-        """The undistorted plate (H, W, 3) uint8 sRGB; None where there is none. Raises as
-        `image`."""
+        """The undistorted plate (H, W, 3) uint8 sRGB; None without. Raises as `image`."""
         if self.plate is None:
             return None
-        plate = read_image(View(0, 0, self.camera, self.name, self.plate))
-        return plate if self.undistortion is None else self.undistortion(plate)
+        return self._undistorted(read_image(View(0, 0, self.camera, self.name, self.plate)))
+
+    def _undistorted(self, image: np.ndarray) -> np.ndarray:
+        return image if self.undistortion is None else self.undistortion(image)
 
     def source(self, timestep: int) -> str:
         """What a message calls the frame: its file, in a video with the number of the frame."""
@@ -127,6 +130,8 @@ class FootageCamera:
 
     def file(self, timestep: int) -> Path | None:
         """An image file whose stored pixels are those of `image`; None where there is none."""
+        if timestep in self.kept:
+            return self.kept[timestep] if self.kept[timestep].exists() else None
         return self.frames.file(timestep) if self.undistortion is None else None
 
 
@@ -153,8 +158,7 @@ class Footage:
     warnings: tuple[str, ...] = ()
 
     def views(self) -> Iterator[tuple[int, FootageCamera]]:
-        """(timestep, camera) of every frame, camera by camera in order of time: the fast order for
-        videos."""
+        """(timestep, camera) of every frame, camera by camera: the fast order for videos."""
         for camera in self.cameras:
             for timestep in camera.timesteps:
                 yield timestep, camera

@@ -9,31 +9,26 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.camera import Camera, camera_from_gl
+from ...capture.camera import camera_from_gl
 from ...capture.images import image_size
 from ...capture.model import View
 from ...errors import StgaError
-from . import video
 from .calibrations import EXPECTED, find_calibration, read_calibration
-from .clocks import clock_offsets
-from .file_types import is_video
 from .focal_tags import photo_focal, video_focal
-from .given_masks import with_masks
-from .image_frames import ImageFrames
-from .lens import Lens
-from .model import Footage, FootageCamera, Frames
-from .sequences import (
-    FrameRange,
-    Sequence,
-    frames_per_second,
-    open_sequence,
-    recorded_size,
-    sequence_size,
-    synchronized,
-)
+from .lens import Lens, undistortion
+from .model import Footage, FootageCamera, Frames, ImageFrames
+from .sequences import FrameRange, Sequence, open_sequence, sequence_size, synchronized
 from .shots import Shot
-from .sources import Sources, find_sources, sequence_files, sequence_names, still_image
-from .undistort import undistortion
+from .sources import (
+    Sources,
+    find_sources,
+    frame_number,
+    is_video,
+    sequence_files,
+    sequence_names,
+    still_image,
+)
+from .video import Video, VideoFrames, video_size
 
 ALL_FRAMES = FrameRange()
 USUAL_VIEW_DEG = 65.0
@@ -59,38 +54,36 @@ def open_footage(
     Raises StgaError in one sentence naming file, field and what was expected, also for a missing
     image.
     """
-    sources, root = _sources(path)
-    footage = _open(path, root, sources, cameras, frames, focal)
-    plated = tuple(
-        replace(camera, plate=sources.plates.get(camera.name)) for camera in footage.cameras
-    )
-    footage = replace(footage, cameras=plated)
-    return footage if mattes is None else with_masks(footage, sources, mattes)
-
-
-def _open(
-    path: Path,
-    root: Path,
-    sources: Sources,
-    cameras: Path | None,
-    frames: FrameRange,
-    focal: float | None,
-) -> Footage:
-    calibration = (
-        cameras if cameras is not None else find_calibration(root) if isdir(path) else None
-    )
-    if calibration is None:
-        return _single_camera(root, sources, frames, focal)
-    if focal is not None:
-        raise StgaError(f"{calibration}: has focal lengths; expected none besides")
-    shots, warnings = read_calibration(calibration, partial(_image_size, sources))
-    found = _calibrated(root, sources, calibration, shots, frames)
-    warnings = (*warnings, *found.warnings)
-    return replace(found, keeps_world=all(shot.keeps_world for shot in shots), warnings=warnings)
+    root = Path(realpath(path))  # Path.resolve raises RuntimeError for a loop of links
+    if isdir(path):
+        sources = find_sources(root)
+        cameras = find_calibration(root) if cameras is None else cameras
+    elif isfile(path) and is_video(path):
+        sources = Sources(root.parent, videos={root.stem: [root]})
+    else:
+        raise StgaError(f"{path}: is neither a folder nor a video; put photos into a folder")
+    if cameras is None:
+        footage = _single_camera(sources, frames, focal)
+    elif focal is not None:
+        raise StgaError(f"{cameras}: has focal lengths; expected none besides")
+    else:
+        shots, warnings = read_calibration(cameras, partial(_image_size, sources))
+        footage = _calibrated(sources, cameras, shots, frames)
+        keeps_world = all(shot.keeps_world for shot in shots)
+        warnings = (*warnings, *footage.warnings)
+        footage = replace(footage, keeps_world=keeps_world, warnings=warnings)
+    plated = tuple(replace(own, plate=sources.plates.get(own.name)) for own in footage.cameras)
+    if mattes is None:
+        return replace(footage, cameras=plated)
+    if not isdir(mattes):
+        raise StgaError(f"{mattes}: is not a folder; expected one of mattes")
+    given = find_sources(Path(realpath(mattes)))
+    masked = tuple(_masked(camera, sources, given, len(plated) == 1) for camera in plated)
+    return replace(footage, cameras=masked)
 
 
 def _calibrated(
-    root: Path, sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange
+    sources: Sources, calibration: Path, shots: list[Shot], frames: FrameRange
 ) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
@@ -98,27 +91,12 @@ def _calibrated(
         raise StgaError(
             f"{calibration}: lists images, which offsets do not apply to; expected none"
         )
-    if timed:
-        found = _listed_cameras(
-            [shot for shot in shots if frames.selects(shot.timestep or 0)], calibration
-        )
-        return _footage(
-            root, found, next((shot.fps for shot in shots if shot.fps is not None), None)
-        )
     if any(names):
-        rig = _by_name(shots, names, root)
-        sequences = {name: open_sequence(sequence_files(sources, name)) for name in rig}
-        return _rig(root, sources, sequences, rig, frames)
-    return _footage(root, _listed_cameras(_with_stills(shots, sources), calibration))
-
-
-def _sources(path: Path) -> tuple[Sources, Path]:
-    root = Path(realpath(path))  # Path.resolve raises RuntimeError for a loop of links
-    if isdir(path):
-        return find_sources(root), root
-    if isfile(path) and is_video(path):
-        return Sources(root.parent, videos={root.stem: [root]}), root.parent
-    raise StgaError(f"{path}: is neither a folder nor a video; put photos into a folder")
+        return _rig(sources, _by_name(shots, names, sources.root), frames)
+    fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
+    chosen = [shot for shot in shots if frames.selects(shot.timestep or 0)]
+    listed = _listed_cameras(chosen if timed else _with_stills(shots, sources), calibration)
+    return _footage(sources.root, listed, fps)
 
 
 def _footage(
@@ -131,52 +109,69 @@ def _footage(
     return Footage(root, cameras, tuple(sorted(timesteps)), fps, warnings=warnings)
 
 
+def _masked(
+    camera: FootageCamera, recorded: Sources, given: Sources, single: bool
+) -> FootageCamera:
+    """The camera with masks of a folder. single: it needs no folder of its own."""
+    names, frames, masks = [camera.name, ""] if single else [camera.name], camera.frames, {}
+    by_number = {
+        frame_number(path): path for name in reversed(names) for path in given.folders.get(name, [])
+    }
+    for timestep in camera.timesteps:
+        source = Path(camera.source(timestep))
+        if isinstance(frames, VideoFrames):
+            expected = f"{camera.name}/{frames.numbers[timestep]:05d}"
+            path = by_number.get(frames.numbers[timestep])
+        else:
+            inside = source.is_relative_to(recorded.root)
+            expected = recorded.name_of(source) if inside else source.stem
+            path = next(iter(given.images.get(expected) or given.masks.get(expected, [])), None)
+        if path is None:
+            raise StgaError(
+                f"{given.root}: has no matte of {camera.source(timestep)}; expected {expected}.png"
+            )
+        masks[timestep] = View(timestep, 0, camera.camera, camera.name, source, path)
+    if isinstance(frames, VideoFrames):
+        return replace(camera, frames=VideoFrames(frames.video, frames.numbers, masks))
+    views = {t: replace(view, mask=masks[t].mask) for t, view in frames.views.items()}
+    return replace(camera, frames=ImageFrames(views))
+
+
 # Sequences: a folder of images or a video for each camera
 
 
 def _by_name(shots: list[Shot], names: list[str | None], root: Path) -> dict[str, Shot]:
-    """Camera -> its shot. Raises StgaError for a camera without recording, and for two with the
-    same."""
+    """Camera -> its shot. Raises StgaError for one without recording, and two of the same."""
     found: dict[str, Shot] = {}
     for shot, name in zip(shots, names, strict=True):
         if name is None:
             raise StgaError(
-                f"{shot.where}: {root} has no folder or video of this camera, though it has of others"
+                f"{shot.where}: {root} has no folder or video of this camera, "
+                "though it has of others"
             )
         if name in found:
             raise StgaError(
-                f"{shot.where}: and {found[name].where} are both of camera {name}; expected different names"
+                f"{shot.where}: and {found[name].where} are both of camera {name}; "
+                "expected different names"
             )
         found[name] = shot
     return found
 
 
 def _rig(
-    root: Path,
     sources: Sources,
-    sequences: Mapping[str, Sequence],
     shots: Mapping[str, Shot],
     frames: FrameRange,
+    opened: Mapping[str, Sequence] | None = None,
 ) -> Footage:
-    fps = frames_per_second(sequences)
-    videos = {
-        name: sequence for name, sequence in sequences.items() if isinstance(sequence, video.Video)
-    }
-    warnings = tuple(warning for each in videos.values() for warning in each.warnings)
-    if frames.sync != "none":
-        if len(videos) < max(2, len(sequences)) or fps is None:
-            raise StgaError(
-                f"{root}: expected a video of each of several cameras, whose clocks --sync compares"
-            )
-        found, sentences = clock_offsets(videos, fps, frames.sync)
-        frames, warnings = (
-            replace(frames, offsets={**found, **frames.offsets}),
-            (*warnings, *sentences),
-        )
-    recorded = synchronized(sequences, shots, sources, frames)
-    return _footage(
-        root, tuple(_camera(name, shots[name], recorded[name]) for name in shots), fps, warnings
+    """opened: the sequences, where they are."""
+    sequences = opened or {name: open_sequence(sequence_files(sources, name)) for name in shots}
+    warnings = tuple(
+        warning for own in sequences.values() if isinstance(own, Video) for warning in own.warnings
     )
+    recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
+    cameras = tuple(_camera(name, shots[name], recorded[name]) for name in shots)
+    return _footage(sources.root, cameras, fps, (*warnings, *sentences))
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
@@ -186,36 +181,29 @@ def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
     return FootageCamera(name, shot.camera if found is None else found.camera, frames, found)
 
 
-def _single_camera(
-    root: Path, sources: Sources, frames: FrameRange, focal: float | None
-) -> Footage:
+def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) -> Footage:
     """Footage of one camera without a calibration; its world is the camera's, y up."""
-    names = sorted({*sources.videos, *sources.folders})
+    names, root = sorted({*sources.videos, *sources.folders}), sources.root
     if len(names) != 1:
         found = f"{len(names)} cameras" if names else "neither images nor videos"
         raise StgaError(
             f"{root}: has {found} and no calibration; expected {EXPECTED}, or one camera"
         )
-    sequence: Sequence = open_sequence(sequence_files(sources, names[0]))
+    sequence, known = open_sequence(sequence_files(sources, names[0])), "given"
     width, height = sequence_size(sequence)
-    pixels, known = (
-        (focal, "given") if focal is not None else _stated_focal(sequence, width, height)
-    )
-    if pixels < 1:
-        raise StgaError(f"Focal length: expected at least 1 pixel, not {pixels:g}")
-    camera = camera_from_gl(np.eye(4), width, height, pixels, pixels, width / 2, height / 2)
+    if focal is None:
+        if isinstance(sequence, Video):
+            focal, known = video_focal(sequence.path, width, height), "file"
+        else:
+            focal, known = photo_focal(sequence[0], width, height), "file"
+        if focal is None:
+            focal, known = usual_focal(width, height), "usual"
+    if focal < 1:
+        raise StgaError(f"Focal length: expected at least 1 pixel, not {focal:g}")
+    camera = camera_from_gl(np.eye(4), width, height, focal, focal, width / 2, height / 2)
     name = names[0] or root.name
     shot = Shot(name, camera, Lens(), str(root))
-    return replace(_rig(root, sources, {name: sequence}, {name: shot}, frames), focal=known)
-
-
-def _stated_focal(sequence: Sequence, width: int, height: int) -> tuple[float, str]:
-    """Pixels of the recording, and where they are from (`Footage.focal`)."""
-    if isinstance(sequence, video.Video):
-        stated = video_focal(sequence.path, width, height)
-    else:
-        stated = photo_focal(sequence[0], width, height)
-    return (usual_focal(width, height), "usual") if stated is None else (stated, "file")
+    return replace(_rig(sources, {name: shot}, frames, {name: sequence}), focal=known)
 
 
 def usual_focal(width: int, height: int) -> float:
@@ -237,7 +225,8 @@ def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
         other = poses.setdefault(_pose(shot), shot)
         if other is not shot:
             raise StgaError(
-                f"{shot.where}: has the pose of {other.label}; expected a timestep_index, or one image of each camera"
+                f"{shot.where}: has the pose of {other.label}; "
+                "expected a timestep_index, or one image of each camera"
             )
         listed = shot.image if shot.image is not None and isfile(shot.image) else None
         image = listed or still_image(sources, shot.label, shot.where)
@@ -251,9 +240,10 @@ def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
 def _image_size(sources: Sources, label: str) -> tuple[int, int]:
     """Size of the images of a label; for calibrations that do not hold it."""
     name = sequence_names(sources, [label])[0]
-    if name is not None:
-        return recorded_size(sequence_files(sources, name))
-    return image_size(still_image(sources, label, f"camera {label}"))
+    if name is None:
+        return image_size(still_image(sources, label, f"camera {label}"))
+    files = sequence_files(sources, name)
+    return video_size(files) if isinstance(files, Path) else image_size(files[0])
 
 
 def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera, ...]:
@@ -262,7 +252,10 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
         raise StgaError(f"{calibration}: none of its frames are in the chosen range")
     groups: dict[object, list[Shot]] = {}
     for shot in shots:
-        groups.setdefault(_identity(shot), []).append(shot)
+        camera = shot.camera
+        intrinsics = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
+        identity = shot.camera_name, intrinsics, _pose(shot), shot.lens
+        groups.setdefault(identity, []).append(shot)
     names = [group[0].camera_name or group[0].label for group in groups.values()]
     cameras: list[FootageCamera] = []
     for name, group in zip(names, groups.values(), strict=True):
@@ -273,12 +266,6 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
             )
         cameras.append(_camera(unique, group[0], ImageFrames(_views(unique, group))))
     return tuple(cameras)
-
-
-def _identity(shot: Shot) -> object:
-    camera: Camera = shot.camera
-    intrinsics = camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
-    return shot.camera_name, intrinsics, _pose(shot), shot.lens
 
 
 def _pose(shot: Shot) -> bytes:

@@ -1,17 +1,17 @@
 """Frames of cameras that recorded a sequence each, in step."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ...capture.images import image_size
 from ...capture.model import FPS_LIMIT, View
 from ...errors import StgaError
-from .image_frames import ImageFrames
-from .model import Frames
+from .clocks import clock_offsets
+from .model import Frames, ImageFrames
 from .shots import Shot
 from .sources import Sources, frame_number
-from .video import Video, VideoFrames, read_video, video_size
+from .video import Video, VideoFrames, read_video
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class FrameRange:
         if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):
             stop = "the end" if self.stop is None else self.stop
             raise StgaError(
-                f"Frames {self.start} to {stop} in steps of {self.step} are none; expected at least one"
+                f"Frames {self.start} to {stop} in steps of {self.step} are none; "
+                "expected at least one"
             )
 
     def selects(self, timestep: int) -> bool:
@@ -48,15 +49,8 @@ Sequence = Video | list[Path]
 
 
 def open_sequence(files: Path | list[Path]) -> Sequence:
-    """Index a video; images are taken as they are. Raises StgaError where the video cannot be
-    read."""
+    """Index a video; images are taken as they are. Raises StgaError for an unreadable one."""
     return read_video(files) if isinstance(files, Path) else files
-
-
-def recorded_size(files: Path | list[Path]) -> tuple[int, int]:
-    """(width, height) of the first frame, without an index of the video. Raises StgaError as
-    `open_sequence` does."""
-    return video_size(files) if isinstance(files, Path) else image_size(files[0])
 
 
 def sequence_size(sequence: Sequence) -> tuple[int, int]:
@@ -64,98 +58,112 @@ def sequence_size(sequence: Sequence) -> tuple[int, int]:
     return sequence.size if isinstance(sequence, Video) else image_size(sequence[0])
 
 
-def frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
-    """Of the videos; None where none says a plausible one. Raises StgaError for videos of different
-    rates."""
-    rates = {
-        name: s.fps
-        for name, s in sequences.items()
-        if isinstance(s, Video) and 0 < s.fps < FPS_LIMIT
-    }
-    first = next(iter(rates), None)
-    for name, rate in rates.items():
-        if first is not None and abs(rate - rates[first]) > 0.01 * rates[first]:
-            raise StgaError(
-                f"The video of camera {name} has {rate:g} frames a second, that of camera {first} {rates[first]:g}; "
-                "expected one rate"
-            )
-    return None if first is None else rates[first]
-
-
 def synchronized(
     sequences: Mapping[str, Sequence],
     shots: Mapping[str, Shot],
     sources: Sources,
     frames: FrameRange,
-) -> dict[str, Frames]:
-    """Frames of each camera; timestep t is frame t + offset of its recording. Timesteps of which a
-    video whose rate varies has no frame are left out.
+) -> tuple[dict[str, Frames], float | None, tuple[str, ...]]:
+    """Frames of each camera, those of the videos a second (None where none says a plausible
+    number), and a sentence for each clock that was compared.
 
-    Raises StgaError where a camera has fewer frames than another, lacks one in between, or is of
-    another size.
+    Timestep t is frame t + offset of a recording. Timesteps of which a video whose rate varies has
+    no frame are left out. Raises StgaError where a camera has fewer frames than another, lacks one
+    in between, is of another size or has another rate, and where clocks cannot be compared.
     """
+    fps, sentences = _frames_per_second(sequences), tuple[str, ...]()
+    if frames.sync != "none":
+        videos = {name: own for name, own in sequences.items() if isinstance(own, Video)}
+        if len(videos) < max(2, len(sequences)) or fps is None:
+            raise StgaError(
+                f"{sources.root}: expected a video of each of several cameras, "
+                "whose clocks --sync compares"
+            )
+        found, sentences = clock_offsets(videos, fps, frames.sync)
+        frames = replace(frames, offsets={**found, **frames.offsets})
     unknown = set(frames.offsets) - set(sequences)
     if unknown:
         raise StgaError(f"Offset for camera {min(unknown)}: expected one of {', '.join(sequences)}")
-    first, last = _common_range(sequences, frames)
-    recorded = {name: _numbers(sequence) for name, sequence in sequences.items()}
-    shared = set.intersection(
-        *(
-            {number - frames.offsets.get(name, 0) for number in own}
-            for name, own in recorded.items()
-        )
-    )
-    timesteps = [t for t in sorted(shared) if first <= t < last and frames.selects(t)]
+    recorded, offsets = {}, {name: frames.offsets.get(name, 0) for name in sequences}
+    for name, own in sequences.items():  # timestep -> number of the frame, the first of several
+        shown = own.timesteps if isinstance(own, Video) else range(len(own))
+        pairs = reversed(list(enumerate(shown)))
+        recorded[name] = {timestep - offsets[name]: number for number, timestep in pairs}
+    first, last = _common_range(sequences, frames, offsets)
+    shared = sorted(set.intersection(*(set(own) for own in recorded.values())))
+    timesteps = [t for t in shared if first <= t < last and frames.selects(t)]
     if not timesteps:
         raise StgaError(f"Frames from {frames.start} on: the cameras have only {last} in common")
-    _require_same_gaps(sequences, frames, timesteps)
-    result = {}
-    for name, sequence in sequences.items():
-        numbers = {t: recorded[name][t + frames.offsets.get(name, 0)] for t in timesteps}
-        result[name] = _frames(sequence, numbers, shots[name], sources)
-    return result
+    _require_same_gaps(sequences, offsets, timesteps)
+    result: dict[str, Frames] = {}
+    for name, own in sequences.items():
+        numbers = {t: recorded[name][t] for t in timesteps}
+        size, shot, camera = sequence_size(own), shots[name], shots[name].camera
+        if size != (camera.width, camera.height):
+            raise StgaError(
+                f"{own.path if isinstance(own, Video) else own[0]}: has {size[0]} x {size[1]} "
+                f"pixels, but {shot.where} has {camera.width} x {camera.height}"
+            )
+        if isinstance(own, Video):
+            result[name] = VideoFrames(own, numbers)
+            continue
+        files = {t: own[number] for t, number in numbers.items()}
+        masks = {t: sources.mask_of(file) for t, file in files.items()}
+        result[name] = ImageFrames(
+            {t: View(t, 0, camera, shot.label, files[t], masks[t]) for t in timesteps}
+        )
+    return result, fps, sentences
 
 
-def _numbers(sequence: Sequence) -> dict[int, int]:
-    """Timestep, without offset -> number of the frame, the first of several."""
-    if not isinstance(sequence, Video):
-        return dict(enumerate(range(len(sequence))))
-    return {timestep: number for number, timestep in reversed(list(enumerate(sequence.timesteps)))}
+def _frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
+    videos = {name: own for name, own in sequences.items() if isinstance(own, Video)}
+    rates = {name: own.fps for name, own in videos.items() if 0 < own.fps < FPS_LIMIT}
+    first = next(iter(rates), None)
+    for name, rate in rates.items():
+        if first is not None and abs(rate - rates[first]) > 0.01 * rates[first]:
+            raise StgaError(
+                f"The video of camera {name} has {rate:g} frames a second, "
+                f"that of camera {first} {rates[first]:g}; expected one rate"
+            )
+    return None if first is None else rates[first]
 
 
-def _common_range(sequences: Mapping[str, Sequence], frames: FrameRange) -> tuple[int, int]:
+def _common_range(
+    sequences: Mapping[str, Sequence], frames: FrameRange, offsets: Mapping[str, int]
+) -> tuple[int, int]:
     """Timesteps (first, last + 1) that all cameras have.
 
     Recordings of different length may start at different moments, so they need a `stop` or offsets.
     """
     lengths = {
-        name: s.timesteps[-1] + 1 if isinstance(s, Video) else len(s)
-        for name, s in sequences.items()
+        name: own.timesteps[-1] + 1 if isinstance(own, Video) else len(own)
+        for name, own in sequences.items()
     }
     longest = max(lengths, key=lambda name: lengths[name])
     for name, length in lengths.items():
-        if frames.stop is not None and length - frames.offsets.get(name, 0) < frames.stop:
+        if frames.stop is not None and length - offsets[name] < frames.stop:
             raise StgaError(
-                f"Camera {name} has {length} frames; expected all up to {frames.stop} and its offset"
+                f"Camera {name} has {length} frames; "
+                f"expected all up to {frames.stop} and its offset"
             )
         if frames.stop is None and not frames.offsets and length != lengths[longest]:
             raise StgaError(
-                f"Camera {name} has {length} frames and camera {longest} {lengths[longest]}; expected recordings of "
-                "the same length, offsets, or the number of the last frame"
+                f"Camera {name} has {length} frames and camera {longest} {lengths[longest]}; "
+                "expected recordings of the same length, offsets, or the number of the last frame"
             )
-    first = max(0, *(-frames.offsets.get(name, 0) for name in lengths))
-    return first, min(length - frames.offsets.get(name, 0) for name, length in lengths.items())
+    first = max(0, *(-offset for offset in offsets.values()))
+    return first, min(length - offsets[name] for name, length in lengths.items())
 
 
 def _require_same_gaps(
-    sequences: Mapping[str, Sequence], frames: FrameRange, timesteps: list[int]
+    sequences: Mapping[str, Sequence], offsets: Mapping[str, int], timesteps: list[int]
 ) -> None:
     """Raise StgaError where the numbers in image names say that cameras lack different frames."""
     patterns: dict[str, list[int]] = {}
     for name, sequence in sequences.items():
         if isinstance(sequence, Video):
             continue
-        paths = [sequence[t + frames.offsets.get(name, 0)] for t in timesteps]
+        paths = [sequence[t + offsets[name]] for t in timesteps]
         found = [number for number in map(frame_number, paths) if number is not None]
         if len(found) < len(paths) or len(set(found)) < len(found):
             continue
@@ -164,23 +172,7 @@ def _require_same_gaps(
         for path, own, other in zip(paths, patterns[name], patterns[first], strict=True):
             if own != other:
                 raise StgaError(
-                    f"{path}: is {own} frames after the first of camera {name}, where camera {first} has one "
-                    f"{other} after its first; expected no missing frames, or the same ones"
+                    f"{path}: is {own} frames after the first of camera {name}, "
+                    f"where camera {first} has one {other} after its first; "
+                    "expected no missing frames, or the same ones"
                 )
-
-
-def _frames(sequence: Sequence, numbers: dict[int, int], shot: Shot, sources: Sources) -> Frames:
-    size, camera = sequence_size(sequence), shot.camera
-    if size != (camera.width, camera.height):
-        path = sequence.path if isinstance(sequence, Video) else sequence[0]
-        expected = f"{camera.width} x {camera.height}"
-        raise StgaError(
-            f"{path}: has {size[0]} x {size[1]} pixels, but {shot.where} has {expected}"
-        )
-    if isinstance(sequence, Video):
-        return VideoFrames(sequence, numbers)
-    views = {
-        t: View(t, 0, camera, shot.label, sequence[number], sources.mask_of(sequence[number]))
-        for t, number in numbers.items()
-    }
-    return ImageFrames(views)

@@ -1,4 +1,4 @@
-"""Finding the frames of cameras in a folder: an image, a folder of images or a video for each."""
+"""Files of footage in a folder: an image, a folder of images or a video for each camera."""
 
 import os
 import re
@@ -7,15 +7,20 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from ...errors import StgaError, shorten
-from .file_types import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".mxf")
 CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's."""
 MASK_FOLDERS = ("masks", "fg_masks")
 PLATE_FOLDER = "plates"
 """Holds an image without the person for each camera, of its name."""
-MAX_DEPTH = 4
-MAX_FILES = 1_000_000
+MAX_DEPTH, MAX_FILES = 4, 1_000_000
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path has the name of a video file."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 @dataclass
@@ -37,9 +42,9 @@ class Sources:
     masks: dict[str, list[Path]] = field(default_factory=dict)
     plates: dict[str, Path] = field(default_factory=dict)
 
-    def name_of(self, image: Path) -> str:
+    def name_of(self, path: Path) -> str:
         """Path below the footage, without suffix and without a leading "images/" and the like."""
-        return _key(self.root, image)
+        return _without_container(path.relative_to(self.root).with_suffix("").as_posix())
 
     def mask_of(self, image: Path) -> Path | None:
         """The mask with the same path below one of `MASK_FOLDERS`."""
@@ -48,8 +53,7 @@ class Sources:
 
 
 def find_sources(root: Path) -> Sources:
-    """List the footage folder, four levels deep, without hidden folders. Raises StgaError for over
-    a million files."""
+    """List the visible files, four levels deep. Raises StgaError for over a million files."""
     sources, count = Sources(root), 0
     for folder, names, files in os.walk(root):
         depth = len(Path(folder).relative_to(root).parts)
@@ -59,27 +63,22 @@ def find_sources(root: Path) -> Sources:
             raise StgaError(
                 f"{root}: holds more than {MAX_FILES} files; expected a folder of footage"
             )
-        for name in sorted(files, key=natural_order):
-            _enter(sources, Path(folder, name))
+        for path in (Path(folder, name) for name in sorted(files, key=natural_order)):
+            key, suffix = sources.name_of(path), path.suffix.lower()
+            first, _, rest = path.relative_to(root).as_posix().partition("/")
+            name = rest.rpartition(".")[0]
+            if path.name.startswith("."):
+                continue
+            if suffix in VIDEO_SUFFIXES:
+                sources.videos.setdefault(key, []).append(path)
+            elif suffix in IMAGE_SUFFIXES and first in MASK_FOLDERS:
+                sources.masks.setdefault(_without_container(name), []).append(path)
+            elif suffix in IMAGE_SUFFIXES and first == PLATE_FOLDER:
+                sources.plates.setdefault(name, path)
+            elif suffix in IMAGE_SUFFIXES:
+                sources.images.setdefault(key, []).append(path)
+                sources.folders.setdefault(key.rpartition("/")[0], []).append(path)
     return sources
-
-
-def _enter(sources: Sources, path: Path) -> None:
-    key, suffix = _key(sources.root, path), path.suffix.lower()
-    if path.name.startswith("."):
-        return
-    if suffix in VIDEO_SUFFIXES:
-        sources.videos.setdefault(key, []).append(path)
-    elif suffix in IMAGE_SUFFIXES:
-        first, _, rest = path.relative_to(sources.root).as_posix().partition("/")
-        if first in MASK_FOLDERS:
-            sources.masks.setdefault(_without_container(rest.rpartition(".")[0]), []).append(path)
-            return
-        if first == PLATE_FOLDER:
-            sources.plates.setdefault(rest.rpartition(".")[0], path)
-            return
-        sources.images.setdefault(key, []).append(path)
-        sources.folders.setdefault(key.rpartition("/")[0], []).append(path)
 
 
 def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
@@ -95,15 +94,13 @@ def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
         names = _tails(label)
         if parent and parents.count(parent) == 1:
             names += _tails(parent)
-        found.append(
-            next((n for n in names if n in sources.videos or (n and n in sources.folders)), None)
-        )
+        known = (n for n in names if n in sources.videos or (n and n in sources.folders))
+        found.append(next(known, None))
     return found
 
 
 def still_image(sources: Sources, label: str, where: str) -> Path:
-    """The image of that name. Raises StgaError, beginning with `where`, where there is none, or
-    more than one."""
+    """The image of that name. Raises StgaError where there is none, or more than one."""
     found = next((sources.images[name] for name in _tails(label) if name in sources.images), [])
     if not found:
         raise StgaError(
@@ -117,13 +114,13 @@ def still_image(sources: Sources, label: str, where: str) -> Path:
 
 
 def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
-    """The video of a camera, or its images in order. Raises StgaError where there are both, or two
-    videos."""
+    """The video of a camera, or its images in order. Raises StgaError for both, or two videos."""
     videos, images = sources.videos.get(name, []), sources.folders.get(name, [])
     if len(videos) > 1 or (videos and images):
         other = videos[1] if len(videos) > 1 else images[0].parent
         raise StgaError(
-            f"{videos[0]} and {other} are both named {shorten(name)}; expected one video or folder a camera"
+            f"{videos[0]} and {other} are both named {shorten(name)}; "
+            "expected one video or folder a camera"
         )
     return videos[0] if videos else images
 
@@ -139,10 +136,6 @@ def frame_number(path: Path) -> int | None:
     """The last number in a file's name."""
     found = re.findall(r"\d+", path.stem)
     return int(found[-1]) if found else None
-
-
-def _key(root: Path, path: Path) -> str:
-    return _without_container(path.relative_to(root).with_suffix("").as_posix())
 
 
 def _without_container(path: str) -> str:

@@ -11,6 +11,8 @@ import numpy as np
 
 from ...capture.camera import is_image_size
 from ...capture.color import is_srgb, to_srgb
+from ...capture.images import read_mask
+from ...capture.model import View
 from ...errors import StgaError
 
 MIN_HD_LINES = 720
@@ -29,11 +31,9 @@ DISPLAY_MATRIX_ONE = 1 << 16
 CHECKED_FRAMES = 8
 """Frames at the beginning of a video that are decoded to check the times of its packets."""
 MAX_FRAMES_AHEAD = 100
-"""Frames that are decoded to reach a later one; further ahead, the key frame before it is
-sought."""
+"""Frames that are decoded to reach a later one; further ahead, a key frame is sought."""
 SEEK_BACK_FRAMES = (0, 16, 64, 256)
-"""How far before a frame a seek is tried, one after the other, before all is decoded from the
-beginning."""
+"""How far before a frame a seek is tried, in turn, before all is decoded from the beginning."""
 RATE_TOLERANCE = 0.01
 """Relative difference up to which a stated frame rate is that of the frames' times."""
 VARIABLE_RATE_FACTOR = 1.5
@@ -75,12 +75,13 @@ def read_video(path: Path) -> Video:
     times, is_cut_off = _packet_times(path)
     left_out = 0 if times is None or first[0] not in times else times.index(first[0])
     if times is None or times[left_out : left_out + len(first)] != first:
-        times, left_out = _decoded_times(path), 0
+        with opened_video(path) as container:
+            container.streams.video[0].thread_type = "AUTO"
+            times, left_out = [frame.pts for frame in _decoded_frames(container)], 0
     with opened_video(path) as container:
         stream = container.streams.video[0]
-        seekable = _ascending(times) and (
-            _is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream)
-        )
+        exact = _is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream)
+        seekable = _ascending(times) and exact
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
         time_base = float(stream.time_base)
     if not seekable:
@@ -90,7 +91,8 @@ def read_video(path: Path) -> Video:
     timesteps, fps, warnings = _timed(path, shown, time_base, rates)
     if left_out:
         warnings += (
-            f"{path}: its first {left_out} frames cannot be decoded; they are left out, and not counted",
+            f"{path}: its first {left_out} frames cannot be decoded; "
+            "they are left out, and not counted",
         )
     if is_cut_off:
         warnings += (f"{path}: is cut off; it ends after {len(shown)} frames",)
@@ -103,11 +105,16 @@ def video_size(path: Path) -> tuple[int, int]:
 
 
 class VideoFrames:
-    """`numbers`: timestep -> number of the frame in the video, ascending. One decoder: not for two
-    threads at once."""
+    """Frames in a video, read with one decoder: not for two threads at once.
 
-    def __init__(self, video: Video, numbers: Mapping[int, int]) -> None:
-        self.video, self.numbers = video, numbers
+    numbers  timestep -> number of the frame in the video, ascending
+    masks    timestep -> the view of its mask, where there are any
+    """
+
+    def __init__(
+        self, video: Video, numbers: Mapping[int, int], masks: Mapping[int, View] | None = None
+    ) -> None:
+        self.video, self.numbers, self.masks = video, numbers, masks
         self._container: Any = None
         self._decoder: Iterator[Any] | None = None
         self._decoded = -1
@@ -119,9 +126,11 @@ class VideoFrames:
 
     @property
     def timesteps(self) -> tuple[int, ...]:
+        """Timesteps that have a frame, ascending."""
         return tuple(self.numbers)
 
     def image(self, timestep: int) -> np.ndarray:
+        """(H, W, 3) uint8 sRGB. Raises StgaError naming the file; KeyError without a frame."""
         number = self.numbers[timestep]
         av = _pyav(self.video.path)
         try:
@@ -135,17 +144,21 @@ class VideoFrames:
             self.close()  # a decoder holds dozens of frames, and a rig has dozens of cameras
         return pixels
 
-    def mask(self, timestep: int) -> None:
-        return None
+    def mask(self, timestep: int) -> np.ndarray | None:
+        """(H, W) uint8, 255 inside; None where the frame has none. Raises as `image` does."""
+        return None if self.masks is None else read_mask(self.masks[timestep])
 
     def source(self, timestep: int) -> str:
+        """What a message calls the frame."""
         return f"{self.video.path}: frame {self.numbers[timestep]}"
 
     @property
     def files(self) -> tuple[Path, ...]:
+        """What the frames are read from."""
         return (self.video.path,)
 
-    def file(self, timestep: int) -> None:
+    def file(self, timestep: int) -> Path | None:
+        """The image file whose stored pixels are the frame; None where they are converted."""
         return None
 
     def close(self) -> None:
@@ -162,13 +175,18 @@ class VideoFrames:
         """
         from av.error import InvalidDataError
 
-        failure = None
+        failure, times = None, self.video.times
         for decoder in self._decoders(number):
-            self._decoder = decoder
+            self._decoder, frame = decoder, None
             try:
-                frame = self._reached(number)
+                if self.video.seekable:
+                    later = (f for f in decoder if f.pts is not None and f.pts >= times[number])
+                    frame = next(later, None)
+                    frame = frame if frame is not None and frame.pts == times[number] else None
+                else:
+                    frame = next(itertools.islice(decoder, number - self._decoded - 1, None), None)
             except InvalidDataError as error:
-                frame, failure = None, error
+                failure = error
             if frame is not None:
                 self._decoded = number
                 return frame
@@ -179,9 +197,8 @@ class VideoFrames:
         from av.error import FFmpegError
 
         seekable = self.video.seekable
-        if self._decoder is not None and 0 < number - self._decoded <= (
-            MAX_FRAMES_AHEAD if seekable else number + 1
-        ):
+        farthest = MAX_FRAMES_AHEAD if seekable else number + 1
+        if self._decoder is not None and 0 < number - self._decoded <= farthest:
             yield self._decoder
         for back in SEEK_BACK_FRAMES if seekable else ():
             if number - back > 0:
@@ -197,17 +214,6 @@ class VideoFrames:
         self._open()
         yield _decoded_frames(self._container)
 
-    def _reached(self, number: int) -> Any:
-        """The frame of that number, None where the decoder is already past it or at the end."""
-        assert self._decoder is not None
-        if not self.video.seekable:
-            return next(itertools.islice(self._decoder, number - self._decoded - 1, None), None)
-        time = self.video.times[number]
-        frame = next(
-            (frame for frame in self._decoder if frame.pts is not None and frame.pts >= time), None
-        )
-        return frame if frame is not None and frame.pts == time else None
-
     def _open(self) -> None:
         if self._container is None:
             self._container = _pyav(self.video.path).open(str(self.video.path))
@@ -215,8 +221,7 @@ class VideoFrames:
 
 
 def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
-    """Size (width, height) as displayed and times of the first frames in the order shown. Raises
-    StgaError."""
+    """Size as displayed and times of the first frames in the order shown. Raises StgaError."""
     with opened_video(path) as container:
         frames = _decoded_frames(container)
         first = next(frames, None)
@@ -250,10 +255,8 @@ def _packet_times(path: Path) -> tuple[list[int] | None, bool]:
     """
     with opened_video(path) as container:
         stream = container.streams.video[0]
-        timed = (
-            _is_of(container, TIMED_CONTAINERS)
-            and stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
-        )
+        timed = stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
+        timed = timed and _is_of(container, TIMED_CONTAINERS)
         if not (timed or _is_intra_only(stream)):
             return None, False
         packets, is_cut_off = [], False
@@ -272,16 +275,8 @@ def _is_cut_off(container: Any, packet: Any) -> bool:
     return packet.is_corrupt and _is_of(container, TIMED_CONTAINERS)
 
 
-def _decoded_times(path: Path) -> Sequence[int | None]:
-    """Times of all frames in the order shown."""
-    with opened_video(path) as container:
-        container.streams.video[0].thread_type = "AUTO"
-        return [frame.pts for frame in _decoded_frames(container)]
-
-
 def _decoded_frames(container: Any) -> Iterator[Any]:
-    """All frames from the beginning; a transport stream may begin with packets that cannot be
-    decoded."""
+    """All frames; the first packets of a transport stream may not be decodable."""
     from av.error import InvalidDataError
 
     stream, may_fail = container.streams.video[0], _is_of(container, ("mpegts",))
@@ -325,35 +320,30 @@ def _is_intra_only(stream: Any) -> bool:
     return bool(stream.codec_context.codec.intra_only)
 
 
-def _frame_rate(times: Sequence[int], time_base: float, rates: list[float]) -> float:
-    """The first of the stated rates that the frames' times agree with, else the average of the
-    times.
-
-    What a file states also counts frames that are hidden.
-    """
-    if len(times) < 2:
-        return next(iter(rates), 0.0)
-    measured = (len(times) - 1) / ((times[-1] - times[0]) * time_base)
-    return next(
-        (rate for rate in rates if abs(rate - measured) <= RATE_TOLERANCE * measured), measured
-    )
-
-
 def _timed(
     path: Path, times: Sequence[int], time_base: float, rates: list[float]
 ) -> tuple[tuple[int, ...], float, tuple[str, ...]]:
-    """Timesteps of the frames, frames per second, and a sentence where the rate varies."""
+    """Timesteps of the frames, frames per second, and a sentence where the rate varies.
+
+    The rate is the first of the stated ones that the frames' times agree with, else the average of
+    the times: what a file states also counts frames that are hidden.
+    """
+    if len(times) < 2:
+        return tuple(range(len(times))), next(iter(rates), 0.0), ()
     durations = np.diff(times)
-    if not len(durations) or durations.max() <= VARIABLE_RATE_FACTOR * np.median(durations):
-        return tuple(range(len(times))), _frame_rate(times, time_base, rates), ()
-    usual = durations[durations <= VARIABLE_RATE_FACTOR * np.median(durations)]
+    longest = VARIABLE_RATE_FACTOR * np.median(durations)
+    if durations.max() <= longest:
+        fps = (len(times) - 1) / ((times[-1] - times[0]) * time_base)
+        agreeing = (rate for rate in rates if abs(rate - fps) <= RATE_TOLERANCE * fps)
+        return tuple(range(len(times))), next(agreeing, fps), ()
+    usual = durations[durations <= longest]
     fps = 1 / (time_base * float(usual.mean()))
     timesteps = np.round((np.array(times) - times[0]) * time_base * fps).astype(int)
     low, high = (1000 * time_base * float(ticks) for ticks in (durations.min(), durations.max()))
     missing = timesteps[-1] + 1 - len(np.unique(timesteps))
     warning = (
-        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); its frames are numbered by their "
-        f"times, {fps:.4g} a second, and {missing} numbers have none"
+        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); its frames "
+        f"are numbered by their times, {fps:.4g} a second, and {missing} numbers have none"
     )
     return tuple(timesteps.tolist()), fps, (warning,)
 
@@ -370,27 +360,17 @@ def _pixels(frame: Any) -> np.ndarray:
     codes = int(frame.color_primaries), int(frame.color_trc)
     deep = not is_srgb(*codes)  # 8 bits of HDR are too few for its dark colors
     rgb = frame.reformat(format="rgb48le" if deep else "rgb24", src_colorspace=matrix).to_ndarray()
-    return _displayed(to_srgb(rgb, *codes) if deep else rgb, _display_matrix(frame))
-
-
-def _display_matrix(frame: Any) -> np.ndarray:
-    """(2, 2) whole numbers a video's header maps stored pixels with: row vector (x, y) times the
-    matrix, y down."""
-    data = frame.side_data.get("DISPLAYMATRIX")
+    pixels, data = to_srgb(rgb, *codes) if deep else rgb, frame.side_data.get("DISPLAYMATRIX")
     if data is None:
-        return np.eye(2, dtype=int)
-    turn = np.sign(
-        np.round(np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2) / DISPLAY_MATRIX_ONE)
-    )
-    whole = np.abs(turn).sum(0).tolist() == np.abs(turn).sum(1).tolist() == [1, 1]
-    return turn.astype(int) if whole else np.eye(2, dtype=int)
-
-
-def _displayed(pixels: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """The pixels mirrored and turned by quarters."""
+        return np.ascontiguousarray(pixels)
+    # Row vector (x, y) of a stored pixel times the matrix (2, 2), y down, is where it is shown.
+    fixed = np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2)
+    turn = np.sign(np.round(fixed / DISPLAY_MATRIX_ONE))
+    if not np.abs(turn).sum(0).tolist() == np.abs(turn).sum(1).tolist() == [1, 1]:
+        return np.ascontiguousarray(pixels)
     if turn[0, 0] == 0:  # the stored x becomes y
         pixels, turn = pixels.swapaxes(0, 1), turn[::-1]
-    columns, rows = np.sign(np.diag(turn)).tolist()
+    columns, rows = turn.diagonal().astype(int).tolist()
     return np.ascontiguousarray(pixels[::rows, ::columns])
 
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG
-from ...tracking.folder import is_tracked
-from ...tracking.torso_motion import read_torso_motion
+from ...tracking.folder import is_tracked, read_torso_motion
 from .evidence import MIN_EXPOSURE_LEVELS, Evidence
 from .facts import CaptureFacts
 

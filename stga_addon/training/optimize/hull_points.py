@@ -16,7 +16,7 @@ from ...capture.mesh_geometry import MIN_DEPTH_M, silhouette
 from ...capture.model import Capture, View
 from ...flame.model import torso_faces
 from ...flame.sequence import below_neck
-from ...tracking.torso_motion import TorsoPoints, read_torso_points
+from ...tracking.folder import TorsoPoints, read_torso_points
 
 VOXEL_SIZE_M = 0.004
 """Distance between hull points, on a mesh of a head's size."""
