@@ -17,7 +17,7 @@ from .forward import (
     neutral_frame,
     shaped_vertices,
 )
-from .model import JOINTS, FlameModel
+from .model import JOINTS, MIN_TORSO_WEIGHT, FlameModel
 from .quaternions import from_axis_angle, slerp, to_axis_angle
 from .teeth import TEETH_VERTICES
 
@@ -37,6 +37,7 @@ FIELD_ALIASES = {
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
+TORSO_SHIFT, SHIFT_SIZE = "torso_shift", 3
 MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
 MAX_TIMESTEP = 1 << 20  # Blender's last frame
 
@@ -139,13 +140,27 @@ def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray
     return _identity(path, read_npz(path), model)
 
 
+def torso_shapes(model: FlameModel) -> np.ndarray:
+    """(V, 3, 3) vertex offsets by which the torso is shifted along x, y and z, in its axes."""
+    share = np.minimum(model.weights[:, JOINTS.index("root")] / MIN_TORSO_WEIGHT, 1)
+    return share[:, None, None] * np.eye(SHIFT_SIZE)
+
+
+def torso_offset(
+    shapes: np.ndarray, shift: np.ndarray, offset: np.ndarray | None
+) -> np.ndarray | None:
+    """(V, 3) a timestep's vertex offsets, None being none, with the torso shifted."""
+    return shapes @ shift + (0 if offset is None else offset) if shift.any() else offset
+
+
 def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     """Read a whole motion from one file: arrays with a leading time axis, of which any but one may
     be missing (zero).
 
     VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a
     GaussianAvatars avatar, and plain files of expression and pose, whose fields may have the names
-    in `FIELD_ALIASES` too. `pose` holds the joints of `POSE_LAYOUTS`. Timesteps count from 0,
+    in `FIELD_ALIASES` too. `pose` holds the joints of `POSE_LAYOUTS`, TORSO_SHIFT a shift of the torso
+    (`torso_shapes`). Timesteps count from 0,
     unless `timesteps` (T,) names them. Raises StgaError naming the file and the field.
     """
     return motion_of(path, read_npz(path), model)
@@ -185,9 +200,15 @@ def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -
         raise StgaError(f"{path}: timesteps: expected {count} whole numbers {limits}")
     timesteps = tuple(found.tolist())
     row = {timestep: number for number, timestep in enumerate(timesteps)}
+    shift, torso = arrays.get(TORSO_SHIFT, np.zeros((count, SHIFT_SIZE))), torso_shapes(model)
+    if shift.shape != (count, SHIFT_SIZE) or not (np.abs(shift) < MAX_PARAMETER).all():
+        raise StgaError(f"{path}: {TORSO_SHIFT}: expected finite numbers ({count}, {SHIFT_SIZE})")
 
     def frame(timestep: int) -> FlameFrame:
-        return _frame(path, {name: array[row[timestep]] for name, array in moving.items()}, model)
+        at = row[timestep]
+        found = _frame(path, {name: array[at] for name, array in moving.items()}, model)
+        offset = torso_offset(torso, shift[at], found.dynamic_offset)
+        return replace(found, dynamic_offset=offset)
 
     for timestep in timesteps:
         frame(timestep)  # report a wrong value when the file is opened, not minutes later

@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -17,8 +18,9 @@ from ..format import format_duration
 from ..options import option, usable_path
 from ..progress import Cancelled, Progress, Report, Say, TimeLeft
 from ..report import CURVE
-from ..tracking.folder import REPORT_FILE, SHEET_FILE, is_flame, is_written
+from ..tracking.folder import KEPT_FOLDER, REPORT_FILE, SHEET_FILE, is_flame, is_written
 from ..training.run.folder import AVATAR, has_run
+from ..worker.helpers import Helpers
 from .results import Written
 from .train import Train, resumed, train
 
@@ -69,6 +71,10 @@ class Track:
         "calibration: COLMAP, Metashape, RealityCapture or transforms.json (default: that in the footage's folder)",
         None, metavar="FILE",
     )  # fmt: skip
+    avatar: Path | None = option(
+        "run of the same person's avatar: its head is fitted, in place of --model, and pose and expression are such "
+        "that it looks like the images", None, metavar="RUN",
+    )  # fmt: skip
     landmarks: Path | None = option("landmark files of another detector", None, metavar="FOLDER")
     focal: float | None = option(
         "focal length of a single camera without calibration, in pixels (default: as its file says, or from the head's "
@@ -94,6 +100,12 @@ class Track:
         "masks of the person: made where the footage has none (default), only the footage's, or a folder's",
         "auto", is_path=lambda text: text not in MATTES, metavar="auto|none|FOLDER", parse=_parsed_mattes,
     )  # fmt: skip
+
+    def check(self) -> None:
+        """Raise StgaError where two options contradict each other."""
+        if self.avatar is not None and (self.model is not None or self.meshes):
+            name = "--meshes" if self.model is None else "--model"
+            raise StgaError(f"{name}: does not go with --avatar, whose head is tracked")
 
 
 @dataclass(frozen=True)
@@ -151,9 +163,12 @@ STAGES = {
     "Contact sheet": (0.97, 0.985),
     "Images": (0.985, 0.99),
     "Heads": (0.99, 1.0),
+    "Avatar": (0.99, 1.0),
 }
 """Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its
 share of the time on two processors where one camera recorded a video of 1080p."""
+MAX_MISFIT = 0.5
+"""Median share of the head's pixels, beyond which the avatar is another person's."""
 FOCAL_SOURCES = {
     "given": "as given",
     "file": "as the file says",
@@ -168,7 +183,9 @@ def track(request: Track, report: Report, say: Say) -> Written:
     from which the same request continues."""
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
+    from ..tracking.track import end_tracking
     from ..tracking.track import track as track_footage
+    from ..training.run.recording import avatar_person, track_recording
 
     steps = _Steps(report)
     steps.report("Opening the footage", 0, 1)
@@ -177,10 +194,24 @@ def track(request: Track, report: Report, say: Say) -> Written:
     )
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
+    person, model = None, request.model
+    if request.avatar is not None:
+        person, model = avatar_person(request.avatar)
     found = track_footage(
-        footage, request.model, request.out, request.landmarks, request.meshes, request.world,
-        request.mattes == "auto", steps.report, steps.show,
+        footage, model, request.out, request.landmarks, request.meshes, request.world,
+        request.mattes == "auto", steps.report, steps.show, person,
     )  # fmt: skip
+    missed = []
+    if request.avatar is not None:
+        with Helpers(folder=request.out / KEPT_FOLDER) as helpers:
+            tracked = track_recording(
+                request.avatar, request.out, helpers, partial(steps.report, "Avatar")
+            )
+        end_tracking(request.out)
+        share = float(np.median(tracked.misfit))
+        missed = [f"avatar: {share:.0%} of the head's pixels are not as it has them (median)"]
+        if share > MAX_MISFIT:
+            missed.append("warning: the avatar does not look like the person of this footage")
     error = f"Reprojection error {found.median_px:.1f} px (median)"
     report(Progress(1.0, "Tracked", error))
     lines = [
@@ -192,6 +223,7 @@ def track(request: Track, report: Report, say: Say) -> Written:
             else [f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}"]
         ),
         *([] if found.torso is None else [f"torso: {found.torso.description}"]),
+        *missed,
         f"capture: {request.out}",
     ]
     return Written(request.out, tuple(lines))

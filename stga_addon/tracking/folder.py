@@ -34,7 +34,8 @@ def mask_name(timestep: int, camera: int) -> str:
 
 def is_written(out: Path) -> bool:
     """Whether a folder holds a whole capture; tracking that was interrupted leaves none."""
-    return any((out / name).exists() for name in (SPLIT_FILES[0], "transforms.json"))
+    files = (SPLIT_FILES[0], "transforms.json")
+    return any((out / name).exists() for name in files) and not (out / KEPT_FOLDER).exists()
 
 
 def is_flame(out: Path) -> bool:

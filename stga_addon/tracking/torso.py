@@ -98,12 +98,14 @@ def follow_torso(
     footage: Footage,
     helpers: Helpers,
     report: Report,
+    bends: bool = True,
 ) -> FollowedTorso:
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.
 
     The torso turns about the neck's joint; the head is not moved. Parameters are returned as they
     are where the torso rides on the head, and where its motion cannot be told: without masks, in
     takes shorter than MIN_TIMESTEPS, of models without a neck, and where little of a torso is seen.
+    bends: whether cloth may; the model is drawn over it then.
     """
     unchanged, torso = dict(parameters), torso_faces(fit.head.model)
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
@@ -130,7 +132,9 @@ def follow_torso(
         return FollowedTorso(fit, unchanged, motion=decided)
     name = own if motion == "own" else motion
     points = TorsoPoints(middle, deep[name].at)
-    bending = found_bending(take, motions[name], points, some, walk) if name == "shifted" else None
+    bending = None
+    if bends and name == "shifted":
+        bending = found_bending(take, motions[name], points, some, walk)
     return _followed(fit, take, motions[name], bending, decided, points)
 
 

@@ -123,6 +123,7 @@ def track(
     mattes: bool = True,
     report: Report = lambda stage, done, total: None,
     show: Show = lambda draw, figures: None,
+    person: HeadFit | None = None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
@@ -136,14 +137,16 @@ def track(
     the cameras, which is scaled about its origin where it is not in meters; "auto": as the
     calibration says, else "head".
     show: given pictures and figures of how the head fits, the first one within seconds.
+    person: whose head is known from another take, with `head_file`'s shapes: then only scale,
+    expressions and poses are sought, and `end_tracking` is the caller's.
     Raises StgaError.
     """
     if is_written(out):
         raise StgaError(f"{out}: already holds a capture; give another --out")
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
-    head = read_head_model(head_file)
-    footage, source = _stored(footage, out), _source(footage, head_file, landmarks)
+    head = read_head_model(head_file) if person is None else person.head
+    footage, source = _stored(footage, out), _source(footage, head_file, landmarks, head)
     with Helpers(folder=out / KEPT_FOLDER) as helpers:
         if landmarks is None:
             seen = _detected(head, head_file, footage, source, out, helpers, report, show)
@@ -194,7 +197,9 @@ def track(
         show(partial(picture_of_fit, fit, footage), {"error_px": _median_px(errors)})
         images, masks = partial(_images, footage), partial(_masks, footage)
         recorded = RecordedTake(seen.places, seen.reliable, take, images, masks, metric)
-        fit, misfits = by_images(head, fit, recorded, helpers, report)
+        fit, misfits = by_images(head, fit, recorded, helpers, report, person is not None)
+        if person is not None:
+            fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
         fit = in_cameras_world(fit) if keep else fit
         errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
         shares = [share for own in misfits.values() for share in own.values()]
@@ -210,7 +215,7 @@ def track(
             footage, matte_warnings = with_mattes(
                 footage, head_pixels, out, source, helpers, report
             )
-        torso = follow_torso(fit, parameters, footage, helpers, report)
+        torso = follow_torso(fit, parameters, footage, helpers, report, person is None)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
@@ -254,8 +259,14 @@ def track(
         with replacing(out / BUNDLED_MODEL) as copy:
             shutil.copyfile(BUNDLED_HEAD, copy)
     write_capture(out, footage, torso.fit, torso.parameters, torso.offsets, meshes, report)
-    shutil.rmtree(out / KEPT_FOLDER, ignore_errors=True)
+    if person is None:
+        end_tracking(out)
     return result
+
+
+def end_tracking(out: Path) -> None:
+    """Remove what an interrupted tracking goes on from: the capture is whole."""
+    shutil.rmtree(out / KEPT_FOLDER, ignore_errors=True)
 
 
 @dataclass(frozen=True)
@@ -317,17 +328,19 @@ def by_images(
     take: RecordedTake,
     helpers: Helpers,
     report: Report = lambda stage, done, total: None,
+    is_person: bool = False,
 ) -> tuple[HeadFit, dict[str, dict[int, float]]]:
     """The fit moved onto what the images show, and region -> timestep -> how badly they are
     explained (`Misfit`); none where the take is too short for dense tracking. `fit` is what
-    `fit_head` returns for `head`."""
+    `fit_head` returns for `head`. is_person: the surface is known, and need not be sought."""
     dense = fit_dense(fit, take, helpers, report=report)
     if dense is None:
-        return fit_surface(head, fit, take, helpers, report), {}
-    take = replace(take, landmarks=dense.landmarks)
-    fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
-    dense = fit_dense(fit, take, helpers, True, report)
-    assert dense is not None
+        return fit if is_person else fit_surface(head, fit, take, helpers, report), {}
+    if not is_person:
+        take = replace(take, landmarks=dense.landmarks)
+        fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
+        dense = fit_dense(fit, take, helpers, True, report)
+        assert dense is not None
     misfits = {
         name: {t: float(own[row]) for t, own in dense.misfit.items()}
         for row, name in enumerate(REGIONS)
@@ -378,15 +391,16 @@ def reprojection_errors(
 
 
 def _source(
-    footage: Footage, head_file: Path | None, landmarks: Path | None = None
+    footage: Footage, head_file: Path | None, landmarks: Path | None, head: HeadModel
 ) -> dict[str, Any]:
     """What landmarks and mattes are of; landmarks: the folder that they were read from."""
     model = str(head_file.resolve()) if head_file else ""
+    template = hashlib.sha256(head.model.v_template.tobytes()).hexdigest()[:16]
     return {
         "footage": str(footage.root),
         "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
         "timesteps": list(footage.timesteps),
-        "head_model": [model, _state([head_file or BUNDLED_HEAD])],
+        "head_model": [model, _state([head_file or BUNDLED_HEAD]), template],
         "landmarks": None if landmarks is None else realpath(landmarks),
     }
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...avatar.file import Avatar
 from ...capture.images import read_view
-from ...capture.mesh_geometry import vertex_normals
+from ...capture.mesh_geometry import silhouette, vertex_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import with_sequence
 from ...errors import StgaError
@@ -28,8 +28,17 @@ from ...flame.forward import (
     frame_of,
     parameters_gradient,
 )
-from ...flame.sequence import FlameSequence, sequence_mesh, with_identity
+from ...flame.model import JOINTS, FlameModel
+from ...flame.sequence import (
+    SHIFT_SIZE,
+    FlameSequence,
+    sequence_mesh,
+    torso_offset,
+    torso_shapes,
+    with_identity,
+)
 from ...progress import Cancelled
+from ...render.render import render_avatar
 from ...tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
 from ...tracking.dense_terms import POINT_SHARE, inside, projection_derivative
 from ...tracking.head_model import HeadModel
@@ -44,32 +53,44 @@ from .frames import FrameStore
 from .image_preparation import image_preparation
 from .state import new_offset, new_state
 
-RENDERINGS = 6
+RENDERINGS = 7
 """Of each view of a timestep: more of them hardly lower the loss."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
 """Cameras, spread over the rig, whose images are compared; images higher than this are shrunk to
 it."""
+PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200, 400), 20
+"""Heights of the images in which the first timestep of another recording is tracked, from small
+ones on, as a pattern on clothes leads astray by more than its width, and renderings in each."""
+ROOT = JOINTS.index("root")
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
 POINTS, MIN_COSINE, VISIBILITY_SIDE_PX = 6000, 0.15, 160
 """Points of the surface; of the angle between normal and camera, below which one does not count;
 size of the depth image that hidden ones are found in."""
 EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
+SCALE_SIGMA = 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
 FIRST_STEP = 0.01
 """Length of the first step, as a share of the one down a loss as steep as the points say: it is
 steeper."""
+MISS_LEVELS = 24
+"""Mean over the channels, of 255, by which a pixel's color is missed that is not explained."""
 
 
 @dataclass(frozen=True)
 class AvatarTracking:
-    """Parameters (T, E + 18) of timesteps, and what was minimized, (T,), where they started and
-    where they are: the loss of their images, in the points' units, and the prior."""
+    """Parameters (T, E + 18) of timesteps; what was minimized, (T,), where they started and where
+    they are: the loss of their images, in the points' units, and the prior; and (T,) the share of
+    the head's pixels whose colors the avatar misses by more than MISS_LEVELS; (T, 3) by how much
+    the torso is shifted, of `torso_shapes`; and (T,) the head's scale, where it was sought."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
     before: np.ndarray
     after: np.ndarray
+    misfit: np.ndarray
+    shift: np.ndarray
+    scale: np.ndarray
 
 
 class RefinedTracking:
@@ -77,7 +98,7 @@ class RefinedTracking:
     capture's.
 
     tracked     (T, P) the capture's parameters
-    parameters  (T, P) those of now
+    parameters  (T, P + 3) those of now, and a shift of the torso (`torso_shapes`)
     rounds      how often the avatar has tracked
     """
 
@@ -96,16 +117,19 @@ class RefinedTracking:
         self.tracked = np.stack(
             [self.sequence.frame(timestep).parameters for timestep in self.sequence.timesteps]
         )
-        self.parameters, self.rounds = self.tracked.copy(), 0
+        self.parameters, self.rounds = np.pad(self.tracked, ((0, 0), (0, SHIFT_SIZE))), 0
         self._row = {timestep: row for row, timestep in enumerate(self.sequence.timesteps)}
         self._source = lru_cache(CACHED_TIMESTEPS)(self.sequence.frame)
         self._person = replace(with_identity(self.sequence), frame=self.frame)
+        self._torso = torso_shapes(self._person.model)
 
     def refines(self, timestep: int) -> bool:
         return timestep in self._row
 
     def frame(self, timestep: int) -> FlameFrame:
-        return frame_of(self.parameters[self._row[timestep]], self._source(timestep).dynamic_offset)
+        values, source = self.parameters[self._row[timestep]], self._source(timestep)
+        offset = torso_offset(self._torso, values[-SHIFT_SIZE:], source.dynamic_offset)
+        return frame_of(values[:-SHIFT_SIZE], offset)
 
     def mesh(self, timestep: int) -> np.ndarray:
         """(V, 3) meters."""
@@ -121,7 +145,8 @@ class RefinedTracking:
         rows, at = (
             [self._row[timestep] for timestep in own] for own in (timesteps, found.timesteps)
         )
-        change = found.parameters - self.parameters[at]
+        values = np.concatenate([found.parameters, found.shift], axis=1)
+        change = values - self.parameters[at]
         between = [np.interp(rows, at, column) for column in change.T]
         self.parameters = self.parameters.copy()
         self.parameters[rows] += np.stack(between, axis=1)
@@ -134,15 +159,19 @@ def track_by_avatar(
     timesteps: Sequence[int] | None = None,
     seconds: float | None = None,
     report: Callable[[int, int], bool] = lambda done, total: False,
+    is_far: bool = False,
+    scales: bool = False,
 ) -> AvatarTracking:
     """Refine the parameters of a tracked capture of the avatar's person, from where they are.
 
     settings: with which the avatar was trained, whose background and exposures the images have.
     timesteps: None: all; as many of them, evenly spread, as `seconds` allow. report: how many are
-    done; returns whether to stop. Raises StgaError where the capture has no parameters or is of
-    another head, and Cancelled.
+    done; returns whether to stop. is_far: the starts are some way off, as of another recording: the
+    first timestep is sought in small images first. scales: whether the head's size is sought too.
+    Each timestep begins where the one before has led. Raises StgaError where the capture has no
+    parameters or is of another head, and Cancelled.
     """
-    tracker, found = _Tracker(avatar, settings, capture), []
+    tracker, found = _Tracker(avatar, settings, capture, is_far, scales), []
     chosen, begin = list(capture.timesteps if timesteps is None else timesteps), perf_counter()
     number = 0
     while number < len(chosen):
@@ -153,15 +182,19 @@ def track_by_avatar(
         if number == 1 and seconds is not None:
             most = int(seconds / (perf_counter() - begin))
             chosen = sorted({chosen[0], *evenly_spread(chosen, max(2, most))})
-    parameters, before, after = zip(*found, strict=True)
-    return AvatarTracking(tuple(chosen), np.stack(parameters), np.array(before), np.array(after))
+    values, *figures = zip(*found, strict=True)
+    rows, added = np.stack(values), np.s_[-RIGID_SIZE - SHIFT_SIZE - scales : -RIGID_SIZE]
+    shift, scale = np.split(rows[:, added], [SHIFT_SIZE], axis=1)
+    rows = np.delete(rows, added, axis=1)
+    before, after, misfit = map(np.array, figures)
+    return AvatarTracking(tuple(chosen), rows, before, after, misfit, shift, 1 + scale.ravel())
 
 
 class _Posed:
     """The head at the parameters that are being tried, in place of the capture's (`FrameStore`)."""
 
-    def __init__(self, sequence: FlameSequence) -> None:
-        self._sequence = with_identity(sequence)
+    def __init__(self, sequence: FlameSequence, model: FlameModel) -> None:
+        self._sequence, self._model = sequence, model
         self.values = np.zeros(0)
 
     def refines(self, timestep: int) -> bool:
@@ -169,26 +202,41 @@ class _Posed:
 
     def mesh(self, timestep: int) -> np.ndarray:
         offset = self._sequence.frame(timestep).dynamic_offset
-        return flame_forward(self._sequence.model, np.zeros(0), frame_of(self.values, offset))
+        return flame_forward(self._model, np.zeros(0), frame_of(self.values, offset))
 
 
 class _Tracker:
-    def __init__(self, avatar: Avatar, settings: TrainingSettings, capture: Capture) -> None:
+    def __init__(
+        self,
+        avatar: Avatar,
+        settings: TrainingSettings,
+        capture: Capture,
+        is_far: bool,
+        scales: bool,
+    ) -> None:
         sequence = capture.flame
         if sequence is None:
             raise StgaError(f"{capture.root}: is not tracked with FLAME or the bundled head")
         if not np.array_equal(avatar.faces, capture.faces):
             raise StgaError(f"{capture.root}: is of another head than the avatar")
-        self._capture, self._settings, self._sequence = capture, settings, sequence
+        self._avatar, self._capture = avatar, capture
+        self._settings, self._sequence = settings, sequence
         self._views: dict[int, list[View]] = {}
         for view in (view for views in capture.views.values() for view in views):
             self._views.setdefault(view.timestep, []).append(view)
         self._prepare = image_preparation(capture, settings)
         person = with_identity(sequence).model
+        root = person.j_regressor[ROOT] @ person.v_template
+        grown = (person.v_template - root)[:, :, None][:, :, : int(scales)]
+        # what is sought beside the expressions, as if they were some
+        shapes = [person.shapedirs, torso_shapes(person), grown]
+        person = replace(person, shapedirs=np.concatenate(shapes, axis=2))
+        self._is_far, self._added = is_far, SHIFT_SIZE + scales
+        self._change: np.ndarray | None = None
         self._head = HeadModel(person, "flame")
         self._points = surface_points(self._head, POINTS)
         self._posed_points = PosedPoints(person, self._points)
-        self._posed = _Posed(sequence)
+        self._posed = _Posed(sequence, person)
         state = new_state(avatar.splats)
         state.driven_offsets = {
             name: new_offset(own) for name, own in avatar.driven_offsets.items()
@@ -199,48 +247,79 @@ class _Tracker:
         )
         self._backend = CpuBackend(settings, self._frames, state)
 
-    def solve(self, timestep: int) -> tuple[np.ndarray, float, float]:
-        """Parameters (E + 18,), and what was minimized before and after; as tracked where no view
-        shows it."""
+    def solve(self, timestep: int) -> tuple[np.ndarray, float, float, float]:
+        """Parameters (E + 18,), what was minimized before and after, and the misfit; as tracked
+        where no view shows it."""
+
+        frame = self._sequence.frame(timestep).parameters
+        tracked = np.insert(frame, len(frame) - RIGID_SIZE, np.zeros(self._added))
+        views = evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
+        if not views:
+            return tracked, 0.0, 0.0, 0.0
+        heights: tuple[int, ...] = (MAX_HEIGHT_PX,)
+        renderings, found = RENDERINGS, tracked
+        if self._change is not None:
+            shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
+            starts = tracked, tracked + self._change
+            found = min(starts, key=lambda start: self._loss(start, timestep, shots)[0])
+        elif self._is_far:
+            heights, renderings = PYRAMID_PX, PYRAMID_RENDERINGS
+        energies: list[float] = []
+        for height in heights:
+            shots = [self._read(view, height) for view in views]
+            found, *energies = self._descended(timestep, shots, tracked, found, renderings)
+        self._change = found - tracked
+        return found, energies[0], energies[1], self._misfit(found, shots)
+
+    def _descended(
+        self,
+        timestep: int,
+        shots: Sequence[tuple[View, np.ndarray]],
+        tracked: np.ndarray,
+        start: np.ndarray,
+        renderings: int,
+    ) -> tuple[np.ndarray, float, float]:
+        """Parameters from `start` on, and what was minimized before and after."""
         from scipy.linalg import solve_triangular
         from scipy.optimize import minimize
 
-        tracked = self._sequence.frame(timestep).parameters
-        shots = [
-            self._read(view) for view in evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
-        ]
-        if not shots:
-            return tracked, 0.0, 0.0
-        precision = self._precision()
-        root = np.linalg.cholesky(self._gauss_newton(tracked, timestep, shots) + np.diag(precision))
+        precision = self._precision()  # of the change from those that were tracked
+        root = np.linalg.cholesky(self._gauss_newton(start, timestep, shots) + np.diag(precision))
 
         def energy(whitened: np.ndarray) -> tuple[float, np.ndarray]:
-            change = solve_triangular(root, whitened, lower=True, trans=1)
-            loss, gradient = self._loss(tracked + change, timestep, shots)
-            excess = self._excess(tracked + change)
+            values = start + solve_triangular(root, whitened, lower=True, trans=1)
+            loss, gradient = self._loss(values, timestep, shots)
+            change, excess = values - tracked, self._excess(values)
             gradient += precision * change + excess / WEIGHT_EXCESS_SIGMA**2
             prior = precision @ change**2 + (excess**2).sum() / WEIGHT_EXCESS_SIGMA**2
             return loss + prior / 2, solve_triangular(root, gradient, lower=True)
 
-        start = np.zeros(len(tracked))
-        before, slope = energy(start)
+        zero = np.zeros(len(tracked))
+        before, slope = energy(zero)
         scale = FIRST_STEP * max(float(np.linalg.norm(slope)), 1e-9)
 
         def scaled(values: np.ndarray) -> tuple[float, np.ndarray]:
             found, gradient = (before, slope) if not values.any() else energy(scale * values)
             return found, scale * gradient
 
-        options = {"maxfun": RENDERINGS, "maxiter": RENDERINGS}
-        best = minimize(scaled, start, jac=True, method="L-BFGS-B", options=options)
-        return (
-            tracked + solve_triangular(root, scale * best.x, lower=True, trans=1),
-            before,
-            float(best.fun),
-        )
+        options = {"maxfun": renderings, "maxiter": renderings}
+        best = minimize(scaled, zero, jac=True, method="L-BFGS-B", options=options)
+        change = solve_triangular(root, scale * best.x, lower=True, trans=1)
+        return start + change, before, float(best.fun)
 
-    def _read(self, view: View) -> tuple[View, np.ndarray]:
+    def _misfit(self, values: np.ndarray, shots: Sequence[tuple[View, np.ndarray]]) -> float:
+        self._posed.values = values
+        mesh, missed, count = self._posed.mesh(shots[0][0].timestep), 0, 0
+        for view, image in shots:
+            head = silhouette(mesh, self._capture.faces, view.camera) > 0
+            drawn = render_avatar(self._avatar, mesh, view.camera, self._settings.background)
+            away = np.abs(255 * drawn.transpose(1, 2, 0) - image).mean(2)
+            missed, count = missed + int((away[head] > MISS_LEVELS).sum()), count + int(head.sum())
+        return missed / max(count, 1)
+
+    def _read(self, view: View, height: int) -> tuple[View, np.ndarray]:
         background = [round(255 * part) for part in self._settings.background]
-        scale = min(1.0, MAX_HEIGHT_PX / view.camera.height)
+        scale = min(1.0, height / view.camera.height)
         view, image, mask = read_view(view, scale, (background[0], background[1], background[2]))
         if self._prepare is not None:
             image, _ = self._prepare(view, image, mask)
@@ -256,6 +335,8 @@ class _Tracker:
             (count, RIGID_SIZE - TRANSLATION_SIZE, TRANSLATION_SIZE),
         )
         absent = np.repeat(~np.array(self._head.joints), 3)
+        first = count - self._added
+        sigma[first:count] = (*(TRANSLATION_SIGMA_M,) * SHIFT_SIZE, SCALE_SIGMA)[: self._added]
         precision = sigma**-2.0
         rigid = slice(count, count + len(absent))
         precision[rigid] = np.where(
@@ -267,8 +348,8 @@ class _Tracker:
         """(E + 18,) by which weights leave 0 to 1."""
         found = np.zeros(len(values))
         if self._head.model.expression_names:
-            weights = values[:-RIGID_SIZE]
-            found[:-RIGID_SIZE] = weights - np.clip(weights, 0, 1)
+            count = len(values) - RIGID_SIZE - self._added
+            found[:count] = values[:count] - np.clip(values[:count], 0, 1)
         return found
 
     def _loss(

@@ -34,6 +34,42 @@ def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparati
     return prepare
 
 
+MAX_GAIN = 4.0
+EXPOSURE_PRIOR, EXPOSURE_SCALE, EXPOSURE_ITERATIONS = 1e-3, 0.08, 4
+"""Weight of the usual exposure as a share of the pixels, which decides where all have one color;
+and the difference in 0…1 beyond which pixels are outliers."""
+
+
+def fitted_exposure(
+    drawn: np.ndarray,
+    seen: np.ndarray,
+    usual: np.ndarray | None = None,
+    share: float = EXPOSURE_PRIOR,
+) -> np.ndarray:
+    """(2, 3) gain and offset of each channel with which colors (3, N) become those of a camera.
+
+    In 0…1; robust (Geman-McClure). usual: what is expected (None: gain 1, offset 0), with the
+    weight of a share of the pixels.
+    """
+    usual = np.array([[1.0] * 3, [0.0] * 3]) if usual is None else usual
+    if not drawn.size:
+        return usual
+    found = usual
+    for _ in range(EXPOSURE_ITERATIONS):
+        columns = []
+        for channel, (x, y) in enumerate(zip(drawn, seen, strict=True)):
+            residual = y - found[0, channel] * x - found[1, channel]
+            weight = (1 + (residual / EXPOSURE_SCALE) ** 2) ** -2.0
+            system = np.stack([x, np.ones_like(x)])
+            matrix = (weight * system) @ system.T
+            prior = share * weight.sum() * np.diag([x.var() + 1e-4, 1.0])
+            right = system @ (weight * y) + prior @ usual[:, channel]
+            columns.append(np.linalg.solve(matrix + prior, right))
+        found = np.stack(columns, axis=1)
+        found[0] = np.clip(found[0], 1 / MAX_GAIN, MAX_GAIN)
+    return found
+
+
 def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
     """Exposure of the cameras in `TrainingSettings.exposure`, where it drifts interpolated between
     timesteps."""

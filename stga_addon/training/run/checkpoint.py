@@ -35,7 +35,7 @@ class Checkpoint:
     best_difference  of avatar.npz (`Quality.detail_difference`); ∞ before the first evaluation
     losses     of the last global iterations
     identity   digest of the run's identity
-    tracking   (T, P) float64 `RefinedTracking.parameters`; None where they are not refined
+    tracking   (T, P + 3) float64 `RefinedTracking.parameters`; None where they are not refined
     rounds     in which they were
     """
 

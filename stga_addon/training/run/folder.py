@@ -29,7 +29,7 @@ from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError, shorten
 from ...files import read_json, read_npz, remove_leftovers, write_json, write_npz
 from ...flame.forward import FlameFrame, frame_of
-from ...flame.sequence import FRAME_FIELDS, FlameSequence, read_motion
+from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, read_motion
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
 from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_lock, lock_owner
@@ -300,13 +300,15 @@ def _has(device: str) -> bool:
 def write_tracking(
     folder: Path, sequence: FlameSequence, refined: np.ndarray, tracked: np.ndarray
 ) -> None:
-    """Write refined and tracked `FlameFrame.parameters` (T, P) of the timesteps of a sequence."""
-    frame = frame_of(refined.T)
+    """Write `RefinedTracking.parameters` (T, P + 3), and those that were tracked (T, P), of the
+    timesteps of a sequence."""
+    frame = frame_of(refined[:, :-SHIFT_SIZE].T)
     arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
     arrays["shape"] = sequence.shape
     if sequence.static_offset is not None:
         arrays["static_offset"] = sequence.static_offset
     arrays["timesteps"], arrays["tracked"] = np.array(sequence.timesteps), tracked
+    arrays[TORSO_SHIFT] = refined[:, -SHIFT_SIZE:]
     write_npz(folder / TRACKING, arrays, compressed=True)
 
 
@@ -320,10 +322,11 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
     path, sequence = folder / TRACKING, capture.flame
     if sequence is None or not path.exists():
         return capture
-    motion, tracked = read_motion(path, sequence.model), read_npz(path).get("tracked", np.zeros(0))
-    if len(tracked) != len(motion.timesteps):
+    motion, arrays = read_motion(path, sequence.model), read_npz(path)
+    count, tracked = len(motion.timesteps), arrays.get("tracked", np.zeros(0))
+    if len(tracked) != count:
         raise StgaError(
-            f"{path}: tracked has shape {tracked.shape}, expected {len(motion.timesteps)} timesteps first"
+            f"{path}: tracked has shape {tracked.shape}, expected {count} timesteps first"
         )
     before = dict(zip(motion.timesteps, tracked, strict=True))
 
@@ -331,7 +334,11 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
         found = sequence.frame(timestep)
         if timestep not in before or not np.array_equal(found.parameters, before[timestep]):
             return found
-        return replace(motion.frame(timestep), dynamic_offset=found.dynamic_offset)
+        refined = motion.frame(timestep)
+        offsets = [
+            frame.dynamic_offset for frame in (found, refined) if frame.dynamic_offset is not None
+        ]
+        return replace(refined, dynamic_offset=np.sum(offsets, axis=0) if offsets else None)
 
     return with_sequence(capture, replace(sequence, frame=frame))
 

@@ -23,6 +23,7 @@ from ...capture.loader import ViewLoader
 from ...capture.model import Capture, ViewExposure, evenly_spread
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
+from ...flame.sequence import SHIFT_SIZE
 from ...progress import Cancelled, Progress, Report, ignore
 from ...schema import to_json
 from ...selection import select_capture
@@ -364,7 +365,10 @@ def resume_session(
 
 def _restore(folder: Path, trainer: Trainer, checkpoint: Checkpoint) -> None:
     here, there = trainer.tracking, checkpoint.tracking
-    if (None if here is None else here.tracked.shape) != (None if there is None else there.shape):
+    if here is not None and there is not None and there.shape == here.tracked.shape:
+        there = np.pad(there, ((0, 0), (0, SHIFT_SIZE)))  # of a version that shifted no torso
+    wanted = None if here is None else here.parameters.shape
+    if wanted != (None if there is None else there.shape):
         raise StgaError(
             f"{folder}: its checkpoint's refined tracking does not fit the capture or the settings"
         )

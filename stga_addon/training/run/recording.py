@@ -1,0 +1,211 @@
+"""Tracking of other footage of a person by the avatar that a run trained."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from ...avatar.file import Avatar, read_avatar
+from ...capture.images import read_view
+from ...capture.mesh_geometry import Similarity, silhouette
+from ...capture.model import Capture, View, evenly_spread
+from ...capture.open import PARAMETERS, open_capture
+from ...errors import StgaError
+from ...files import read_json, read_npz, write_json, write_npz
+from ...flame.forward import joint_positions, shaped_vertices
+from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
+from ...render.render import render_avatar
+from ...tracking.fit import HeadFit
+from ...tracking.folder import REPORT_FILE, SPLIT_FILES
+from ...tracking.head_model import HeadModel
+from ...tracking.write_capture import moving_arrays
+from ...worker.helpers import Helpers, Step
+from ..optimize.avatar_tracking import (
+    ROOT,
+    AvatarTracking,
+    track_by_avatar,
+)
+from ..optimize.image_preparation import fitted_exposure
+from ..settings import TrainingSettings
+from .folder import AVATAR, open_refined, read_run
+
+EXPOSURE_VIEWS, EXPOSURE_HEIGHT_PX = 24, 160
+"""Views of a camera, spread over the take, that its exposure is fitted to, and their height."""
+CAMERA_WEIGHT = 0.2
+"""Of the camera's exposure in that of a view, as a share of the view's pixels."""
+MIN_COVER = 250
+"""Of a mask, of 255, from which a pixel shows the person alone."""
+SCALE_TIMESTEPS = 6
+"""Spread over the take, that the scale is found from."""
+PART_TIMESTEPS = 16
+"""Tracked by a helping process at a time."""
+AVATAR_MISFIT = "avatar"
+"""In a tracking's report, beside the regions of the face: what the avatar does not explain."""
+
+
+def avatar_person(run: Path) -> tuple[HeadFit, Path | None]:
+    """The head of a run's avatar as `tracking.track` takes a person, and the file of its FLAME
+    model, None of the bundled head. Raises StgaError where its capture was not tracked with
+    either."""
+    sequence, flame = _sequence(run), read_run(run).flame
+    fit = HeadFit(
+        HeadModel(with_identity(sequence).model, "flame"),
+        sequence.shape,
+        {},
+        Similarity(1.0, np.eye(3), np.zeros(3)),
+        sequence.static_offset,
+    )
+    return fit, flame
+
+
+def track_recording(
+    run: Path, root: Path, helpers: Helpers, report: Callable[[int, int], None]
+) -> AvatarTracking:
+    """Refine the tracking of a capture of the run's person by the avatar, its splats fixed.
+
+    Exposure and white balance of each camera, where they drift of each timestep, are fitted to the
+    avatar's colors first. The timesteps' parameter files are replaced, and the report says what
+    share of the images is left unexplained. Raises StgaError, and what `report` raises.
+    """
+    timesteps = open_capture(root, read_run(run).flame).timesteps
+    report(0, len(timesteps))
+    factor = _fit_scale(run, root, helpers, lambda: report(0, len(timesteps)))
+    avatar, settings, capture = _opened(run, root, factor)
+    assert capture.flame is not None
+    rows = _exposure(avatar, settings, capture)
+    parts = [
+        (run, root, factor, rows, timesteps[first : first + PART_TIMESTEPS], False)
+        for first in range(0, len(timesteps), PART_TIMESTEPS)
+    ]
+    found = helpers.map(
+        _tracked_part, parts, lambda done: report(min(done, len(timesteps)), len(timesteps)), True
+    )
+    columns = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
+    tracked = AvatarTracking(timesteps, **columns)
+    frame, torso = capture.flame.frame, torso_shapes(capture.flame.model)
+    for timestep, values, shift in zip(timesteps, tracked.parameters, tracked.shift, strict=True):
+        path = root / PARAMETERS / f"{timestep:05d}.npz"
+        arrays = {**read_npz(path), **moving_arrays(values)}  # the identity stays
+        offset = torso_offset(torso, shift, frame(timestep).dynamic_offset)
+        if offset is not None:
+            arrays["dynamic_offset"] = offset[None].astype(np.float32)
+        write_npz(path, arrays)
+    stored = read_json(root / REPORT_FILE)
+    shares = zip(timesteps, tracked.misfit.tolist(), strict=True)
+    stored["image_misfit"][AVATAR_MISFIT] = {str(t): round(share, 3) for t, share in shares}
+    write_json(root / REPORT_FILE, stored)
+    return tracked
+
+
+def _tracked_part(
+    run: Path,
+    root: Path,
+    factor: float,
+    exposure: Sequence[Sequence[float]],
+    timesteps: Sequence[int],
+    scales: bool,
+    step: Step,
+) -> dict[str, np.ndarray]:
+    avatar, settings, capture = _opened(run, root, factor)
+    settings = replace(settings, exposure=tuple(map(tuple, exposure)))
+
+    def report(done: int, total: int) -> bool:
+        if done:
+            step()
+        return False
+
+    found = track_by_avatar(avatar, settings, capture, timesteps, None, report, True, scales)
+    step()
+    names = ("parameters", "before", "after", "misfit", "shift", "scale")
+    return {name: getattr(found, name) for name in names}
+
+
+def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], None]) -> float:
+    """Scale the capture's world such that the head is as large as the avatar's; landmarks alone are
+    off by some percent. One camera does not see scale. Returns the factor."""
+    avatar, settings, capture = _opened(run, root, 1.0)
+    cameras = {view.camera_index for views in capture.views.values() for view in views}
+    if len(cameras) < 2:
+        return 1.0
+    chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
+    rows = _exposure(avatar, settings, capture)
+    parts = [(run, root, 1.0, rows, [timestep], True) for timestep in chosen]
+    found = helpers.map(_tracked_part, parts, lambda done: report(), True)
+    factor = 1 / float(np.median([part["scale"] for part in found]))
+    scaled_capture(root, read_run(run).flame, factor)
+    return factor
+
+
+def scaled_capture(root: Path, flame: Path | None, factor: float) -> None:
+    """Scale a tracked capture's world about its origin; the heads keep their size."""
+    capture = open_capture(root, flame)
+    assert capture.flame is not None
+    for name in SPLIT_FILES:
+        document = read_json(root / name)
+        for frame in document["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= factor
+        write_json(root / name, document)
+    model = capture.flame.model
+    for timestep in capture.timesteps:
+        frame = capture.flame.frame(timestep)
+        joints = joint_positions(model, shaped_vertices(model, capture.flame.shape, frame.expr))
+        arrays = read_npz(root / PARAMETERS / f"{timestep:05d}.npz")
+        moved = arrays["translation"] + (factor - 1) * (joints[ROOT] + frame.translation)
+        arrays["translation"] = moved.astype(np.float32)
+        write_npz(root / PARAMETERS / f"{timestep:05d}.npz", arrays)
+    stored = read_json(root / REPORT_FILE)
+    write_json(
+        root / REPORT_FILE, {**stored, "meters_per_unit": factor * stored["meters_per_unit"]}
+    )
+
+
+@lru_cache(1)
+def _opened(run: Path, root: Path, factor: float) -> tuple[Avatar, TrainingSettings, Capture]:
+    """Of the capture once it was scaled by the factor."""
+    stored = read_run(run)
+    capture = open_capture(root, stored.flame)
+    return read_avatar(run / AVATAR), stored.settings, capture
+
+
+def _sequence(run: Path) -> FlameSequence:
+    capture = open_refined(run)
+    if capture.flame is None:
+        raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
+    return capture.flame
+
+
+def _exposure(
+    avatar: Avatar, settings: TrainingSettings, capture: Capture
+) -> tuple[tuple[float, ...], ...]:
+    """`TrainingSettings.exposure` of a capture that the avatar was not trained on."""
+    by_camera: dict[int, list[View]] = {}
+    for view in (view for views in capture.views.values() for view in views):
+        by_camera.setdefault(view.camera_index, []).append(view)
+    rows = []
+    for camera, views in by_camera.items():
+        chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
+        pixels = [_compared(avatar, settings, capture, view) for view in chosen]
+        both = [np.concatenate(side, axis=1) for side in zip(*pixels, strict=True)]
+        usual = fitted_exposure(both[0], both[1])
+        for view, (drawn, seen) in zip(chosen, pixels, strict=True):
+            own = fitted_exposure(drawn, seen, usual, CAMERA_WEIGHT)
+            scaled = own * np.array([[1.0], [255.0]])
+            rows.append((float(camera), *scaled.ravel().tolist(), float(view.timestep)))
+    return tuple(rows)
+
+
+def _compared(
+    avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colors (3, N) in 0…1 of the avatar and of the image, on the head."""
+    levels = [round(255 * part) for part in settings.background]
+    scale = min(1.0, EXPOSURE_HEIGHT_PX / view.camera.height)
+    view, image, mask = read_view(view, scale, (levels[0], levels[1], levels[2]))
+    mesh = capture.mesh(view.timestep)
+    drawn = render_avatar(avatar, mesh, view.camera, settings.background)
+    head = silhouette(mesh, capture.faces, view.camera) > 0
+    head &= True if mask is None else mask >= MIN_COVER
+    return drawn[:, head].astype(np.float64), image[head].T / 255

@@ -1,0 +1,90 @@
+"""Footage tracked by the avatar of its person: another exposure, another size of the world."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon.avatar.file import write_avatar
+from stga_addon.capture.open import open_capture
+from stga_addon.files import read_json, write_json
+from stga_addon.training.run.folder import AVATAR, Run, write_run
+from stga_addon.training.run.recording import (
+    AVATAR_MISFIT,
+    avatar_person,
+    scaled_capture,
+    track_recording,
+)
+from stga_addon.worker.helpers import Helpers
+
+from .heads import TIMESTEPS
+from .test_avatar_tracking import lost, millimeters, person, right  # noqa: F401
+
+SCALE, GAIN, OFFSET = 1.02, 0.85, 12
+
+
+def ignore(done: int, total: int) -> None:
+    pass
+
+
+@pytest.fixture
+def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
+    """A run, and a capture that is darker and in a world that is too large."""
+    avatar, settings = person
+    run, root = tmp_path / "run", tmp_path / "recording"
+    run.mkdir()
+    shutil.copytree(lost[0].root, root)
+    write_run(run, Run(root, root / "model.npz", "vhap", settings))
+    write_avatar(run / AVATAR, avatar)
+    for path in (root / "images").iterdir():
+        image, mask = (
+            np.asarray(Image.open(path)),
+            np.asarray(Image.open(root / "fg_masks" / path.name)),
+        )
+        darker = np.where(mask[..., None] > 0, image * GAIN + OFFSET, image)
+        Image.fromarray(darker.astype(np.uint8)).save(path)
+    write_json(root / "tracking.json", {"image_misfit": {}, "meters_per_unit": 1.0})
+    scaled_capture(root, root / "model.npz", SCALE)
+    return run, root
+
+
+def test_another_recording_is_tracked(recording, lost) -> None:  # noqa: F811
+    """Catches colors of another exposure that are taken for shading of another pose, a head that
+    keeps the size that landmarks gave it, files that keep the old parameters, and identities that
+    change."""
+    run, root = recording
+    before = json.loads((root / "transforms_train.json").read_text())["frames"]
+    found = track_recording(run, root, Helpers(1), ignore)
+    after = json.loads((root / "transforms_train.json").read_text())["frames"]
+    sizes = [
+        np.linalg.norm(np.array(frame["transform_matrix"])[:3, 3])
+        for frame in (before[0], after[0])
+    ]
+    assert sizes[1] / sizes[0] == pytest.approx(1 / SCALE, abs=0.004)
+    assert read_json(root / "tracking.json")["meters_per_unit"] == pytest.approx(1, abs=0.004)
+    away = millimeters(open_capture(root, root / "model.npz"), lost[1])
+    tracked = millimeters(*lost)
+    assert np.median(away[:-1] / tracked[:-1]) < 0.4
+    misfit = read_json(root / "tracking.json")["image_misfit"][AVATAR_MISFIT]
+    assert sorted(misfit) == sorted(map(str, TIMESTEPS))
+    assert found.misfit.max() < 0.2
+
+
+def test_another_person_is_missed(recording) -> None:
+    """Catches a misfit that is small whatever the images show."""
+    run, root = recording
+    for path in (root / "images").iterdir():
+        Image.fromarray(np.asarray(Image.open(path))[..., [1, 2, 0]]).save(path)
+    assert np.median(track_recording(run, root, Helpers(1), ignore).misfit) > 0.4
+
+
+def test_the_head_is_the_avatars(recording, lost) -> None:  # noqa: F811
+    """Catches an identity or an offset that gets lost on its way into the tracker."""
+    fit, model = avatar_person(recording[0])
+    assert model == recording[1] / "model.npz"
+    np.testing.assert_allclose(fit.head.model.v_template, lost[0].neutral, atol=1e-9)
+    assert fit.head.model.n_identity == 0
+    assert len(fit.shape) == 4
