@@ -19,6 +19,7 @@ class TrackOptions:
     footage: option_property(Track, "footage")
     cameras: option_property(Track, "cameras")
     model: option_property(Track, "model", "Head Model")
+    avatar: option_property(Track, "avatar", subtype="DIR_PATH")
     directory: path_property("Capture", "Folder for the tracked capture", "DIR_PATH")
     focal: option_property(Track, "focal", "Focal Length")
     start: option_property(Track, "start")
@@ -59,7 +60,17 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        names = ("footage", "cameras", "model", "landmarks", "focal", "start", "stop", "step")
+        names = (
+            "footage",
+            "cameras",
+            "model",
+            "avatar",
+            "landmarks",
+            "focal",
+            "start",
+            "stop",
+            "step",
+        )
         given = {"model": None, **given_values(self, Track, *names)}
         out = file_path(self.directory, "capture").resolve()
         mattes = (

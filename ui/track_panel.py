@@ -32,9 +32,10 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
         if tracking.subject is not None:
             box = draw_end(layout, context, tracking)
             draw_text(box, context, tracking.snapshot.status.detail)
-        for name in ("footage", "cameras", "model", "directory"):
+        for name in ("footage", "cameras", "model", "avatar", "directory"):
             layout.prop(settings.track, name)
-        track = layout.operator(ids.TRACK_FOOTAGE, text="Track", icon="CON_FOLLOWTRACK")
+        text = "Track with Avatar" if settings.track.avatar else "Track"
+        track = layout.operator(ids.TRACK_FOOTAGE, text=text, icon="CON_FOLLOWTRACK")
         set_options(track, settings.track, TrackOptions)
         draw_missing_python(layout, context)
 

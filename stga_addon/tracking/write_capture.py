@@ -36,7 +36,7 @@ def write_capture(
 
     parameters: timestep -> (E + 18,), interpolated ones included; offsets: timestep -> (V, 3),
     where there are any. With four cameras or more, the one nearest to the middle is held out as
-    `val`. Raises StgaError where `out` cannot be written.
+    `val`; timesteps at which no camera saw a face, as behind a hand, are `test`. Raises StgaError where `out` cannot be written.
     """
     views = [view for view in footage.views() if view[0] in parameters]
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
@@ -53,7 +53,8 @@ def write_capture(
             entry["flame_param_path"] = f"{PARAMETERS}/{timestep:05d}.npz"
         else:
             entry["mesh_path"] = f"meshes/{timestep:05d}.obj"
-        splits["val" if source.name == held_out else "train"].append(entry)
+        seen = "val" if source.name == held_out else "train"
+        splits[seen if timestep in fit.parameters else "test"].append(entry)
         report("Images", number + 1, len(views))
     top: dict[str, Any] = {} if flame else {"canonical_mesh_path": "meshes/neutral.obj"}
     if footage.fps is not None:

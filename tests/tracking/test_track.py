@@ -324,7 +324,7 @@ def test_landmark_files_of_different_detectors(recorded, capsys):
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_timesteps_that_determine_no_pose_are_interpolated(tmp_path, head, capsys):
     """Catches NaN, or a head at the camera, from landmarks of one timestep that are too few to tell
-    where it is."""
+    where it is, and training on images whose head is a guess."""
     record(tmp_path, head, timesteps=8)
     places = dict(np.load(tmp_path / "points/head_model.npz"))
     places["face"][:7] = -1
@@ -339,6 +339,14 @@ def test_timesteps_that_determine_no_pose_are_interpolated(tmp_path, head, capsy
         write_npz(tmp_path / f"points/cam{camera}.npz", arrays)
     assert command(tmp_path) == 0
     assert read_json(tmp_path / "out/tracking.json")["interpolated"] == [2, 3, 4, 5, 6]
+    timesteps = {
+        split: {
+            frame["timestep_index"]
+            for frame in read_json(tmp_path / f"out/transforms_{split}.json")["frames"]
+        }
+        for split in ("train", "test")
+    }
+    assert timesteps == {"train": {0, 1, 7}, "test": {2, 3, 4, 5, 6}}
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
