@@ -124,11 +124,7 @@ def test_selection_that_came_with_the_capture_wins():
     asked: list[tuple[int, str]] = []
     given = {4: region(0, 7), 6: region()}
     chosen = select_capture(capture(given, asked), SelectionOptions(threshold=THRESHOLD))
-    assert numbers(chosen) == {
-        1: [1, 2],
-        4: [0, 7],
-        6: [],
-    }
+    assert numbers(chosen) == {1: [1, 2], 4: [0, 7], 6: []}
     assert asked == [(1, "head")]
 
 
