@@ -36,8 +36,7 @@ class DeviceError(StgaError):
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Of a program that does this work: 0, or 2 after a StgaError, whose sentence goes to
-    stderr."""
+    """Of a program that does this work: 0, or 2 after a StgaError, which goes to stderr."""
     try:
         work()
     except StgaError as error:
@@ -47,8 +46,7 @@ def exit_code(work: Callable[[], object]) -> int:
 
 
 def one_line(message: str) -> str:
-    """The message in bounded length, with control characters and lone surrogates (of a path, say)
-    as escapes."""
+    """The message in bounded length, with control characters and lone surrogates escaped."""
     return _UNPRINTABLE.sub(
         lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS)
     )

@@ -27,13 +27,11 @@ from .errors import StgaError
 MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
-MAX_UNPACKED_BYTES = 4 << 30
-"""Of an npz: a checkpoint of four million splats."""
+MAX_UNPACKED_BYTES = 4 << 30  # Of an npz: a checkpoint of four million splats
 MAX_HEADER_BYTES = 1 << 16
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
-)
-"""Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
+)  # Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial
 RENAME_PATIENCE_S, RENAME_INTERVAL_S = 5.0, 0.1
 """How long, and how often, a rename is tried again while another program has the file open, on
 Windows."""
@@ -78,7 +76,17 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
             f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
         )
         with _naming(path):
-            _make_folders(path.parent, made_folders)
+            folder = path.parent
+            missing = []
+            try:
+                while not folder.is_dir() and folder != folder.parent:
+                    missing.append(folder)
+                    folder = folder.parent
+                for name in reversed(missing):
+                    name.mkdir(exist_ok=True)
+                    made_folders.append(name)
+            except ValueError as error:  # a null character or a lone surrogate
+                raise OSError(str(error)) from error
             partials[path] = partial
             _create(partial)
             yield partial
@@ -109,8 +117,7 @@ class NumberedFiles:
     """
 
     def __init__(self, folder: Path, names: re.Pattern[str]) -> None:
-        """names: of the files, matched as a whole. Raises StgaError where the folder holds one that
-        is not listed."""
+        """Raises StgaError where the folder holds one of these names that is not listed."""
         self.folder, self._names, self._written = folder, names, dict[str, str]()
         self._list = folder / SEQUENCE_FILE
         listed = (
@@ -129,8 +136,7 @@ class NumberedFiles:
             )
 
     def add(self, name: str, content: Path) -> None:
-        """List a file before it gets its name; `content` is the complete file under a temporary
-        one."""
+        """List a file before it gets its name; `content`: the whole file, under another one."""
         with _naming(self._list), self._list.open("a") as stream:
             self._written[name] = self._line(name, content)
             stream.write(self._written[name] + "\n")
@@ -169,8 +175,7 @@ def _naming(path: Path, done: str = "written") -> Iterator[None]:
 
 
 def _once_free(action: Callable[[], None], patience_s: float) -> None:
-    """Call `action`, again and again for `patience_s` while Windows says that another program has
-    the file open."""
+    """Call `action`, again for `patience_s` while Windows says that another program has it open."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
@@ -180,20 +185,6 @@ def _once_free(action: Callable[[], None], patience_s: float) -> None:
             if not is_open or time.monotonic() >= deadline:
                 raise
             time.sleep(RENAME_INTERVAL_S)
-
-
-def _make_folders(folder: Path, made: list[Path]) -> None:
-    """Make the folder and its parents; append those that were missing to `made`. Raises OSError."""
-    missing = []
-    try:
-        while not folder.is_dir() and folder != folder.parent:
-            missing.append(folder)
-            folder = folder.parent
-        for name in reversed(missing):
-            name.mkdir(exist_ok=True)
-            made.append(name)
-    except ValueError as error:  # a null character or a lone surrogate
-        raise OSError(str(error)) from error
 
 
 def check_writable(path: Path) -> None:
@@ -221,8 +212,7 @@ def _create(partial: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that processes of this computer, killed while writing, left in the
-    folder."""
+    """Remove the temporary files that killed processes of this computer left in the folder."""
     with suppress(OSError):
         for name in os.listdir(folder):
             match = PARTIAL_NAME.fullmatch(name)
@@ -249,8 +239,7 @@ def _is_running(process: int) -> bool:
 
 
 def file_size(path: Path) -> int:
-    """Size in bytes. Raises StgaError where there is no regular file: reading a pipe or a device
-    need never end."""
+    """Size in bytes. Raises StgaError for no regular file: a pipe or a device need never end."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
@@ -263,8 +252,7 @@ def file_size(path: Path) -> int:
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """What a file holds. Raises StgaError where it is missing, no regular file or above the
-    limit."""
+    """What a file holds. Raises StgaError where it is no regular file or above the limit."""
     size = file_size(path)
     if size > limit:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
@@ -275,14 +263,12 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing, malformed or
-    above 256 MiB."""
+    """Parse a UTF-8 JSON file of up to 256 MiB. Raises StgaError naming the file."""
     return _parsed(path, "JSON", MAX_JSON_BYTES, parse_json)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Parse a TOML file. Raises StgaError naming the file where it is missing, malformed or above
-    16 MiB."""
+    """Parse a TOML file of up to 16 MiB. Raises StgaError naming the file."""
     found: dict[str, Any] = _parsed(
         path, "TOML", MAX_TOML_BYTES, lambda data: tomllib.loads(data.decode("utf-8"))
     )
@@ -298,8 +284,7 @@ def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) ->
 
 
 def parse_json(data: bytes) -> Any:
-    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds text that nothing can
-    print."""
+    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds lone surrogates."""
     value = json.loads(data.decode("utf-8"))
     if b"\\u" in data:  # the only way to write a lone surrogate
         json.dumps(value, ensure_ascii=False).encode("utf-8")
@@ -343,8 +328,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read the array of a npy file without pickle. Raises StgaError naming the file, as `read_npz`
-    does."""
+    """Read the array of a npy file without pickle. Raises StgaError as `read_npz` does."""
     size = file_size(path)
     try:
         with path.open("rb") as stream:
@@ -367,8 +351,7 @@ def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
 
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
-    """The array of a npy stream of `size` bytes; numpy alone would allocate whatever the header
-    promises."""
+    """The array of a npy stream of `size` bytes, which bounds what its header promises."""
     start = stream.read(12).ljust(12, b"\0")
     length = struct.unpack("<H" if start[6] == 1 else "<L", start[8 : 10 if start[6] == 1 else 12])[
         0

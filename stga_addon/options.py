@@ -1,5 +1,4 @@
-"""Fields of dataclasses as options: of the command line here, of Blender's operators in
-`operators/options.py`."""
+"""Fields of dataclasses as options: of the command line; of Blender in `operators/options.py`."""
 
 import dataclasses
 import errno
@@ -17,8 +16,7 @@ from .schema import alternatives, expectation, setting, type_hints
 
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
-MAX_DIGITS = 18
-"""Of a whole number on the command line, which fits 64 bits."""
+MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
 
 
 def option(
@@ -96,7 +94,8 @@ def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] =
             continue
         if asked["group"] not in groups:
             groups[asked["group"]] = parser.add_mutually_exclusive_group()
-        is_required = not _has_default(spec) and spec.name not in may_lack
+        has_default = {spec.default, spec.default_factory} != {dataclasses.MISSING}
+        is_required = not has_default and spec.name not in may_lack
         form = {"help": _help(spec), "default": None, **_form(spec, hint, is_required)}
         groups[asked["group"]].add_argument(*form.pop("names"), **form)
 
@@ -125,12 +124,6 @@ def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
         return {**form, "choices": tuple(asked["offered"])}
     form["type"] = _parser(get_args(kind)[0] if several else kind, asked)
     return {**form, "metavar": asked["metavar"]} if asked["metavar"] else form
-
-
-def _has_default(spec: Any) -> bool:
-    return (
-        spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
-    )
 
 
 def _help(spec: Any) -> str:
@@ -168,8 +161,7 @@ def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
 
 
 def refuse_useless(value: Any) -> None:
-    """Raise StgaError for the first option of a dataclass that has no effect without another
-    (`needs`)."""
+    """Raise StgaError for the first option without effect, by its `needs`."""
     specs = {spec.name: spec for spec in dataclasses.fields(value)}
     for spec in option_fields(type(value)):
         for needed in spec.metadata["needs"] if _is_changed(value, spec) else ():
@@ -287,5 +279,4 @@ _CONVERSIONS: dict[Any, Callable[[str], Any]] = {
     float: _number,
     tuple[int, int]: frame_span,
     tuple[float, float, float]: color,
-}
-"""Type of a field -> what reads its values; what it cannot read, `schema.expectation` refuses."""
+}  # Type of a field -> what reads its values; what it cannot read, `schema.expectation` refuses

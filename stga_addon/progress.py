@@ -12,8 +12,7 @@ import numpy as np
 
 Item = TypeVar("Item")
 
-PACE_SHARE = 0.1
-"""Share of the work, the last that was done, whose pace says how much time is left."""
+PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
 MAX_STEP_SHARE = 0.03
 """Of the work in a step, beyond which it was done before, by what was interrupted, and says nothing
 of the pace."""
@@ -41,8 +40,7 @@ class Progress:
 
 Report = Callable[[Progress], bool]
 """Called now and then; returns True to stop and keep what there is."""
-Say = Callable[[str], None]
-"""Called with a line for people."""
+Say = Callable[[str], None]  # Called with a line for people
 
 
 class TimeLeft:

@@ -1,5 +1,4 @@
-"""What is shown of a run: the lines of its summary, and its accuracy curve by matplotlib and, for
-Blender, by numpy."""
+"""What is shown of a run: its summary, and its curve by matplotlib and, for Blender, by numpy."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -64,8 +63,7 @@ class CurveUpdater:
 
 
 def write_curve(folder: Path) -> None:
-    """Write curve.png of the run in `folder`, if there is an evaluation to draw and matplotlib to
-    draw it."""
+    """Write curve.png of the run in `folder`, with an evaluation to draw and matplotlib."""
     metrics = read_metrics(folder)
     if curve_of(metrics) and find_spec("matplotlib") is not None:
         with replacing(folder / CURVE) as partial:
@@ -93,8 +91,7 @@ def report_run(folder: Path) -> list[str]:
 
 
 def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
-    """Lines on accuracy, the target (dB), checked forecasts, and the cost of evaluation and
-    memory."""
+    """Lines on accuracy, target (dB), checked forecasts, and cost of evaluation and memory."""
     if not metrics:
         return []
     lines, curve, last = [], curve_of(metrics), metrics[-1]
@@ -131,38 +128,25 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
 
 
 def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Lines on the accuracy of the avatar before and after, by region and group of held-out
-    views."""
+    """Lines on the accuracy before and after, by region and group of held-out views."""
     if not metrics:
         return []
     first, last = metrics[0], metrics[-1]
     lines = [f"splats: {first['splats']} before, {last['splats']} after"]
-    for name, label in _labels(first).items():
+    fitted = " (exposure fitted)" if UNMATCHED in first else ""
+    all_views = {"psnr": f"held-out views{fitted}"}
+    all_views[UNMATCHED] = "held-out views (exposure not fitted)"
+    parts = [name for name in first if name.startswith("psnr_") and name != UNMATCHED]
+    for name in (*(name for name in all_views if name in first), *parts):
+        label = all_views.get(name, name.removeprefix("psnr_").replace("_", " ") + fitted)
         before, after = first[name], last.get(name, math.nan)
-        lines.append(
-            f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})"
-        )
+        change = f"{before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})"
+        lines.append(f"{label}: {change}")
     return lines
 
 
-def _labels(line: Mapping[str, Any]) -> dict[str, str]:
-    """Each PSNR of a metrics line -> what it is called: of all held-out views, then by region and
-    group."""
-    fitted = " (exposure fitted)" if UNMATCHED in line else ""
-    labels = {name: f"held-out views{fitted}" for name in ("psnr",) if name in line}
-    if UNMATCHED in line:
-        labels[UNMATCHED] = "held-out views (exposure not fitted)"
-    parts = [
-        name.removeprefix("psnr_")
-        for name in line
-        if name.startswith("psnr_") and name != UNMATCHED
-    ]
-    return {**labels, **{f"psnr_{part}": part.replace("_", " ") + fitted for part in parts}}
-
-
 def evaluation_share(lines: Sequence[Mapping[str, Any]]) -> float:
-    """Seconds of evaluation during training over seconds of training; the final evaluation does not
-    count."""
+    """Seconds of evaluation during training, the final one left out, over those of training."""
     spent: float = sum(line["evaluation_s"] for line in lines[:-1])
     return spent / max(float(lines[-1]["seconds"]), 1e-9)
 
@@ -221,8 +205,7 @@ def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
 
 
 def finish_axes(axes: "Axes") -> None:
-    """Add the legend and cut off the steep start: the axis begins at the lowest value after a tenth
-    of the time."""
+    """Add the legend and cut off the steep start, at the lowest value after a tenth of the time."""
     curves = [np.asarray(line.get_xydata()).T for line in axes.lines]
     curves = [curve for curve in curves if curve.size]
     if not curves:
@@ -237,14 +220,12 @@ def finish_axes(axes: "Axes") -> None:
 
 # The curve in Blender's panel: its Python need not have matplotlib or Pillow
 
-SIZE = 256
-"""Width and height in pixels: Blender's icons are square."""
+SIZE = 256  # Width and height in pixels: Blender's icons are square
 MARGIN = 6.0
 LINE_WIDTH = 3.0
 BACKGROUND_COLOR, GRID_COLOR = (0.11, 0.11, 0.11), (0.25, 0.25, 0.25)
 CURVE_COLOR, FORECAST_COLOR, DETAIL_COLOR = (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45)
-BAND_OPACITY = 0.35
-"""Of the band that shows a forecast's error."""
+BAND_OPACITY = 0.35  # Of the band that shows a forecast's error
 GRID_STEPS_DB = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """The first step is used that gives at most MAX_GRID_STEPS."""
 MAX_GRID_STEPS = 6
@@ -292,8 +273,7 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
 def _draw_detail(
     plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]
 ) -> str:
-    """Draw the detail difference, scaled to the height in dB from a tenth of the time on; returns
-    its range as text."""
+    """Draw the detail difference, scaled to the height in dB; returns its range as text."""
     seconds, detail = np.array(detail_curve(lines), np.float64).reshape(-1, 2).T
     if len(detail) < 2:
         return ""
@@ -317,8 +297,7 @@ class _Plot:
         self.pixels[self._rows(y).astype(int), :, :3] = GRID_COLOR
 
     def line(self, x: np.ndarray, y: np.ndarray, color: Color) -> None:
-        """Antialiased by the distance of each pixel's center to the line segment in the pixel's
-        column."""
+        """Antialiased by the distance of pixels' centers to the segment in their column."""
         seconds, inside = self._columns(x)
         height = np.interp(seconds, x, self._rows(y))
         slope = np.gradient(height)

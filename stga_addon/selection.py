@@ -1,5 +1,4 @@
-"""Selection of the triangles that move in a timestep, whose splats it trains (STGA, selective
-training)."""
+"""Selection of the triangles that move in a timestep, whose splats it trains."""
 
 import math
 from collections.abc import Mapping
@@ -70,8 +69,7 @@ def select_faces(
 
 
 def select_capture(capture: Capture, options: SelectionOptions) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool for every timestep; a selection that comes with the capture takes
-    precedence."""
+    """timestep -> (F,) bool of every timestep; a capture's own selection takes precedence."""
     regions = {name: capture.regions[name] for name in options.regions if name in capture.regions}
     chosen = {}
     for timestep in capture.timesteps:

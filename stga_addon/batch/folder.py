@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator, Set
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from filelock import SoftFileLease
@@ -184,33 +185,23 @@ def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
     record, moved = read_record(job), None
     if record is not None and record.digest != digest:
         prepare_status_folder(job.request_folder)  # raises while a worker is running
-        moved, record = _move_aside(job.folder), None
+        kept, name = job.folder.parent / REPLACED, job.folder.name
+        names = (name if n == 1 else f"{name}_{n}" for n in count(1))
+        moved, record = next(kept / name for name in names if not (kept / name).exists()), None
+        try:
+            kept.mkdir(exist_ok=True)
+            job.folder.rename(moved)
+        except OSError as error:
+            reason = f"cannot be moved to {moved} ({error.strerror or error})"
+            raise StgaError(f"{job.folder}: {reason}") from error
     if record is None:
-        if job.folder.is_dir() and any(
-            path.name != job.request_folder.name for path in job.folder.iterdir()
-        ):
-            raise StgaError(
-                f"{job.folder}: holds files that no job of a batch wrote; choose another 'out'"
-            )
+        held = job.folder.iterdir() if job.folder.is_dir() else ()
+        if any(path.name != job.request_folder.name for path in held):
+            foreign = "holds files that no job of a batch wrote; choose another 'out'"
+            raise StgaError(f"{job.folder}: {foreign}")
         write_record(job, JobRecord(digest, forecast_s))
     if record is None or not has_request(job.request_folder):
         write_request(job.request_folder, job.request)
     else:
         prepare_status_folder(job.request_folder)
     return moved
-
-
-def _move_aside(folder: Path) -> Path:
-    """Move a job's folder to the first free name in the batch's folder REPLACED."""
-    target, number = folder.parent / REPLACED / folder.name, 1
-    while target.exists():
-        number += 1
-        target = folder.parent / REPLACED / f"{folder.name}_{number}"
-    try:
-        target.parent.mkdir(exist_ok=True)
-        folder.rename(target)
-    except OSError as error:
-        raise StgaError(
-            f"{folder}: cannot be moved to {target} ({error.strerror or error})"
-        ) from error
-    return target

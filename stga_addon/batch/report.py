@@ -1,5 +1,4 @@
-"""What is shown of a batch: the live table, the table of what a plan asks for, and the report, one
-HTML file."""
+"""What is shown of a batch: the live table, the table of a plan, and the report, an HTML file."""
 
 import base64
 import html
@@ -22,15 +21,13 @@ from ..training.run.metrics_log import read_metrics
 from ..worker.status import log_lines
 from .run import Batch, Entry, JobState
 
-MAX_LIVE_ROWS = 20
-"""Jobs that the live table shows: the running ones, then those that failed."""
+MAX_LIVE_ROWS = 20  # Jobs that the live table shows: the running ones, then those that failed
 BAR_WIDTH = 20
 CLEAR_LINE, UP = "\x1b[2K", "\x1b[{}A"
 
 
 class LiveTable:
-    """Shows a batch on a stream: on a terminal a table that is drawn over, else a line for each
-    event."""
+    """Shows a batch: on a terminal a table that is drawn over, else a line for each event."""
 
     def __init__(self, stream: TextIO, width: int = 100) -> None:
         self._stream, self._width = stream, width
@@ -86,8 +83,7 @@ def summary_line(batch: Batch) -> str:
 
 
 def seconds_left(entries: Iterable[Entry]) -> float | None:
-    """Seconds until the batch is done, if as many jobs run at once as now; None where that is
-    unknown."""
+    """Seconds until the batch is done, if as many jobs run at once as now; None: unknown."""
     open_ones = [entry for entry in entries if not entry.state.is_over]
     each = [entry.left_s for entry in open_ones]
     known = [seconds for seconds in each if seconds is not None]
@@ -177,9 +173,13 @@ Run = tuple[Entry, list[dict[str, Any]]]
 
 
 def write_report(batch: Batch) -> Path:
-    """Write report.html into the batch's folder and return its path. Raises StgaError where it
-    cannot be written."""
-    runs = _runs(batch)
+    """Write report.html into the batch's folder; returns its path. Raises StgaError."""
+    found: list[Run] = []
+    for entry in batch.entries.values():
+        if entry.state.is_done and has_run(entry.job.folder):
+            with suppress(StgaError):
+                found.append((entry, read_metrics(entry.job.folder)))
+    runs = sorted(found, key=lambda run: _figures(run).get("psnr", -np.inf))
     parts = [_summary(batch), _failures(batch), _chart(runs), _pictures(runs), _table(batch, runs)]
     title = html.escape(batch.plan.out.name)
     head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
@@ -189,16 +189,6 @@ def write_report(batch: Batch) -> Path:
             f"{head}<h1>Batch {title}</h1>{''.join(parts)}</html>\n", encoding="utf-8"
         )
     return path
-
-
-def _runs(batch: Batch) -> list[Run]:
-    """The finished trainings, from the lowest PSNR to the highest."""
-    found: list[Run] = []
-    for entry in batch.entries.values():
-        if entry.state.is_done and has_run(entry.job.folder):
-            with suppress(StgaError):
-                found.append((entry, read_metrics(entry.job.folder)))
-    return sorted(found, key=lambda run: _figures(run).get("psnr", -np.inf))
 
 
 def _figures(run: Run) -> dict[str, Any]:
@@ -235,8 +225,7 @@ def _summary(batch: Batch) -> str:
 
 
 def _forecast_error(entry: Entry) -> float | None:
-    """By how much a finished job took longer than expected, as a share of that; None where nothing
-    was expected."""
+    """How much longer a finished job took than expected, as a share; None: not expected."""
     if not (entry.state.is_done and entry.forecast_s and entry.seconds):
         return None
     return entry.seconds / entry.forecast_s - 1
@@ -276,25 +265,25 @@ def _chart(runs: Sequence[Run]) -> str:
 
 
 def _pictures(runs: Sequence[Run]) -> str:
-    """A held-out image of each run beside its avatar, where its capture has one and can be opened
-    here."""
+    """A held-out image of each run beside its avatar, where its capture has one here."""
     shown = []
     for entry, metrics in _spread(runs, MAX_PICTURES):
         with suppress(StgaError, ModuleNotFoundError):
             pair, figures = held_out_pair(entry.job.folder), _figures((entry, metrics))
             if pair is not None:
+                from PIL import Image
+
                 psnr = f", {figures['psnr']:.2f} dB" if "psnr" in figures else ""
-                data, name = (
-                    base64.b64encode(_jpeg(pair)).decode("ascii"),
-                    html.escape(entry.job.name),
-                )
-                image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="data:image/jpeg;base64,{data}">'
+                picture, out = Image.fromarray(pair), io.BytesIO()
+                height = min(2 * PICTURE_HEIGHT_PX, picture.height)
+                picture = picture.resize((round(picture.width * height / picture.height), height))
+                picture.save(out, "JPEG", quality=JPEG_QUALITY)
+                source = f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
+                name = html.escape(entry.job.name)
+                image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="{source}">'
                 shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
-    return (
-        f"<h2>Held-out views: image and avatar, from the lowest PSNR</h2>{''.join(shown)}"
-        if shown
-        else ""
-    )
+    title = "<h2>Held-out views: image and avatar, from the lowest PSNR</h2>"
+    return title + "".join(shown) if shown else ""
 
 
 def held_out_pair(run: Path) -> np.ndarray | None:
@@ -319,16 +308,6 @@ def held_out_pair(run: Path) -> np.ndarray | None:
     rendered = render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
     pixels = np.round(255 * np.clip(rendered, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
     return np.hstack([image, pixels])
-
-
-def _jpeg(image: np.ndarray) -> bytes:
-    from PIL import Image
-
-    picture, out = Image.fromarray(image), io.BytesIO()
-    height = min(2 * PICTURE_HEIGHT_PX, picture.height)
-    picture = picture.resize((round(picture.width * height / picture.height), height))
-    picture.save(out, "JPEG", quality=JPEG_QUALITY)
-    return out.getvalue()
 
 
 def _table(batch: Batch, runs: Iterable[Run]) -> str:

@@ -17,13 +17,10 @@ from ..worker.status import WorkerState, WorkerStatus, read_status, request_canc
 from .folder import is_done, is_running, job_digests, prepare, read_record, write_record
 from .plan import Engine, Job, Plan
 
-MAX_RETRIES = 5
-"""How often a job whose worker was killed is tried again in one start of a batch."""
+MAX_RETRIES = 5  # How often a job whose worker was killed is tried again in one start of a batch
 SHOW_INTERVAL_S = 1.0
-MAX_BEGUN = 64
-"""Jobs that are begun before the next look at what has ended."""
-MAX_MISSES = 50
-"""Jobs that are asked for in vain, in a row, before the next look at what has ended."""
+MAX_BEGUN = 64  # Jobs that are begun before the next look at what has ended
+MAX_MISSES = 50  # Jobs that are asked for in vain, in a row, before the next look at what has ended
 Say = Callable[[str], None]
 
 
@@ -68,8 +65,7 @@ class Entry:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until it is finished, from its share done, else from its forecast; None:
-        unknown."""
+        """Seconds until it is finished, by its share done, else by its forecast; None: unknown."""
         if self.state.is_over:
             return 0.0
         spent = self.status.seconds if self.state == JobState.RUNNING else 0.0
@@ -91,7 +87,11 @@ class Batch:
             kept = all(self.entries[other].state.is_done for other in entry.job.after)
             if kept and is_done(entry.job, entry.digest):
                 entry.state = JobState.KEPT
-                self._recall(entry)
+                record = read_record(entry.job)
+                entry.status = read_status(entry.job.request_folder) or entry.status
+                if record is not None:
+                    entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
+                    entry.machine = record.machine or entry.status.machine
 
     @property
     def unfinished(self) -> list[Job]:
@@ -104,14 +104,6 @@ class Batch:
     @property
     def failures(self) -> list[Entry]:
         return [e for e in self.entries.values() if e.state in (JobState.FAILED, JobState.BLOCKED)]
-
-    def _recall(self, entry: Entry) -> None:
-        """Read what earlier starts of the batch left."""
-        record = read_record(entry.job)
-        entry.status = read_status(entry.job.request_folder) or entry.status
-        if record is not None:
-            entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
-            entry.machine = record.machine or entry.status.machine
 
     def set_forecasts(self, seconds: Mapping[str, float]) -> None:
         for name, expected in seconds.items():
@@ -330,8 +322,7 @@ class _Loop:
         self._say(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
 
     def _look(self, now: bool = False) -> None:
-        """Read the status of the running jobs, and show the batch, at most every
-        SHOW_INTERVAL_S."""
+        """Read the status of running jobs, and show the batch, at most every SHOW_INTERVAL_S."""
         if not now and time.monotonic() - self._shown_s < SHOW_INTERVAL_S:
             return
         for name, machine in self._engine.running().items():
@@ -377,11 +368,7 @@ def _corrected(stated: float | None, taken: Sequence[tuple[float, float | None]]
 
 
 def _stated(job: Job, paces: list[float]) -> float | None:
-    """Seconds by the plan: what it says, the budget of a training, or the time that its iterations
-    take.
-
-    paces: seconds of an iteration, once it is measured.
-    """
+    """Seconds by the plan, a training's budget, or its iterations and their `paces`."""
     request = job.request
     if job.minutes is not None:
         return 60 * job.minutes
@@ -400,8 +387,7 @@ def _stated(job: Job, paces: list[float]) -> float | None:
 
 
 def pace(job: Job, request: Train) -> float | None:
-    """Seconds per iteration of a training on this machine, measured; None where its capture is not
-    there yet, cannot be trained on, or training is not installed here."""
+    """Measured seconds per iteration of a training here; None where it cannot be trained yet."""
     if find_spec("torch") is None or find_spec("numba") is None or not request.capture.is_dir():
         return None
     from ..capture.open import open_capture

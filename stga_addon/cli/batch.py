@@ -64,14 +64,23 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:
-        _print_commands(plan)
+        from ..batch.folder import hold_folder, prepare
+        from ..batch.plan import job_command
+        from ..batch.run import Batch
+
+        with hold_folder(plan.out):
+            batch = Batch(plan)
+            for job in batch.unfinished:
+                prepare(job, batch.entries[job.name].digest, 0.0)
+                command = ["env", f"PYTHONPATH={PACKAGES_FOLDER}", *job_command(job)]
+                waits = [name for name in job.after if not batch.entries[name].state.is_over]
+                print(shlex.join(command) + (f"  # after {' '.join(waits)}" if waits else ""))
     else:
         carry_out_plan(plan, chosen.engine, chosen.address)
 
 
 def batch_plan(options: Namespace) -> Plan:
-    """Raises StgaError for a mistake in the plan, and for options that would have no effect with
-    one."""
+    """Raises StgaError for a mistake in the plan, and for options without effect on one."""
     given = given_options(options, BatchOptions)
     sources = given.pop("sources")
     given.pop("commands", None)
@@ -122,22 +131,6 @@ def print_plan(plan: Plan) -> None:
     batch = Batch(plan)
     batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
     print("\n".join(plan_lines(batch, processors())))
-
-
-def _print_commands(plan: Plan) -> None:
-    """Prepare the folders of the jobs that are not finished, and print a shell command for each in
-    an order in which they can be done. Raises StgaError where a worker is running in a folder."""
-    from ..batch.folder import hold_folder, prepare
-    from ..batch.plan import job_command
-    from ..batch.run import Batch
-
-    with hold_folder(plan.out):
-        batch = Batch(plan)
-        for job in batch.unfinished:
-            prepare(job, batch.entries[job.name].digest, 0.0)
-            command = ["env", f"PYTHONPATH={PACKAGES_FOLDER}", *job_command(job)]
-            waits = [name for name in job.after if not batch.entries[name].state.is_over]
-            print(shlex.join(command) + (f"  # after {' '.join(waits)}" if waits else ""))
 
 
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:

@@ -19,13 +19,11 @@ if TYPE_CHECKING:
 LAYOUT, LAYOUT_WITH_TIME_LEFT = (
     "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}",
     "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
-)
-"""Of work that says itself how much time is left, and of other work."""
+)  # Of work that says itself how much time is left, and of other work
 
 
 def carry_out(request: Request, with_bar: bool = True) -> Result:
-    """Carry out the request, with a progress bar if it takes long, and print what it says. Raises
-    as `perform` does."""
+    """Carry out the request with a progress bar, and print what it says; raises as `perform`."""
     from ..jobs.perform import perform
 
     with ProgressBar() as bar:
@@ -46,8 +44,7 @@ def carry_out_selection(request: Select | SelectForTake, path: Path | None) -> N
 
 
 class ProgressBar:
-    """A bar over the share of the work on stderr, with its stage and figures; what is said or
-    logged goes above it."""
+    """A bar on stderr with stage and figures; what is said or logged goes above it."""
 
     def __enter__(self) -> "ProgressBar":
         self._bar: tqdm[Any] | None = None

@@ -1,5 +1,4 @@
-"""The commands: for each the dataclasses whose fields are its options, and what it does with
-them."""
+"""The commands: the dataclasses whose fields are their options, and what they do with them."""
 
 import json
 import os
@@ -39,8 +38,7 @@ from .batch import BatchOptions, EngineOptions, run_batch_command
 from .carry_out import ProgressBar, carry_out
 
 BLEND = "avatar.blend"
-TRAIN_SECONDS, REFINE_SECONDS, EXTEND_SECONDS = 120.0, 20.0, 60.0
-"""Budgets where none is given."""
+TRAIN_SECONDS, REFINE_SECONDS, EXTEND_SECONDS = 120.0, 20.0, 60.0  # Budgets where none is given
 
 
 @dataclass(frozen=True)
@@ -123,8 +121,7 @@ def _train(options: Namespace, head: OpenHead | None) -> None:
 
 
 def _settings(options: Namespace) -> TrainingSettings:
-    """The settings of a new run. Raises StgaError for options that do not go together, or would
-    have no effect."""
+    """The settings of a new run. Raises StgaError for options that do not go together."""
     given = given_options(options, TrainingSettings)
     paper, other_method = (
         given.get("schedule") == "paper",
@@ -291,8 +288,7 @@ class SelectOutput:
 
 
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
-    """Carry out the request, and write timestep -> triangles into an .npz file where there is a
-    path."""
+    """Carry out the request; write timestep -> triangles into an .npz where asked to."""
     found = carry_out(request, with_bar=False)
     assert isinstance(found, Selected)
     if path is not None:

@@ -1,5 +1,4 @@
-"""Entry point of the command line: `python -m stga_addon …` and `blender --background … --command
-stga …`."""
+"""The command line: `python -m stga_addon …` and `blender --background … --command stga …`."""
 
 import argparse
 import gc
@@ -66,19 +65,14 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
     except RecursionError:
         return _fail(f"'{command}': its input is nested too deeply")
     except KeyboardInterrupt as error:
-        _forget(error)
+        # without what destructors of objects that were half made say
+        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+        error.__traceback__ = error.__context__ = None
+        gc.collect()  # frames that refer to themselves
+        sys.unraisablehook = hook
         _fail("interrupted")
         return 130
     return 0
-
-
-def _forget(error: BaseException) -> None:
-    """Drop what an interruption left unfinished, without what destructors of objects that were half
-    made say."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    error.__traceback__ = error.__context__ = None
-    gc.collect()  # frames that refer to themselves
-    sys.unraisablehook = hook
 
 
 def _fail(message: str) -> int:

@@ -1,5 +1,4 @@
-"""Standard streams that never raise: closed ones, closed pipes, full devices and ASCII-only
-encodings."""
+"""Standard streams that never raise: closed, full, broken pipes, ASCII-only encodings."""
 
 import io
 import os
@@ -35,7 +34,11 @@ def safe_streams() -> Iterator[Output | None]:
     (by tests, by Blender's console) are left alone, and None is yielded. What the process was
     started with comes back at the end.
     """
-    _reserve_descriptors()
+    for descriptor in range(3):  # closed ones: no file of ours gets them, written by C code
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gives the lowest free one
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = _safe(sys.stdout, sys.__stdout__), _safe(sys.stderr, sys.__stderr__)
     replaced = sys.stdout is not before[0]
@@ -45,16 +48,6 @@ def safe_streams() -> Iterator[Output | None]:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         sys.stdout, sys.stderr = before
-
-
-def _reserve_descriptors() -> None:
-    """Open closed descriptors 0 to 2 on the null device, so that no file of ours gets one and is
-    written by C code."""
-    for descriptor in range(3):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gives the lowest free one
 
 
 def _safe(stream: Any, original: Any) -> Any:

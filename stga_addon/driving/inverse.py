@@ -15,11 +15,9 @@ from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
 from .shapes import JAW_OPEN, MOUTH_CLOSE
 
 MAX_SWEEPS = 60
-CONVERGED = 1e-5
-"""Largest change of a weight in a sweep, below which the descent stops."""
+CONVERGED = 1e-5  # Largest change of a weight in a sweep, below which the descent stops
 NEWTON_STEPS, STEP_SHARES = 12, (1.0, 0.5, 0.2, 0.05, 0.0)
-CHUNK = 256
-"""Rows whose matrices are held at once."""
+CHUNK = 256  # Rows whose matrices are held at once
 RIDGE = 1e-9
 """Share of the mean squared displacement that keeps weights apart which this head cannot tell
 apart."""
@@ -130,8 +128,7 @@ def _descended(
 def _polished(
     matrices: np.ndarray, right: np.ndarray, weights: np.ndarray, limits: np.ndarray
 ) -> np.ndarray:
-    """Minimizers from 0 to `limits` of ½ wᵀGw − rᵀw near weights (T, K), by projected Newton steps
-    (Bertsekas 1982)."""
+    """The minimizers near weights (T, K), by projected Newton steps (Bertsekas 1982)."""
 
     def value(w: np.ndarray) -> np.ndarray:
         return np.asarray((w * (0.5 * np.einsum("tjk,tk->tj", matrices, w) - right)).sum(axis=1))

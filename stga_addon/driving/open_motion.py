@@ -1,5 +1,4 @@
-"""The one place where a file becomes the motion of a head: FLAME parameters, captures and ARKit
-performances."""
+"""A file as the motion of a head: FLAME parameters, captures and ARKit performances."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -61,8 +60,7 @@ class TrainedRange:
     first: dict[str, np.ndarray]
 
     def neutral(self, choice: str) -> dict[str, np.ndarray]:
-        """The face on which a motion is put that is relative to another neutral, one of `NEUTRALS`
-        but "none"."""
+        """The face of one of `NEUTRALS` but "none", on which a relative motion is put."""
         return self.first if choice == "first" else self.quiet
 
 
@@ -102,13 +100,6 @@ def quiet_weights(performance: Performance) -> np.ndarray:
     return np.asarray(
         np.median(performance.weights[order[: max(1, round(QUIET_SHARE * len(order)))]], axis=0)
     )
-
-
-def chosen_neutral(where: str, choice: str) -> str:
-    """The choice. Raises StgaError where it is none of `NEUTRALS`."""
-    if choice not in NEUTRALS:
-        raise StgaError(f"{where}: neutral is {choice!r}, expected one of {', '.join(NEUTRALS)}")
-    return choice
 
 
 def exchanged_neutral(
@@ -169,8 +160,7 @@ MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
 
 
 def parsed_gain(text: str) -> tuple[str, float]:
-    """Name and factor of `jawOpen=0.8`, a key and value of `MotionOptions.gains`. Raises StgaError
-    for other text."""
+    """Name and factor of `jawOpen=0.8`, for `MotionOptions.gains`. Raises StgaError."""
     name, _, number = text.partition("=")
     if name not in (*PARTS, "head", *ARKIT_SHAPES):
         raise StgaError(f"'{name}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
@@ -261,7 +251,9 @@ def open_motion(
     Raises StgaError where the file is no motion, or its model has other triangles.
     """
     options = options or MotionOptions()
-    chosen_neutral(str(path), options.neutral)
+    if options.neutral not in NEUTRALS:
+        known = ", ".join(NEUTRALS)
+        raise StgaError(f"{path}: neutral is {options.neutral!r}, expected one of {known}")
     if is_performance(path):
         model = flame_model(flame)
         if flame is None and len(model.faces) != len(faces):
@@ -300,8 +292,7 @@ def performed(
     trained: TrainedRange | None = None,
     fps: float | None = None,
 ) -> Motion:
-    """A performance on a person's head: one timestep per 1/fps seconds, from 0 on. `name` is what
-    errors call it."""
+    """A performance on a person's head, a timestep per 1/fps seconds; `name` is for errors."""
     # `frames_of` applies it
     prepared = prepared_performance(performance, replace(options, strength=1.0), fps)
     frames, beyond = frames_of(head_map(person, name), prepared, options, trained)
@@ -324,8 +315,7 @@ def adapted(
 def prepared_performance(
     performance: Performance, options: MotionOptions, fps: float | None = None
 ) -> Performance:
-    """The performance at an even rate, relative to its neutral face, smoothed, amplified, mirrored,
-    at the strength."""
+    """Evenly sampled, relative to its neutral, smoothed, `corrected`, at the strength."""
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
         raise StgaError(
             f"a performance cannot be resampled to {fps:g} frames per second, expected {MIN_FPS:g} to {MAX_FPS:g}"
@@ -349,8 +339,7 @@ def prepared_performance(
 def corrected(
     performance: Performance, options: MotionOptions, rest: Performance | None = None
 ) -> Performance:
-    """The performance row by row: with the sender's exchanged pairs put right, relative to the face
-    of `rest` (None: as it is), amplified and mirrored."""
+    """With exchanged pairs put right, relative to the face of `rest`, amplified and mirrored."""
     changed = exchanged_sides(performance, options.exchange)
     if rest is not None:
         changed = relative_to(changed, exchanged_sides(rest, options.exchange))
@@ -359,8 +348,7 @@ def corrected(
 
 
 def at_strength(performance: Performance, options: MotionOptions) -> Performance:
-    """Weights and head rotation times the strength, for what has no FLAME parameters, which
-    `frames_of` strengthens."""
+    """Weights and head rotation times the strength, for what has no FLAME parameters."""
     return amplified(performance, dict.fromkeys((*PARTS, "head"), options.strength))
 
 
@@ -379,8 +367,7 @@ def frames_of(
 def _finished(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """The frames on the head's own neutral, where they are relative to the performer's; at the
-    strength, led back, and how far they were outside the trained range before that."""
+    """The frames on the head's neutral, at the strength, led back; how far they were outside."""
     if options.neutral != "none" and trained is not None:
         frames = exchanged_neutral(frames, None, trained.neutral(options.neutral))
     if options.strength != 1.0:

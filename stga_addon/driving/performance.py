@@ -21,14 +21,11 @@ ARKIT_SHAPES = (
 )  # fmt: skip
 """In the order of Live Link Face's CSV files."""
 COUNT = len(ARKIT_SHAPES)
-MAX_WEIGHT = 10.0
-"""Beyond it, weights of shapes are in percent, or are no weights."""
+MAX_WEIGHT = 10.0  # Beyond it, weights of shapes are in percent, or are no weights
 COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}
-OPTIONAL = ("tongueOut",)
-"""Shapes that sources of 51 lack; they stay zero."""
+OPTIONAL = ("tongueOut",)  # Shapes that sources of 51 lack; they stay zero
 PARTS = ("face", "jaw", "eyes")
-MAX_NAMED = 8
-"""Names that an error lists."""
+MAX_NAMED = 8  # Names that an error lists
 _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
 
 
@@ -83,8 +80,7 @@ def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
 
 
 def _unknown(names: list[str]) -> str:
-    """What stands there instead of the missing names, if anything does: mistyped names, most
-    likely."""
+    """What stands there instead of the missing names: mistyped names, most likely."""
     prefixes = ("eye", "jaw", "mouth", "brow", "cheek", "nose", "tongue")
     rotations = re.compile(
         r"(left|right)?(eye|head)(yaw|pitch|roll)|(left|right)eye(yaw|pitch|roll)"
@@ -103,10 +99,8 @@ MIRROR = np.array([COLUMN[mirrored_name(name)] for name in ARKIT_SHAPES])
 EXCHANGEABLE = ("jaw", "mouth")
 """Pairs of shapes, such as mouthLeft and mouthRight, which receivers report as exchanged by some
 senders."""
-GAP = 1.5
-"""Rows farther apart than this many frames have lost some between them."""
-SMOOTHING_REACH = 3.0
-"""Standard deviations of the smoothing kernel that are summed."""
+GAP = 1.5  # Rows farther apart than this many frames have lost some between them
+SMOOTHING_REACH = 3.0  # Standard deviations of the smoothing kernel that are summed
 
 
 @dataclass(frozen=True)
@@ -162,8 +156,7 @@ def exchanged_sides(performance: Performance, pairs: tuple[str, ...]) -> Perform
 
 
 def smoothed(performance: Performance, seconds: float) -> Performance:
-    """Convolved in time by a Gaussian of standard deviation `seconds`; rows must be evenly spaced
-    (`resampled`)."""
+    """Convolved by a Gaussian of standard deviation `seconds`; rows must be even (`resampled`)."""
     deviation = seconds * performance.fps
     reach = int(np.ceil(SMOOTHING_REACH * deviation))
     if reach < 1:
@@ -180,16 +173,14 @@ def smoothed(performance: Performance, seconds: float) -> Performance:
 
 
 def amplified(performance: Performance, gains: Mapping[str, float]) -> Performance:
-    """Weights times the gain of their part (`names.PARTS`, or "head") or of their own name; 1 where
-    none is given."""
+    """Weights times the gain of their part (PARTS, "head") or of their own name, else 1."""
     factors = np.array([gains.get(name, gains.get(part_of(name), 1.0)) for name in ARKIT_SHAPES])
     head = None if performance.head is None else performance.head * gains.get("head", 1.0)
     return replace(performance, weights=performance.weights * factors, head=head)
 
 
 def relative_to(performance: Performance, rest: Performance) -> Performance:
-    """The performance without the face and head rotation of `rest` (its first row), so that these
-    are 0 and a weight of 1 stays 1."""
+    """Without the face and head rotation of `rest` (its first row); a weight of 1 stays 1."""
     neutral = rest.weights[0]
     head = performance.head
     if head is not None and rest.head is not None:

@@ -1,5 +1,4 @@
-"""Reading of face performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap and named
-weights in JSON."""
+"""Performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap, weights in JSON."""
 
 import csv
 import math
@@ -14,10 +13,8 @@ from ..files import file_size, read_json
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6}))?", re.ASCII)
-BASES = (24, 25, 30, 48, 50, 60, 100, 120)
-"""Frames per second that timecodes count."""
-USUAL_BASE = 60
-"""Of a take of less than a second, whose frame numbers do not tell."""
+BASES = (24, 25, 30, 48, 50, 60, 100, 120)  # Frames per second that timecodes count
+USUAL_BASE = 60  # Of a take of less than a second, whose frame numbers do not tell
 DAY_S = 86_400.0
 DROP_RATIO = 1000 / 1001
 """Timecodes with a semicolon leave out frame numbers, because their frames come this much
@@ -118,8 +115,7 @@ def _head(text: str) -> tuple[float, float, float] | None:
 SUFFIXES = (".csv", ".json", ".txt")
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
-DEFAULT_FPS = 60.0
-"""Of files that hold neither times nor a rate: ARKit's own."""
+DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
 MIN_FPS, MAX_FPS = 1.0, 1000.0
 HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
 COUNT_COLUMN, TIMECODE_COLUMNS, SECONDS_COLUMNS = (
@@ -138,8 +134,7 @@ CATEGORY_KEYS = (("categoryName", "category_name", "name"), ("score", "value", "
 
 
 def is_performance(path: Path) -> bool:
-    """Whether a path has the form of a performance: one of `SUFFIXES`, or a Live Link Face take's
-    folder."""
+    """Whether a path is one of `SUFFIXES`, or the folder of a Live Link Face take."""
     if path.is_dir():
         return (
             not (path / "flame_param").is_dir()
@@ -158,7 +153,12 @@ def read_performance(path: Path) -> Performance:
     file, the row, and the shapes that are missing.
     """
     if path.is_dir():
-        path = _take_file(path)
+        files = _take_files(path)
+        own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
+        if len(own) != 1:
+            names = ", ".join(path.name for path in own[:4]) or "none"
+            raise StgaError(f"{path}: a take's folder holds one CSV file, found {names}")
+        path = own[0]
     suffix = path.suffix.lower()
     if suffix == ".json":
         return _read_json(path)
@@ -175,15 +175,6 @@ def _take_files(folder: Path) -> list[Path]:
     return sorted(
         path for path in folder.iterdir() if path.suffix.lower() == ".csv" and path.is_file()
     )
-
-
-def _take_file(folder: Path) -> Path:
-    files = _take_files(folder)
-    own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
-    if len(own) != 1:
-        names = ", ".join(path.name for path in own[:4]) or "none"
-        raise StgaError(f"{folder}: a take's folder holds one CSV file, found {names}")
-    return own[0]
 
 
 def _text(path: Path) -> str:

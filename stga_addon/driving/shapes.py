@@ -26,8 +26,7 @@ from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 
 SHAPES_FILE = Path(__file__).with_name("arkit_shapes.npz")
 PUPILS = (468, 473)
-SKIN_POINTS = 468
-"""The points after these are the irises', which move with the eyeballs."""
+SKIN_POINTS = 468  # The points after these are the irises', which move with the eyeballs
 MOUTH_CLOSE, JAW_OPEN = COLUMN["mouthClose"], COLUMN["jawOpen"]
 
 
@@ -62,8 +61,7 @@ def face_shapes() -> FaceShapes:
 
 
 def effective_weights(weights: np.ndarray) -> np.ndarray:
-    """Weights (..., 52) with mouthClose at most jawOpen: it closes the lips of an open jaw, and
-    does nothing else."""
+    """Weights (..., 52) with mouthClose at most jawOpen: it closes the lips of an open jaw."""
     limited = weights.copy()
     limited[..., MOUTH_CLOSE] = np.minimum(
         weights[..., MOUTH_CLOSE], np.maximum(weights[..., JAW_OPEN], 0)
@@ -78,15 +76,12 @@ EYEBALL_RADIUS_M = 0.012
 ITERATIONS = 12
 CANDIDATES = 24
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
-MIN_COSINE = 0.5
-"""Between the normals of a point and of the triangle that it may lie on."""
-FAR_M = 1.0
-"""Added to the distance of triangles that face another way."""
+MIN_COSINE = 0.5  # Between the normals of a point and of the triangle that it may lie on
+FAR_M = 1.0  # Added to the distance of triangles that face another way
 MAX_MATCH_M, MEDIANS = 0.003, 4.0
 """A nearest point counts up to this distance, or this many times the median of all."""
 TANGENTIAL_WEIGHT, PUPIL_WEIGHT, IDENTITY_DEVIATION_M, AFFINE_WEIGHT = 0.1, 30.0, 0.002, 0.09
-SMOOTHINGS = (0.3, 0.1, 0.03, 0.01)
-"""Ridge of the warp's kernel, in meters."""
+SMOOTHINGS = (0.3, 0.1, 0.03, 0.01)  # Ridge of the warp's kernel, in meters
 MAX_WARP_MATCH_M = 0.006
 MAX_SURFACE_DISTANCE_M = 0.003
 
@@ -98,7 +93,21 @@ def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray
     them.
     """
     source, surface = face_shapes(), _Surface(model.v_template, model.faces)
-    pupils = _pupils(model, name)
+    joints = joint_positions(model, model.v_template)
+    pupils = []
+    for joint in EYE_JOINTS:
+        eyeball = model.v_template[model.weights[:, joint] > EYEBALL_WEIGHT]
+        if len(eyeball):
+            pupils.append([*eyeball[:, :2].mean(axis=0), eyeball[:, 2].max()])
+        else:
+            pupils.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
+    apart = float(pupils[1][0] - pupils[0][0])
+    if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
+        raise StgaError(
+            f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {1000 * MIN_EYE_DISTANCE_M:.0f} to "
+            f"{1000 * MAX_EYE_DISTANCE_M:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
+        )
+    pupils = np.array(pupils)
     skin = source.reliable & (np.arange(len(source.points)) < SKIN_POINTS)
     points, normals = _aligned(surface, pupils, skin)
     points = _warped(surface, points, normals, pupils, skin)
@@ -120,8 +129,7 @@ class _Surface:
     def nearest(
         self, points: np.ndarray, normals: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Triangle (N,), barycentric and position (N, 3), and distance (N,) of the nearest points
-        that face alike."""
+        """Triangle, barycentric, position and distance of the nearest points that face alike."""
         squared = (self.centers**2).sum(1) - 2 * points @ self.centers.T
         squared += np.where(normals @ self.normals.T < MIN_COSINE, FAR_M, 0.0)
         count = min(CANDIDATES, len(self.centers))
@@ -141,8 +149,7 @@ class _Surface:
 
 
 def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (N, K, 3) of the points of triangles (N, K, 3, 3) nearest to points
-    (N, 3)."""
+    """Barycentric coordinates (N, K, 3) of the points of triangles nearest to points (N, 3)."""
     a, b, c = np.moveaxis(corners, 2, 0)
     from_a, from_b = points[:, None] - a, points[:, None] - b
 
@@ -175,25 +182,6 @@ def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(
         np.take_along_axis(options, distance.argmin(axis=0)[None, ..., None], axis=0)[0]
     )
-
-
-def _pupils(model: FlameModel, name: str) -> np.ndarray:
-    """(2, 3) foremost points of right and left eyeball."""
-    joints = joint_positions(model, model.v_template)
-    pupils = []
-    for joint in EYE_JOINTS:
-        eyeball = model.v_template[model.weights[:, joint] > EYEBALL_WEIGHT]
-        if len(eyeball):
-            pupils.append([*eyeball[:, :2].mean(axis=0), eyeball[:, 2].max()])
-        else:
-            pupils.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
-    apart = float(pupils[1][0] - pupils[0][0])
-    if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
-        raise StgaError(
-            f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {1000 * MIN_EYE_DISTANCE_M:.0f} to "
-            f"{1000 * MAX_EYE_DISTANCE_M:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
-        )
-    return np.array(pupils)
 
 
 def _aligned(

@@ -1,5 +1,4 @@
-"""What an avatar is posed by: a capture, a motion, or the head of an open .blend file, also as a
-folder that another Python reads."""
+"""What poses an avatar: a capture, a motion, or the head of an open .blend file, or its folder."""
 
 import logging
 import re
@@ -199,8 +198,7 @@ def findings(motion: Motion) -> list[str]:
 # The head of an open .blend file
 
 
-FOLDER = "STGA_HEAD"
-"""The environment variable that names the folder."""
+FOLDER = "STGA_HEAD"  # The environment variable that names the folder
 HEAD, SELECTION, PLAYED = "head.json", "selection.npz", "played.npz"
 
 

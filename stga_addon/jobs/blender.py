@@ -1,5 +1,4 @@
-"""Rendering for Blender: images that it has recorded, and frames of a .blend file by the Blender of
-this machine."""
+"""Rendering for Blender: images that it recorded, and frames of a .blend file by Blender itself."""
 
 import os
 import re
@@ -28,15 +27,11 @@ from .train import Train
 PARTIAL = ".rendering-"
 """Start of the name of the folder that Blender writes into; a picture leaves it when it is
 whole."""
-SAVED = re.compile(r"Saved: '(?P<path>.+)'")
-"""What Blender prints when it has written a picture."""
-LAST_LINES = 30
-"""Lines of Blender's output that are searched for why it failed."""
+SAVED = re.compile(r"Saved: '(?P<path>.+)'")  # What Blender prints when it has written a picture
+LAST_LINES = 30  # Lines of Blender's output that are searched for why it failed
 STOP_TIMEOUT_S = 10.0
-MAX_FRAME = 1_048_574
-"""Blender's last frame."""
-FRAME_DIGITS = 6
-"""Of the name of a frame's picture, as many as this at least."""
+MAX_FRAME = 1_048_574  # Blender's last frame
+FRAME_DIGITS = 6  # Of the name of a frame's picture, as many as this at least
 
 
 @dataclass(frozen=True)
@@ -165,8 +160,7 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
 
 
 def blender_command() -> list[str]:
-    """What starts this machine's Blender: the program or command in STGA_BLENDER, else the program
-    `blender`."""
+    """What starts this machine's Blender: the command in STGA_BLENDER, else `blender`."""
     text = os.environ.get(BLENDER_VARIABLE, "")
     if os.path.isfile(text):  # whose path may hold spaces
         return [text]

@@ -30,8 +30,7 @@ SHAPES_SUFFIX = ".csv"
 
 @dataclass(frozen=True)
 class ConvertMotion:
-    """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or a motion to a CSV of
-    shapes."""
+    """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or the other way."""
 
     source: Path = option(
         "a performance (CSV, JSON, text, take folder), a video of a face, FLAME parameters (.npz), "

@@ -1,5 +1,4 @@
-"""Export of an avatar in another format: one frame, a range of frames, or splats with their FLAME
-motion."""
+"""Export of an avatar: one frame, a range of frames, or splats with their FLAME motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -39,8 +38,7 @@ from .train import Train
 
 @dataclass(frozen=True)
 class Export:
-    """Write an avatar in another format, for other viewers and tools; other fields as of
-    `avatar_source.Posed`."""
+    """Write an avatar in another format, for other viewers (`avatar_source.Posed`)."""
 
     source: Path = option("folder of a run, or avatar file", flag="RUN|AVATAR")
     output: Path = option("the file, or the folder of a format of several", flag="--out")
@@ -77,8 +75,7 @@ class Export:
     )
 
     def check(self) -> None:
-        """Raise StgaError for a file name of another format, and for what the format would leave
-        out."""
+        """Raise StgaError for another format's file name, and for what the format leaves out."""
         held = {
             "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
             "frames": [name for name, format in FORMATS.items() if format.source == "range"],
@@ -117,7 +114,8 @@ def export(request: Export, report: Report, say: Say) -> Written:
     meshes: Meshes = ()
     if format.is_page and capture is None and request.frames is None:
         _say_size(request, avatar, 1, say)
-        playback = still_playback(request, avatar, fps, say)
+        _say_licence(flame_notice(avatar, None, motion_only=True), say)
+        playback = Playback(title=_title(request), fps=fps, motion_only=True)
         meshes = [(0, avatar.neutral)]
     elif format.source == "range":
         capture = required_capture(capture)
@@ -156,12 +154,6 @@ def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
 SPLITS = ("val", "train", "test")
 
 
-def still_playback(request: Export, avatar: Avatar, fps: float, say: Say) -> Playback:
-    """What a page of the neutral mesh alone shows. Says what it holds of a FLAME model."""
-    _say_licence(flame_notice(avatar, None, motion_only=True), say)
-    return Playback(title=_title(request), fps=fps, motion_only=True)
-
-
 def capture_playback(
     request: Export,
     avatar: Avatar,
@@ -170,14 +162,26 @@ def capture_playback(
     fps: float,
     say: Say,
 ) -> tuple[Playback, FlameSequence | None]:
-    """What a page of the capture's timesteps shows, and its FLAME motion. Says what it holds of a
-    FLAME model."""
+    """What a page shows of timesteps, and its FLAME motion. Says what of FLAME it holds."""
+    chosen: Mapping[int, np.ndarray] | None = None
+    if request.played is not None:
+        chosen = request.played.selection
+    elif (request.source / SELECTION).exists():
+        # imports torch, which Blender may lack
+        from ..training.run.checkpoint import read_selection
+
+        chosen = read_selection(request.source, len(capture.faces))
+    if not chosen and request.played is None:
+        chosen = select_capture(capture, SelectionOptions())
+    everything = np.ones(len(capture.faces), bool)
     playback = Playback(
         title=_title(request),
         fps=fps,
         views=capture_views(capture),
         up=_up(capture),
-        selection=_selection(request, capture, timesteps),
+        selection=(
+            [chosen.get(timestep, everything) for timestep in timesteps] if chosen else None
+        ),
         motion_only=request.motion_only,
         controls=None if request.motion_only else page_controls(capture.flame),
     )
@@ -229,27 +233,8 @@ def _up(capture: Capture) -> tuple[float, float, float]:
     return (float(axis[0]), float(axis[1]), float(axis[2]))
 
 
-def _selection(
-    request: Export, capture: Capture, timesteps: tuple[int, ...]
-) -> list[np.ndarray] | None:
-    """What each timestep trains: the open file's or the run's selection, else by the rule."""
-    chosen: Mapping[int, np.ndarray] | None = None
-    if request.played is not None:
-        chosen = request.played.selection
-    elif (request.source / SELECTION).exists():
-        # imports torch, which Blender may lack
-        from ..training.run.checkpoint import read_selection
-
-        chosen = read_selection(request.source, len(capture.faces))
-    if not chosen and request.played is None:
-        chosen = select_capture(capture, SelectionOptions())
-    everything = np.ones(len(capture.faces), bool)
-    return [chosen.get(timestep, everything) for timestep in timesteps] if chosen else None
-
-
 def _flame_timesteps(capture: Capture, timesteps: tuple[int, ...]) -> tuple[int, ...]:
-    """The timesteps of `capture.flame` for those of the capture, which an open head numbers by the
-    scene's frames."""
+    """Timesteps of `capture.flame` for the capture's, which an open head numbers by frames."""
     assert capture.flame is not None
     numbered = dict(zip(capture.timesteps, capture.flame.timesteps, strict=True))
     return tuple(numbered[timestep] for timestep in timesteps)

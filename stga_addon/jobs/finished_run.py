@@ -1,5 +1,4 @@
-"""What is found out about a finished run: the light of its capture, kept in its avatar, and its
-quality on a split."""
+"""The light of a finished run's capture, kept in its avatar, and its quality on a split."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,8 +53,7 @@ class Relight:
 
 
 def relight(request: Relight, report: Report, say: Say) -> Written:
-    """Estimate the light, or take the known one, and write it into the run's avatar file. Raises
-    StgaError."""
+    """Write the light, estimated or known, into the run's avatar file. Raises StgaError."""
     from ..light.estimate import Known
 
     folder = request.run
@@ -67,7 +65,14 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
         card = srgb_to_linear(np.array(request.card))
         if not card.min() > 0:
             raise StgaError(f"--gray-card: expected three numbers above 0, got {request.card}")
-        known = Known(card=card[None], toward=_toward_central_camera(capture)[None])
+        first = {
+            view.camera_index: view.camera for views in capture.views.values() for view in views
+        }
+        if not first:
+            raise StgaError(f"{capture.root}: has no camera that a gray card could face")
+        cameras = list(first.values())
+        offset = cameras[central_camera(cameras)].position - capture.neutral.mean(0)
+        known = Known(card=card[None], toward=np.asarray(offset / np.linalg.norm(offset))[None])
     return Written(folder / AVATAR, add_light(folder / AVATAR, capture, known, report))
 
 
@@ -103,23 +108,12 @@ def describe_light(light: AvatarLight) -> tuple[str, ...]:
     return line, f"warning: the capture's light is too hard to be taken away; {damped}"
 
 
-def _toward_central_camera(capture: Capture) -> np.ndarray:
-    """(3,) from the face to the camera that sees it from the front."""
-    first = {view.camera_index: view.camera for views in capture.views.values() for view in views}
-    if not first:
-        raise StgaError(f"{capture.root}: has no camera that a gray card could face")
-    cameras = list(first.values())
-    offset = cameras[central_camera(cameras)].position - capture.neutral.mean(0)
-    return np.asarray(offset / np.linalg.norm(offset))
-
-
 # Quality
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure PSNR, SSIM and LPIPS of a run's avatar on held-out views; they are written into the
-    run's folder, too."""
+    """Measure PSNR, SSIM and LPIPS of a run's avatar on held-out views; its folder keeps them."""
 
     run: Path = like(Relight, "run")
     split: str = option("views to measure on", "val", choices=("train", "val", "test"))
@@ -147,26 +141,6 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
         quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})
-    lines = [f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)]
-    unseen = {view.timestep for view in views} - {
-        view.timestep for view in capture.views.get("train", ())
-    }
-    if (
-        tracked.flame is not None
-        and capture.flame is not None
-        and any(
-            not np.array_equal(capture.flame.frame(t).parameters, tracked.flame.frame(t).parameters)
-            for t in unseen
-        )
-    ):
-        before = _describe(evaluate_avatar(avatar, tracked, split))
-        lines.insert(
-            1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}"
-        )
-    return Written(path, tuple(lines))
-
-
-def _details(quality: "Quality") -> list[str]:
     lines = [
         f"  {name}: {_describe(quality.regions[region])}"
         for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region"))
@@ -188,7 +162,23 @@ def _details(quality: "Quality") -> list[str]:
             f"LPIPS was not measured: it needs {weights}",
             f"and images of at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels",
         ]
-    return lines
+    lines = [f"{split}: {len(views)} views, {_describe(quality)}", *lines]
+    unseen = {view.timestep for view in views} - {
+        view.timestep for view in capture.views.get("train", ())
+    }
+    if (
+        tracked.flame is not None
+        and capture.flame is not None
+        and any(
+            not np.array_equal(capture.flame.frame(t).parameters, tracked.flame.frame(t).parameters)
+            for t in unseen
+        )
+    ):
+        before = _describe(evaluate_avatar(avatar, tracked, split))
+        lines.insert(
+            1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}"
+        )
+    return Written(path, tuple(lines))
 
 
 def _describe(quality: "Quality") -> str:

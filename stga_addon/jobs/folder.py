@@ -59,8 +59,7 @@ def check_request(request: Request) -> None:
 
 
 def worker_arguments(folder: Path, threads: int | None = None, resume: bool = False) -> list[str]:
-    """What a worker's interpreter runs after `-m` for the request in the folder (`stga
-    perform`)."""
+    """What a worker's interpreter runs after `-m` for the request in the folder."""
     limit = [] if threads is None else ["--threads", str(threads)]
     return [
         "stga_addon",
@@ -72,8 +71,7 @@ def worker_arguments(folder: Path, threads: int | None = None, resume: bool = Fa
 
 
 def write_request(folder: Path, request: Request) -> None:
-    """Prepare the folder for a worker. Raises StgaError while one is working in it, or on a full
-    disk."""
+    """Prepare the folder for a worker. Raises StgaError while one works in it."""
     prepare_status_folder(folder)
     for stale in FILES:
         (folder / stale).unlink(missing_ok=True)

@@ -10,17 +10,14 @@ from .table import DISMISSIBLE, STORED, TRAINS, TRANSIENT, Kind
 from .track import CAPTURE_FOLDER, RUN_FOLDER
 
 CHECK_INTERVAL_S = 0.5
-SLICE_INTERVAL_S = 0.02
-"""While splats are built in slices, so that Blender never blocks for long."""
+SLICE_INTERVAL_S = 0.02  # While splats are built in slices, so that Blender never blocks for long
 
-Stamp = tuple[int, int]
-"""Modification time in nanoseconds and size in bytes of a file."""
+Stamp = tuple[int, int]  # Modification time in nanoseconds and size in bytes of a file
 
 
 @dataclass(frozen=True)
 class RunFiles:
-    """Stamps of a run's files, and of the capture that is tracked for it; None: there is no such
-    file."""
+    """Stamps of a run's files, and of the capture that is tracked for it; None: no such file."""
 
     capture: Stamp | None = None
     picture: Stamp | None = None
@@ -147,8 +144,7 @@ class StatusRead:
 
 @dataclass(frozen=True)
 class SceneFree:
-    """What the result changes can be changed now: Blender does not render, and nothing of it is in
-    Edit Mode."""
+    """What the result changes can be changed: no rendering, nothing of it in Edit Mode."""
 
 
 @dataclass(frozen=True)
@@ -211,13 +207,11 @@ class LoadAvatar(_OnPath):
 
 
 class Show(_OnPath):
-    """Put what was loaded into the scene, as far as it was read; answered by SliceBuilt, Shown or
-    Failed."""
+    """Put what was loaded and read into the scene; answered by SliceBuilt, Shown or Failed."""
 
 
 class ReadCurve(_OnPath):
-    """Read the evaluations in the run for the panel's curve, or before the first ones the picture
-    of the tracking."""
+    """Read the run's evaluations for the panel's curve, before them the tracking's picture."""
 
 
 class StopWorker(_OnPath):
@@ -332,39 +326,34 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     if state.loading is not None:
         return state, tuple(effects)
     if state.kind in TRAINS:
-        return _load_avatar(state, event, effects)
+        capture, preview = state.files.capture, state.files.preview
+        if capture not in (None, state.shown_capture) and (
+            state.snapshot.state.is_alive or state.has_result
+        ):
+            return replace(
+                state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture
+            ), tuple(effects)
+        if state.has_result:
+            effects.append(StoreAvatar(state.run / AVATAR))
+            if event.show_result:
+                state = replace(state, loading=state.run / AVATAR)
+            else:
+                state = replace(state, result_shown=True)
+                effects.extend(_stored(state))
+        elif (
+            state.snapshot.state.is_alive
+            and event.live_preview
+            and preview not in (None, state.shown_preview)
+        ):
+            state = replace(state, loading=event.folder / PREVIEW, shown_preview=preview)
+        if state.loading is not None:
+            effects.append(LoadAvatar(state.loading))
+        return state, tuple(effects)
     if state.has_result:
         state = replace(state, loading=state.folder)
     elif state.kind in TRANSIENT and not worker.is_alive:
         # The panel has no options of the command line.
         return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
-    return state, tuple(effects)
-
-
-def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) -> Outcome:
-    """Load the tracked capture, the trained avatar, or a preview of it, once each."""
-    capture, preview = state.files.capture, state.files.preview
-    if capture not in (None, state.shown_capture) and (
-        state.snapshot.state.is_alive or state.has_result
-    ):
-        return replace(state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture), tuple(
-            effects
-        )
-    if state.has_result:
-        effects.append(StoreAvatar(state.run / AVATAR))
-        if event.show_result:
-            state = replace(state, loading=state.run / AVATAR)
-        else:
-            state = replace(state, result_shown=True)
-            effects.extend(_stored(state))
-    elif (
-        state.snapshot.state.is_alive
-        and event.live_preview
-        and preview not in (None, state.shown_preview)
-    ):
-        state = replace(state, loading=event.folder / PREVIEW, shown_preview=preview)
-    if state.loading is not None:
-        effects.append(LoadAvatar(state.loading))
     return state, tuple(effects)
 
 

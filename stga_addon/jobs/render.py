@@ -1,5 +1,4 @@
-"""Rendering of an avatar or a PLY: one PNG per camera entry, a video of its motion, or a
-turntable."""
+"""Rendering of an avatar or a PLY: a PNG per camera entry, a video of its motion, a turntable."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -334,8 +333,7 @@ def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
 def _pictured(
     request: Render, avatar: Avatar, mesh: Callable[[View], np.ndarray], composer: Composer
 ) -> Callable[[View, float], np.ndarray]:
-    """The picture of an avatar on the mesh of a view, as it was recorded or under the light that is
-    asked for."""
+    """The picture of an avatar on the mesh of a view, as recorded or under the asked light."""
     from ..render.render import render_avatar, render_colors
 
     behind = _world(request.source) if request.world else None
@@ -376,8 +374,7 @@ def _middle(vertices: np.ndarray) -> np.ndarray:
 
 
 def unique_names(paths: list[str]) -> list[str]:
-    """File names with the suffix .png; where entries share one, their folders become part of it,
-    then a number."""
+    """Names ending in .png; where entries share one, with their folders, then numbered."""
     pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
     names = [png.name for png in pngs]
     if len(set(names)) < len(names):

@@ -1,5 +1,4 @@
-"""Tracking: footage to a capture, solving one again around poses made by hand, and from footage to
-an avatar."""
+"""Footage to a capture, solving one again around poses made by hand, and footage to an avatar."""
 
 import math
 import os
@@ -159,13 +158,11 @@ FOCAL_SOURCES = {
     "file": "as the file says",
     "solved": "solved from the turns of the head",
     "usual": "a guess, that of a phone",
-}
-"""What a person reads of where a focal length is from (`Footage.focal`)."""
+}  # What a person reads of where a focal length is from (`Footage.focal`)
 
 
 def track(request: Track, report: Report, say: Say) -> Written:
-    """Track the head into a capture. Raises StgaError; cancelled, it leaves what was found so far,
-    from which the same request continues."""
+    """Track the head into a capture; cancelled, the same request continues. Raises StgaError."""
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
     from ..tracking.track import track as track_footage
@@ -231,13 +228,11 @@ class _Steps:
 # From footage to an avatar
 
 
-TRACKING_SHARE = 0.5
-"""Of the progress."""
+TRACKING_SHARE = 0.5  # Of the progress
 
 
 def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
-    """Track unless that was done, and train or continue the run. Raises StgaError where the folder
-    began with other inputs, and as both do."""
+    """Track unless that is done, then train or continue. Raises StgaError for other inputs."""
 
     def report_tracking(progress: Progress) -> bool:
         share, stage = TRACKING_SHARE * progress.share, f"Tracking: {progress.stage}"
@@ -336,8 +331,7 @@ def read_inputs(out: Path) -> dict[str, Any]:
 
 
 def _inputs(track: Track) -> dict[str, Any]:
-    """What decides how it is tracked, as JSON: the fields of `Track` but its folder; paths are
-    absolute."""
+    """What decides how it is tracked, as JSON: `Track` without its folder, absolute paths."""
     values = {spec.name: getattr(track, spec.name) for spec in fields(Track) if spec.name != "out"}
     values["offset"] = dict(sorted((track.offset or {}).items()))
     return {

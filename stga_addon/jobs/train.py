@@ -44,10 +44,8 @@ from ..training.run.identity import file_digest, identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 from .results import Selected, Written
 
-MAX_NAMED_VIEWS = 6
-"""Views that a warning names."""
-Selection = Mapping[int, np.ndarray]
-"""timestep -> (F,) bool: triangles to train."""
+MAX_NAMED_VIEWS = 6  # Views that a warning names
+Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
 
 @dataclass(frozen=True)
@@ -189,8 +187,7 @@ class SelectForTake:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run that can be trained: its capture, of all its takes, and what each timestep trains,
-    where that is given."""
+    """A run that can be trained: the capture of all its takes, and what each timestep trains."""
 
     request: Train | Resume | Refine | Extend
     run: Run
@@ -248,8 +245,7 @@ def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -
 
 
 def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ...]:
-    """Write the light of the capture into the avatar; what there is to say about it, or why there
-    is none."""
+    """Write the light of the capture into the avatar; what there is to say, or why it has none."""
     if any(decision.effect == RELIGHT and not decision.on for decision in prepared.run.effect_plan):
         return (
             "light: not estimated (the effect relight is off); `stga relight RUN` estimates it",
@@ -265,8 +261,7 @@ def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ..
 
 
 def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
-    """Write what stands still behind the person into the run's folder, where its effect is on; what
-    there is to say."""
+    """Write what stands still behind the person, where its effect is on; what there is to say."""
     if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
         return ()
     from ..training.world.world_splats import world_of
@@ -298,8 +293,7 @@ def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say)
 
 
 def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
-    """timestep of the take -> (F,) bool: what extending the run by it would train. Raises
-    StgaError."""
+    """timestep -> (F,) bool: what extending the run by the take would train."""
     report(Progress(stage="Comparing the avatar with the images"))
     wanted = Extend(
         request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame
@@ -340,8 +334,7 @@ def _resumed_run(request: Resume, say: Say) -> Prepared:
 
 
 def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
-    """Raises StgaError where the run, the region or the frames do not exist, or no camera sees the
-    region."""
+    """Raises StgaError without run, region or frames, or where no camera sees the region."""
     from ..training.run.continuation import continued_settings, is_faced
 
     device = _continuing_device(request, say)

@@ -17,13 +17,11 @@ MAX_PIXELS, MAX_HEADER_BYTES = 1 << 26, 1 << 16
 HEADER = re.compile(
     rb"#\?(?:RADIANCE|RGBE)[^\n]*\n(?:[^\n]*\n){0,200}?\n-Y (\d{1,6}) \+X (\d{1,6})\n"
 )
-MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 0x7FFF
-"""Widths of images whose rows may be compressed."""
+MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 0x7FFF  # Widths of images whose rows may be compressed
 MAX_SUNS = 4
 SUN_CONTRAST = 12.0
 """How much brighter than the mean of the environment a pixel must be to belong to a sun."""
-SUN_RADIUS = np.radians(12)
-"""Bright pixels within this angle of the brightest one are one sun."""
+SUN_RADIUS = np.radians(12)  # Bright pixels within this angle of the brightest one are one sun
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From Blender's axes (z up) to those of a capture that its add-on shows upright (y up, the face
 looks along z)."""
@@ -161,8 +159,7 @@ MAX_NUMBER = 1e6
 
 @dataclass(frozen=True)
 class LightEntry:
-    """A table [[lights]]: see `values.Light`; `strength` is Blender's, in W/m² of a sun and in W of
-    others."""
+    """A table [[lights]] of `values.Light`; `strength` is Blender's: W/m² of a sun, else W."""
 
     kind: str = setting(choices=KINDS)
     strength: float = setting(minimum=0, maximum=MAX_NUMBER)
@@ -183,8 +180,7 @@ class LightEntry:
 
 @dataclass(frozen=True)
 class LightFile:
-    """A file of lights, in meters and axes of the capture. world: radiance from everywhere. See
-    `values.Lighting`."""
+    """Lights in meters and axes of the capture (`values.Lighting`). world: radiance everywhere."""
 
     world: tuple[float, float, float] = setting((0.0, 0.0, 0.0), 0, MAX_NUMBER)
     lights: tuple[LightEntry, ...] = ()

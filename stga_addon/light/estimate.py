@@ -21,8 +21,7 @@ MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800
 MIN_FACING = 0.35
 """Cosine between a triangle's normal and the direction to the camera, below which its color is not
 used."""
-HIDDEN_M = 0.003
-"""A triangle is hidden by what is nearer to the camera by as much."""
+HIDDEN_M = 0.003  # A triangle is hidden by what is nearer to the camera by as much
 POINTS = (np.eye(3) + 1 / 3) / 2
 """(3, 3) barycentric coordinates of the points of a triangle whose pixels are read."""
 SATURATED_LEVEL, DARK_LEVEL = 252, 4
@@ -65,7 +64,11 @@ def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -
         report(Progress(n / max(len(by_time), 1), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
         seen = np.stack([_view_colors(capture, mesh, view, exposure(view)) for view in views])
-        colors.append(_darker_half(seen))
+        ordered = np.sort(seen, axis=0)  # NaN comes last
+        count = np.isfinite(seen[..., :1]).sum(0)
+        taken = np.arange(len(seen))[:, None, None] < (count + 1) // 2
+        total = np.where(taken, np.nan_to_num(ordered), 0).sum(0)
+        colors.append(np.where(count > 0, total / np.maximum((count + 1) // 2, 1), np.nan))
         cameras.append(np.isfinite(seen[..., 0]).sum(0))
     return Observed(np.stack(colors), np.stack(cameras))
 
@@ -73,8 +76,7 @@ def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -
 def _view_colors(
     capture: Capture, mesh: np.ndarray, view: View, exposure: np.ndarray | None
 ) -> np.ndarray:
-    """(F, 3) linear mean color of each triangle at POINTS, without its camera's exposure (2, 3);
-    NaN where it is hidden or seen aslant."""
+    """(F, 3) mean linear color of triangles, exposure undone; NaN where hidden or aslant."""
     gain, offset = np.eye(2)[:, :1] if exposure is None else exposure
     scale = min(1.0, MAX_SIDE_PX / max(view.camera.width, view.camera.height))
     view, image, mask = read_view(view, scale)
@@ -114,29 +116,16 @@ def _inner(mask: np.ndarray) -> np.ndarray:
     )
 
 
-def _darker_half(colors: np.ndarray) -> np.ndarray:
-    """(F, 3) of colors by camera (C, F, 3), NaN where unseen: channel by channel the mean of the
-    darker half."""
-    ordered = np.sort(colors, axis=0)  # NaN comes last
-    count = np.isfinite(colors[..., :1]).sum(0)
-    taken = np.arange(len(colors))[:, None, None] < (count + 1) // 2
-    total = np.where(taken, np.nan_to_num(ordered), 0).sum(0)
-    return np.where(count > 0, total / np.maximum((count + 1) // 2, 1), np.nan)
-
-
 ITERATIONS = 40
 PRIOR = 0.7
 """Weight of alike albedos, as a multiple of the observations of a triangle that is seen at every
 timestep."""
-POSED_DIRECTIONS = 96
-"""By which the transfer of a posed mesh is found, at each timestep."""
-UNSEEN_WEIGHT = 1e-3
-"""Of a timestep at which no camera sees a vertex, where each camera counts 1."""
+POSED_DIRECTIONS = 96  # By which the transfer of a posed mesh is found, at each timestep
+UNSEEN_WEIGHT = 1e-3  # Of a timestep at which no camera sees a vertex, where each camera counts 1
 MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
 """Transfer of the constant harmonic below which a triangle counts for nothing: its own shadow hides
 the light."""
-LOSS_SCALE = 3.0
-"""Residual at which an observation's weight has halved, in medians."""
+LOSS_SCALE = 3.0  # Residual at which an observation's weight has halved, in medians
 RIDGE = 1e-4
 MIN_ARRIVING, DARK = 0.02, 1e-5
 """Least irradiance that a color is divided by, as a share of the mean; and what counts as no light
@@ -179,8 +168,7 @@ class Known:
 def estimate_light(
     capture: Capture, known: Known = Known(), report: Report = ignore
 ) -> AvatarLight:
-    """The light of the capture and how its neutral mesh receives light. Raises StgaError without
-    training views."""
+    """The light of the capture and how its head receives it. Raises StgaError without views."""
     if not capture.views.get("train"):
         raise StgaError(
             f"{capture.root}: has no training views, from which its light could be estimated"
@@ -283,8 +271,7 @@ def _albedo(
     color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray, typical: np.ndarray, faces: int,
     times: int,
 ) -> np.ndarray:  # fmt: skip
-    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical` by the
-    prior."""
+    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical`."""
     prior = PRIOR * times * (arriving**2).mean(0)
     found = np.empty_like(color)
     for k in range(3):

@@ -13,16 +13,14 @@ from .array_kernels import toward_light
 from .harmonics import COUNT, basis
 from .values import Caster, Light, Lighting
 
-MAP_SIZE = 512
-"""Texels a side of a light's shadow map, which just holds the head."""
+MAP_SIZE = 512  # Texels a side of a light's shadow map, which just holds the head
 LIFT_M = 0.001
 """Points are lifted off the surface by as much along its normal, so that it does not shade
 itself."""
 BIAS_M, MAX_BIAS_M = 0.001, 0.006
 """A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the
 taps, at most MAX_BIAS_M."""
-TAP_STEP = 1.0
-"""Texels between the 3 × 3 places that are looked up: splats soften edges already."""
+TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats soften edges already
 Projection = Callable[[np.ndarray], np.ndarray]
 """Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light
 cannot see them."""
@@ -45,8 +43,7 @@ class LightView:
 
 @dataclass(frozen=True)
 class HeadBounds:
-    """Middle (3,) of a posed head's box, the diagonal of the box, and the radius around its middle
-    of the head."""
+    """Middle (3,) of a posed head's box, its diagonal, and the head's radius around the middle."""
 
     center: np.ndarray
     diagonal: float
@@ -172,8 +169,7 @@ class ShadowMap:
 
 
 def kernels(name: str) -> Any:
-    """The module `raster.cpu.shade`, with `add_lights`, or `raster.cpu.shadow`, with `add_depths`
-    and `lit_shares`."""
+    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`), or NumPy's."""
     return (
         array_kernels
         if find_spec("numba") is None
@@ -218,8 +214,7 @@ class Lamps:
         roughness: np.ndarray,
         reflectance: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Irradiance and highlight (N, 3) float32 at points (N, 3), seen from eye (3,); see
-        `raster.cpu.shade`."""
+        """Irradiance and highlight (N, 3) at points (N, 3) seen from eye (3,)."""
         found = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
         if not len(self._table):
             return found
@@ -235,8 +230,7 @@ class Lamps:
 
 
 def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
-    """(points, 16) float32: a light as rows of the table of `raster.cpu.shade`, for a head around
-    `center` (3,)."""
+    """(points, 16) float32: a light as rows of `raster.cpu.shade`, for a head at `center` (3,)."""
     places, width = _places(light, center)
     intensity = {"sun": 1.0, "point": 1 / (4 * np.pi), "spot": 1 / (4 * np.pi), "area": 1 / np.pi}[
         light.kind
@@ -250,8 +244,7 @@ def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
 
 
 def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
-    """Positions (points, 3) that stand for a light, and the width of each for
-    `raster.cpu.shade`."""
+    """Positions (points, 3) that stand for a light, and the width of each."""
     if light.kind == "sun":
         return light.position[None], float(np.tan(light.angle / 2))
     if light.kind != "area":
@@ -269,8 +262,7 @@ def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def distant_light(light: Light, center: np.ndarray) -> np.ndarray:
-    """(9, 3) harmonics of a light as if it were far away from a head around `center` (3,), without
-    shadows."""
+    """(9, 3) harmonics of a light as if far away from a head at `center` (3,), unshadowed."""
     found = np.zeros((COUNT, 3))
     for row in light_rows(light, center, -1):
         toward, strength, _ = toward_light(row, np.asarray(center, np.float32)[:, None])

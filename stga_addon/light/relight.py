@@ -1,5 +1,4 @@
-"""Colors of an avatar's splats under the light of a scene, and how much of the recorded ones that
-light keeps."""
+"""Colors of splats under a scene's light, and how much of the recorded ones that light keeps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,8 +40,7 @@ class Kept:
 
 
 def recorded_light(transfer: np.ndarray, bounce: Bounce, irradiance: np.ndarray) -> np.ndarray:
-    """(9, 3) harmonics of the light that gave vertices of the neutral mesh irradiance (V, 3);
-    transfer (V, 9)."""
+    """(9, 3) of the light that gave the neutral mesh irradiance (V, 3); transfer (V, 9)."""
     direct = np.repeat(transfer.T[..., None].astype(np.float64), 3, axis=2)
     columns = np.stack([each + bounce.light(each) for each in direct], axis=1)
     found = np.empty((COUNT, 3))
@@ -86,8 +84,7 @@ def _smooth_step(values: np.ndarray) -> np.ndarray:
     return np.asarray(values * values * (3 - 2 * values))
 
 
-REFLECTANCE = 0.04
-"""Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
+REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
 MIN_IRRADIANCE = 0.15
 """Least irradiance of the capture that color is divided by, as a share of its mean: what was darker
 is noise."""
@@ -149,8 +146,7 @@ class Relighter:
 
     @cached_property
     def diffuse_color(self) -> np.ndarray:
-        """(N, 3) recorded sRGB without what depends on the view: mean over directions from which a
-        splat is seen."""
+        """(N, 3) recorded sRGB, mean over directions from which a splat is seen."""
         sh = self.avatar.splats.sh
         means = np.repeat(VIEW_MEANS, (1, 3, 5, 7))[: sh.shape[1], None].astype(np.float32)
         normals = self._at_splats(
@@ -160,8 +156,7 @@ class Relighter:
 
     @cached_property
     def recorded_light(self) -> np.ndarray:
-        """(9, 3) harmonics of the capture's light in the axes of the neutral mesh, mean over its
-        timesteps."""
+        """(9, 3) of the capture's light in the neutral mesh's axes, mean over time."""
         return recorded_light(self.light.transfer, self.bounce, self.light.irradiance)
 
     @cached_property
@@ -170,14 +165,12 @@ class Relighter:
         return find_lashes(self.avatar, self.corners, self.weights, self.roughness, self.albedo)
 
     def lash_casters(self, mesh: np.ndarray, lighting: Lighting) -> tuple[Caster, ...]:
-        """The lashes of a head posed as `mesh` (V, 3), where there are any and a light throws
-        shadows."""
+        """The lashes of a head posed as `mesh` (V, 3), if a light throws shadows."""
         shadowed = lighting.shadows and any(light.casts_shadow for light in lighting.lights)
         return (self.lashes.caster(mesh),) if shadowed and len(self.lashes.face) else ()
 
     def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
-        """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh`
-        (V, 3): what `transfer` is multiplied with."""
+        """(9, 3) of the world in the neutral mesh's axes, for a posed `mesh` (V, 3)."""
         # Open vertices, which the jaw moves least, say how the head is turned.
         weights = np.asarray(self.light.occlusion, np.float64) + 1e-3
         rotation, _ = weighted_procrustes(
@@ -270,8 +263,7 @@ class Relighter:
         world: np.ndarray,
         roughness: np.ndarray,
     ) -> np.ndarray:
-        """(N, 3) of the world: its mean radiance around the mirrored direction times the lobe's
-        reflectance (Karis 2014)."""
+        """(N, 3) of the world: radiance around the mirrored direction (Karis 2014)."""
         if not np.any(world):
             return np.zeros_like(points)
         view = self._unit(eye.astype(np.float32) - points)

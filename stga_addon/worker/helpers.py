@@ -27,21 +27,17 @@ from ..files import read_npz, write_npz
 from .launch import end_with_this_process, start_python
 from .training_python import own_python
 
-MAX_HELPERS = 8
-"""Each takes some 300 MB."""
+MAX_HELPERS = 8  # Each takes some 300 MB
 THREADS_VARIABLE = "OMP_NUM_THREADS"
 SINGLE = dict.fromkeys(
     (THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
-)
-"""Environment variables of a helper."""
+)  # Environment variables of a helper
 REPORT_INTERVAL_S = 0.2
-STEPS_KEY = "steps"
-"""In the file of a kept result: how many steps it took."""
+STEPS_KEY = "steps"  # In the file of a kept result: how many steps it took
 STEP, RESULT, ERROR = "step", "result", "error"
 """What a helper's messages are: a pair of this and a value."""
 
-Step = Callable[[], None]
-"""Called by work after each of its steps."""
+Step = Callable[[], None]  # Called by work after each of its steps
 
 
 def processors() -> int:
@@ -110,8 +106,7 @@ class Helpers:
         return self._shared(work, parts, done, count)
 
     def run(self, work: Callable[..., Any], part: tuple, done: Callable[[int], None]) -> Any:
-        """The result of work(*part, step) of one helping process, as `map`; for what is not worth
-        two."""
+        """The result of work(*part, step) of one helper, as `map`; for what is not worth two."""
         if self._count < 2:
             return self.map(work, [part], done)[0]
         return self._shared(work, [part], done, 1)[0]
@@ -153,8 +148,7 @@ def _digest(work: Callable[..., Any], part: tuple) -> str:
 def _kept(
     file: Path, work: Callable[..., dict[str, Any]], part: tuple, step: Step
 ) -> dict[str, Any]:
-    """The result of work(*part, step), read from the file where it is there and whole, else written
-    into it."""
+    """The result of work(*part, step), read from the file where it is whole, else written there."""
     with suppress(StgaError, KeyError, TypeError):
         found = read_npz(file)
         for _ in range(int(found.pop(STEPS_KEY))):
@@ -184,8 +178,7 @@ class _Counter:
 
 
 class _Task:
-    """What `Helpers.map` does at a time: parts that are left, and results and errors of the
-    others."""
+    """What `Helpers.map` does at a time: parts that are left, results and errors."""
 
     def __init__(self, work: Callable[..., Any], parts: Sequence[tuple]) -> None:
         self.results: list[Any] = [None] * len(parts)
@@ -236,8 +229,7 @@ def _start() -> "subprocess.Popen[bytes]":
 
 
 class _Unpickler(pickle.Unpickler):
-    """Finds this package's functions and classes by the name that it has in this process: another
-    one in Blender."""
+    """Finds this package's names under its name in this process: another one in Blender."""
 
     def find_class(self, module: str, name: str) -> Any:
         own = (__package__ or "").removesuffix(".worker")
@@ -268,8 +260,7 @@ def claim_stdout() -> BinaryIO:
 
 
 def help_until_closed() -> None:
-    """Work on what comes from standard input, and answer on standard output, until the process that
-    asks has gone."""
+    """Work on what comes from stdin, and answer on stdout, until the asker has gone."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks

@@ -27,8 +27,7 @@ PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 NICENESS, BACKGROUND_NICENESS = 5, 15
 """Added to the nice value of a worker, so that Blender has precedence, and of what runs in the
 background, so that workers have."""
-PR_SET_PDEATHSIG = 1
-"""Of prctl(2)."""
+PR_SET_PDEATHSIG = 1  # Of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
 _DETACHED: dict[str, Any] = (
@@ -102,8 +101,7 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
 
 
 def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start `python -m ARGUMENTS…` at low priority, without a status; what it prints is dropped.
-    Raises StgaError where the interpreter cannot be started."""
+    """Start `python -m ARGUMENTS…` at low priority, without status and output."""
     nothing = subprocess.DEVNULL
     process = start_python(
         python, arguments, stdin=nothing, stdout=nothing, stderr=nothing, **_DETACHED
@@ -196,8 +194,7 @@ def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, s
 
 
 def same_interpreter_environment(variables: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables for another process of this interpreter: the packages that this process
-    finds."""
+    """For another process of this interpreter, with the packages of this one."""
     return {
         **variables,
         "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)]),

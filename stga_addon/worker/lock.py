@@ -1,5 +1,4 @@
-"""Lock files that end with the process that holds them; leases, which it renews, where the storage
-has no locks."""
+"""Lock files that end with their process; leases, which it renews, on storage without locks."""
 
 import errno
 import os
@@ -59,7 +58,13 @@ def _hold_file_lock(path: Path) -> Iterator[None]:
     except Timeout as error:
         raise BlockingIOError(f"{path} is held by another process") from error
     try:
-        _write_owner(path)
+        with suppress(OSError):  # only messages need it
+            descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                os.lseek(descriptor, OWNER_OFFSET, os.SEEK_SET)
+                os.write(descriptor, b"%-20d" % os.getpid())
+            finally:
+                os.close(descriptor)
         yield
     finally:
         with suppress(OSError):  # Windows removes no open file, which leaves an empty lock behind
@@ -69,8 +74,7 @@ def _hold_file_lock(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
-    """Wait until another holder is gone, or has stood still for EXPIRY_S. Raises BlockingIOError
-    when it renews."""
+    """Wait until another holder is gone or still for EXPIRY_S; BlockingIOError if it renews."""
     lease = SoftFileLease(
         path, lease_duration=EXPIRY_S, heartbeat_interval=BEAT_S, thread_local=False
     )
@@ -90,8 +94,7 @@ def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process holds the lock; False where the file is missing or cannot be
-    opened."""
+    """Whether a living process holds the lock; False where it cannot be opened."""
     if not path.is_file() or path.is_symlink():
         return False
     try:
@@ -137,13 +140,3 @@ def _is_renewed(lease: Path) -> bool:
     with suppress(OSError), tempfile.TemporaryFile(dir=lease.parent) as now:
         return before is not None and os.fstat(now.fileno()).st_mtime - before < EXPIRY_S
     return False
-
-
-def _write_owner(path: Path) -> None:
-    with suppress(OSError):  # only messages need it
-        descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0))
-        try:
-            os.lseek(descriptor, OWNER_OFFSET, os.SEEK_SET)
-            os.write(descriptor, b"%-20d" % os.getpid())
-        finally:
-            os.close(descriptor)

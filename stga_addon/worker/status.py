@@ -25,13 +25,10 @@ from ..files import file_size, read_json, write_json
 from .lock import hold_lock, is_locked, lock_owner
 
 STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
-STATUS_INTERVAL_S = 0.5
-"""Least time between two writes of status.json with the same message."""
-MIN_FREE_BYTES = 1 << 20
-"""Free space below which a disk counts as full."""
+STATUS_INTERVAL_S = 0.5  # Least time between two writes of status.json with the same message
+MIN_FREE_BYTES = 1 << 20  # Free space below which a disk counts as full
 LOG_TAIL_LINES, REPORT_LOG_LINES = 6, 200
-MAX_LOG_LINE_BYTES = 400
-"""Assumed length of a log line, which bounds how much of the log is read."""
+MAX_LOG_LINE_BYTES = 400  # Assumed length of a log line, which bounds how much of the log is read
 
 
 class WorkerState(StrEnum):
@@ -81,8 +78,7 @@ class WorkerStatus:
 
 @dataclass(frozen=True)
 class WorkerSnapshot:
-    """State and status of a worker at one moment; `log_tail`: the last lines of its log where it
-    failed."""
+    """State and status of a worker; `log_tail`: the last lines of its log where it failed."""
 
     state: WorkerState = WorkerState.NONE
     status: WorkerStatus = field(default_factory=WorkerStatus)
@@ -110,8 +106,7 @@ def derive_state(
 
 
 def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None) -> WorkerSnapshot:
-    """Snapshot of the worker of a status folder; `process`: the worker, where this process started
-    it."""
+    """Snapshot of a status folder; `process`: its worker, where this process started it."""
     code = None if process is None else process.poll()
     # The process before the status: one that ends between the two reads has written its final
     # status by then.
@@ -192,8 +187,7 @@ def failure_report(folder: Path, snapshot: WorkerSnapshot) -> str:
 
 
 def request_cancel(folder: Path) -> None:
-    """Ask the worker to stop and to keep what it has. Raises StgaError where the folder cannot be
-    written."""
+    """Ask the worker to stop and to keep what it has. Raises StgaError."""
     path = folder / CANCEL_FILE
     try:
         with suppress(FileExistsError):

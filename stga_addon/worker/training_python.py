@@ -1,5 +1,4 @@
-"""The Python that tracks and trains: Blender's own where it has the packages, or one that was
-chosen."""
+"""The Python that tracks and trains: Blender's own with the packages, or a chosen one."""
 
 import os
 import sys

@@ -13,12 +13,9 @@ from ...worker.launch import start_worker
 from ...worker.status import inspect_worker
 from ..plan import Ended, Job, training_python
 
-MEMORY_SHARE = 0.9
-"""Share of the memory that is free at the start that workers may use."""
-GPUS = 1
-"""Jobs at once that need a GPU to themselves."""
-IS_WINDOWS = os.name == "nt"
-"""There, a kill is an exit status like others: 1 by the task manager."""
+MEMORY_SHARE = 0.9  # Share of the memory that is free at the start that workers may use
+GPUS = 1  # Jobs at once that need a GPU to themselves
+IS_WINDOWS = os.name == "nt"  # There, a kill is an exit status like others: 1 by the task manager
 
 
 class LocalEngine:
@@ -41,8 +38,7 @@ class LocalEngine:
         self._jobs: dict[str, tuple[Job, subprocess.Popen[bytes] | None]] = {}
 
     def has_room(self, job: Job) -> bool:
-        """Whether it fits beside what is running; a job that is larger than the machine runs
-        alone."""
+        """Whether it fits beside what is running; a job larger than the machine runs alone."""
         if not self._jobs:
             return True
         wanted = [job.resources, *(other.resources for other, _ in self._jobs.values())]
@@ -75,7 +71,10 @@ class LocalEngine:
             snapshot = inspect_worker(job.request_folder, process)
             if not snapshot.state.is_alive:
                 del self._jobs[name]
-                found[name] = Ended(snapshot, process is None or _is_kill(process.returncode))
+                # killed, unless it is the status of a mistake (2) or of a bug (1)
+                code = None if process is None else process.returncode
+                is_lost = not code or code < 0 or (IS_WINDOWS and code != 2)
+                found[name] = Ended(snapshot, is_lost)
         return found
 
     def withdraw(self) -> Sequence[str]:
@@ -83,12 +82,6 @@ class LocalEngine:
 
     def close(self) -> None:
         """Workers go on; nothing is held."""
-
-
-def _is_kill(code: int | None) -> bool:
-    """Whether an exit status, of a worker without a final status, is that of a kill; a mistake's is
-    2, a bug's 1."""
-    return not code or code < 0 or (IS_WINDOWS and code != 2)
 
 
 def free_memory_gb() -> float:

@@ -19,10 +19,8 @@ from ...worker.status import LOG_FILE, inspect_worker, read_status
 from ...worker.training_python import PYTHON_VARIABLE
 from ..plan import Ended, Job, job_command
 
-MAX_WAITING = 1000
-"""Tasks that are submitted at once: more wait here, not in Ray's memory."""
-NODE_RETRIES = 5
-"""How often Ray begins a task again elsewhere whose machine has gone."""
+MAX_WAITING = 1000  # Tasks that are submitted at once: more wait here, not in Ray's memory
+NODE_RETRIES = 5  # How often Ray begins a task again elsewhere whose machine has gone
 TOKEN_MODE, TOKEN = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN"
 """Environment variables by which only who has the token may use a cluster (Ray 2.52)."""
 
@@ -83,8 +81,7 @@ class RayEngine:
         self._adopted[job.name] = job
 
     def running(self) -> Mapping[str, str]:
-        """The jobs that have written a status: Ray does not tell cheaply which tasks wait for a
-        machine."""
+        """The jobs that have written a status; Ray does not tell cheaply which tasks wait."""
         jobs = [*self._jobs.values(), *self._adopted.values()]
         begun = [job for job in jobs if read_status(job.request_folder) is not None]
         return dict.fromkeys((job.name for job in begun), "")
@@ -129,8 +126,7 @@ class RayEngine:
 
 
 def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
-    """The function that Ray carries out. It is sent to the machine as it is, which need not have
-    this package in the Python that Ray runs in: it uses nothing from outside itself."""
+    """What Ray carries out: sent as it is to machines without this package, it uses only itself."""
 
     def run_command(command: list[str], packages: str, log: str) -> int:
         """Run a command with its output in a log; returns its exit code. On Linux it ends with

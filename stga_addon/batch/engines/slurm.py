@@ -23,10 +23,8 @@ from ...worker.status import LOG_FILE, WorkerState, inspect_worker
 from ..plan import Ended, Job, Resources, job_command, kind_name
 
 TIMEOUT_S = 60.0
-MAX_ARRAY = 1000
-"""Jobs of an array: SLURM's default MaxArraySize is 1001."""
-QUEUE_FORMAT = "%i|%T|%N"
-"""Of squeue: job, state, machines."""
+MAX_ARRAY = 1000  # Jobs of an array: SLURM's default MaxArraySize is 1001
+QUEUE_FORMAT = "%i|%T|%N"  # Of squeue: job, state, machines
 ON_MACHINE = ("RUNNING", "COMPLETING", "CONFIGURING", "STAGE_OUT")
 GRACE_S = 10.0
 """Seconds after its submission in which a job that squeue does not list yet is not gone."""
@@ -128,8 +126,7 @@ class SlurmEngine:
         return {name: machine for name, (state, machine) in found.items() if state in ON_MACHINE}
 
     def _ask(self) -> bool:
-        """Ask what is in the queue; False where squeue does not answer. Raises StgaError after
-        MAX_SILENCE_S."""
+        """Whether squeue answers what is in the queue; StgaError after MAX_SILENCE_S."""
         try:
             self._states = _queue()
         except StgaError:
@@ -187,9 +184,7 @@ def _array(name: str) -> str:
 
 
 def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
-    """The jobs, which follow those that they come after, in arrays of the same kind and needs, in
-    an order in which no array waits for a later one: jobs of an array are as many steps from the
-    first."""
+    """Arrays of the same kind and needs, as many steps from the first: none waits for a later."""
     step: dict[str, int] = {}
     arrays: dict[tuple[int, str, Resources, int], list[Job]] = {}
     for job in jobs:
@@ -202,8 +197,7 @@ def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
 
 
 def _script(jobs: Sequence[Job]) -> str:
-    """What each job of an array runs: the command of its index, with its output in the job's own
-    log."""
+    """What each job of an array runs: the command of its index, with its output in its own log."""
     packages = shlex.quote(str(PACKAGES_FOLDER))
     lines = ["#!/bin/sh", "# A batch of stga; each job continues what it began before."]
     lines += [f"export PYTHONPATH={packages}", "case $SLURM_ARRAY_TASK_ID in"]

@@ -8,8 +8,7 @@ from ..performance import ARKIT_SHAPES, COLUMN, COUNT, MAX_WEIGHT, OPTIONAL, Fac
 
 VERSION = 6
 MAX_TEXT_BYTES = 512
-ROTATIONS = 9
-"""Yaw, pitch and roll of the head and of both eyes, after the shapes."""
+ROTATIONS = 9  # Yaw, pitch and roll of the head and of both eyes, after the shapes
 _TIME = struct.Struct(">ifii")
 _EXCHANGED = {
     "jawRight": "jawLeft",
@@ -58,10 +57,6 @@ def decode(data: bytes) -> FacePacket | None:
     values = np.array(struct.unpack_from(f">{count}f", data, at + 1))
     if not (np.abs(values) <= MAX_WEIGHT).all():
         return None
-    return _packet(values, subject, time)
-
-
-def _packet(values: np.ndarray, subject: str, time: float | None) -> FacePacket:
     names = (
         PACKET_SHAPES
         if len(values) >= COUNT
