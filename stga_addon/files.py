@@ -131,9 +131,8 @@ class NumberedFiles:
             ]
             other = next((path.name for path in self._found() if path not in self._earlier), None)
         if other is not None:
-            raise StgaError(
-                f"{folder}: holds {other}, which was not written here; choose another folder"
-            )
+            problem = f"holds {other}, which was not written here; choose another folder"
+            raise StgaError(f"{folder}: {problem}")
 
     def add(self, name: str, content: Path) -> None:
         """List a file before it gets its name; `content`: the whole file, under another one."""
@@ -243,9 +242,8 @@ def file_size(path: Path) -> int:
     try:
         found = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        raise StgaError(
-            f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
-        ) from error
+        problem = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise StgaError(f"{path}: {problem}") from error
     if not stat.S_ISREG(found.st_mode):
         raise StgaError(f"{path}: cannot be read (is not a regular file)")
     return found.st_size
@@ -308,9 +306,8 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())
             if unpacked > MAX_UNPACKED_BYTES:
-                raise StgaError(
-                    f"{path}: unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
-                )
+                problem = f"unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
+                raise StgaError(f"{path}: {problem}")
             return {
                 entry.filename.removesuffix(".npy"): _read_entry(archive, entry)
                 for entry in archive.infolist()
@@ -322,9 +319,8 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:
         # A damaged archive can make its decompressor or the parser of an array header raise nearly
         # anything.
-        raise StgaError(
-            f"{path}: is not a readable npz file ({error or type(error).__name__})"
-        ) from error
+        problem = f"is not a readable npz file ({error or type(error).__name__})"
+        raise StgaError(f"{path}: {problem}") from error
 
 
 def read_npy(path: Path) -> np.ndarray:
@@ -336,9 +332,8 @@ def read_npy(path: Path) -> np.ndarray:
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # as above
-        raise StgaError(
-            f"{path}: is not a readable npy file ({error or type(error).__name__})"
-        ) from error
+        problem = f"is not a readable npy file ({error or type(error).__name__})"
+        raise StgaError(f"{path}: {problem}") from error
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:

@@ -20,20 +20,12 @@ MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
 
 
 def option(
-    help: str,
-    default: Any = dataclasses.MISSING,
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    *,
-    flag: str = "",
-    metavar: str = "",
-    parse: Callable[[str], Any] | None = None,
-    bare: Any = None,
-    offered: Collection[str] | None = None,
-    group: str = "",
-    needs: tuple[str | tuple[str, ...], ...] = (),
-    **limits: Any,
-) -> Any:
+    help: str, default: Any = dataclasses.MISSING, minimum: float = -math.inf,
+    maximum: float = math.inf, *, flag: str = "", metavar: str = "",
+    parse: Callable[[str], Any] | None = None, bare: Any = None,
+    offered: Collection[str] | None = None, group: str = "",
+    needs: tuple[str | tuple[str, ...], ...] = (), **limits: Any,
+) -> Any:  # fmt: skip
     """A dataclass field that people choose, with its limits (`schema.setting`).
 
     help     what it is, for command line and tooltip; of a field that is a dataclass, the title of
@@ -102,11 +94,9 @@ def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] =
 
 def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
     """What `add_argument` takes for a field, by its type."""
-    (kind,), asked, flag = (
-        (k for k in alternatives(hint) if k is not NoneType),
-        spec.metadata,
-        flag_of(spec),
-    )
+    (kind,) = (k for k in alternatives(hint) if k is not NoneType)
+    asked = spec.metadata
+    flag = flag_of(spec)
     is_named = flag.startswith("-")
     form: dict[str, Any] = {"names": (flag,), "dest": spec.name, "required": is_required}
     if not is_named:

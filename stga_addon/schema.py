@@ -23,17 +23,12 @@ Arrays = dict[str, np.ndarray]
 
 
 def setting(
-    default: Any = dataclasses.MISSING,
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    above: float = -math.inf,
-    choices: Collection[str] | None = None,
-    accepts: Callable[[Any], bool] | None = None,
-    expected: str = "",
-    is_path: Callable[[str], bool] | None = None,
-    default_factory: Any = dataclasses.MISSING,
+    default: Any = dataclasses.MISSING, minimum: float = -math.inf, maximum: float = math.inf,
+    above: float = -math.inf, choices: Collection[str] | None = None,
+    accepts: Callable[[Any], bool] | None = None, expected: str = "",
+    is_path: Callable[[str], bool] | None = None, default_factory: Any = dataclasses.MISSING,
     **option: Any,
-) -> Any:
+) -> Any:  # fmt: skip
     """A dataclass field with its allowed values; the bounds hold for each number of a tuple.
 
     minimum, maximum  inclusive; above: exclusive lower bound
@@ -249,9 +244,8 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
         if not isinstance(value, dict) or value.keys() != hints.keys():
             differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
             fields = ", ".join(sorted(map(str, differing)))[:200]
-            raise StgaError(
-                f"{where}{': ' if where else ''}fields are missing or unknown ({fields})"
-            )
+            problem = f"{where}{': ' if where else ''}fields are missing or unknown ({fields})"
+            raise StgaError(problem)
         return kind(
             **{
                 name: _parsed(hint, value[name], _joined(where, name), arrays)

@@ -36,22 +36,17 @@ class SelectionOptions:
 
     def __post_init__(self) -> None:
         if not (isinstance(self.threshold, int | float) and 0 <= self.threshold < math.inf):
-            raise StgaError(
-                f"selection threshold must be a distance in meters, got {shorten(self.threshold)}"
-            )
+            problem = f"got {shorten(self.threshold)}"
+            raise StgaError(f"selection threshold must be a distance in meters, {problem}")
         if self.zero_pose not in ZERO_POSES:
-            raise StgaError(
-                f"zero_pose is {shorten(self.zero_pose)}, expected one of {', '.join(ZERO_POSES)}"
-            )
+            expected = f"expected one of {', '.join(ZERO_POSES)}"
+            raise StgaError(f"zero_pose is {shorten(self.zero_pose)}, {expected}")
 
 
 def select_faces(
-    mesh: np.ndarray,
-    neutral: np.ndarray,
-    faces: np.ndarray,
-    regions: Mapping[str, np.ndarray],
+    mesh: np.ndarray, neutral: np.ndarray, faces: np.ndarray, regions: Mapping[str, np.ndarray],
     threshold: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """(F,) bool: the triangles whose splats this frame trains.
 
     mesh, neutral (V, 3) meters without rigid head motion; faces (F, 3); regions name -> (F,) bool.

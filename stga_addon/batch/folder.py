@@ -72,9 +72,8 @@ def _input_digest(path: Path, written: Set[str]) -> str:
         else:
             lines = [_line(path.name, path.stat())]
     except OSError as error:
-        raise StgaError(
-            f"{error.filename or path}: cannot be read ({error.strerror or error})"
-        ) from error
+        problem = f"cannot be read ({error.strerror or error})"
+        raise StgaError(f"{error.filename or path}: {problem}") from error
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
 
 
@@ -111,9 +110,8 @@ def hold_folder(folder: Path) -> Iterator[SoftFileLease]:
             folder.mkdir(parents=True, exist_ok=True)
             lease = held.enter_context(hold_lock(path, leased=True))
         except BlockingIOError as error:
-            raise StgaError(
-                f"{folder}: another batch is working in this folder (process {lock_owner(path)})"
-            ) from error
+            problem = f"another batch is working in this folder (process {lock_owner(path)})"
+            raise StgaError(f"{folder}: {problem}") from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         assert lease is not None

@@ -290,25 +290,22 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
 def _require_keys(where: str, values: Mapping[str, Any], allowed: Sequence[str]) -> None:
     unknown = next((key for key in values if key not in allowed), None)
     if unknown is not None:
-        raise StgaError(
-            f"{where}: {unknown}: is not a key of it; expected one of {', '.join(allowed)}"
-        )
+        problem = f"{unknown}: is not a key of it; expected one of {', '.join(allowed)}"
+        raise StgaError(f"{where}: {problem}")
 
 
 def _job(source: str, name: str, table: Any, base: Path, out: Path, shared: Resources) -> Job:
     """The job of a table, which waits for those that its `after` names."""
     where = f"{source}: [job.{name if NAME.fullmatch(name) else shorten(name)}]"
     if not NAME.fullmatch(name) or name == REPLACED:
-        raise StgaError(
-            f"{where}: expected a name of letters, digits, '_', '.' and '-', other than '{REPLACED}'"
-        )
+        problem = f"expected a name of letters, digits, '_', '.' and '-', other than '{REPLACED}'"
+        raise StgaError(f"{where}: {problem}")
     if not isinstance(table, dict):
         raise StgaError(f"{where}: expected a table, got {shorten(table)}")
     kind = KINDS.get(table["request"]) if isinstance(table.get("request"), str) else None
     if kind is None:
-        raise StgaError(
-            f"{where}: request: expected one of {', '.join(KINDS)}, got {shorten(table.get('request'))}"
-        )
+        problem = f"expected one of {', '.join(KINDS)}, got {shorten(table.get('request'))}"
+        raise StgaError(f"{where}: request: {problem}")
     after, minutes = table.get("after", []), table.get("minutes")
     if not isinstance(after, list) or not all(isinstance(other, str) for other in after):
         raise StgaError(f"{where}: after: expected a list of job names, got {shorten(after)}")
@@ -421,9 +418,8 @@ def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
         for name, paths in input_paths(job.request).items():
             for path in paths:
                 if path == job.folder.parent:
-                    raise StgaError(
-                        f"{where}: {name}: {path} is the batch's own folder; choose another 'out'"
-                    )
+                    problem = f"{name}: {path} is the batch's own folder; choose another 'out'"
+                    raise StgaError(f"{where}: {problem}")
                 maker = next(
                     (by_folder[folder] for folder in (path, *path.parents) if folder in by_folder),
                     None,

@@ -132,20 +132,14 @@ def run_batch(
 
 class _Loop:
     def __init__(
-        self,
-        batch: Batch,
-        engine: Engine,
-        lease: SoftFileLease,
-        show: Callable[[Batch], None],
+        self, batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None],
         say: Say,
-    ) -> None:
-        self._batch, self._engine, self._lease, self._show, self._say = (
-            batch,
-            engine,
-            lease,
-            show,
-            say,
-        )
+    ) -> None:  # fmt: skip
+        self._batch = batch
+        self._engine = engine
+        self._lease = lease
+        self._show = show
+        self._say = say
         self._entries = batch.entries
         self._shown_s = 0.0
         self._position = {name: number for number, name in enumerate(self._entries)}
@@ -170,9 +164,8 @@ class _Loop:
         self._adopt()
         while self._left:
             if self._lease.compromise is not None:
-                raise StgaError(
-                    f"{self._batch.plan.out}: another batch has taken this folder; this one has ended"
-                )
+                problem = "another batch has taken this folder; this one has ended"
+                raise StgaError(f"{self._batch.plan.out}: {problem}")
             begun = self._begin()
             ended = self._collect()
             self._look()

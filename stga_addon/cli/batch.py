@@ -89,18 +89,16 @@ def batch_plan(options: Namespace) -> Plan:
             raise StgaError(f"{sources[1]}: cannot be given beside a plan")
         for spec in option_fields(BatchOptions):
             if spec.name in given:
-                raise StgaError(
-                    f"{flag_of(spec)}: has no effect with a plan, which says that itself"
-                )
+                problem = "has no effect with a plan, which says that itself"
+                raise StgaError(f"{flag_of(spec)}: {problem}")
         return read_plan(sources[0])
     out = given.pop("out", None)
     if out is None:
         raise StgaError("--out: is missing; expected the folder of the batch")
     missing = next((path for path in sources if not path.is_dir()), None)
     if missing is not None:
-        raise StgaError(
-            f"{missing}: is not a folder; expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
-        )
+        expected = f"expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
+        raise StgaError(f"{missing}: is not a folder; {expected}")
     settings: dict[str, Any] = {
         name: given[name] for name in ("preset", "seconds", "iterations", "seed") if name in given
     }
@@ -157,6 +155,5 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     failures = batch.failures
     if failures:
         first = failures[0]
-        raise StgaError(
-            f"{len(failures)} of {len(plan.jobs)} jobs failed; {first.job.name}: {first.error}"
-        )
+        problem = f"{first.job.name}: {first.error}"
+        raise StgaError(f"{len(failures)} of {len(plan.jobs)} jobs failed; {problem}")

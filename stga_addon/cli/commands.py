@@ -114,19 +114,16 @@ def _train(options: Namespace, head: OpenHead | None) -> None:
         carry_out(Resume(**given))
         return
     if has_run(options.run):
-        raise StgaError(
-            f"{options.run}: already holds a run; give --resume to continue it, or another --out"
-        )
+        problem = "already holds a run; give --resume to continue it, or another --out"
+        raise StgaError(f"{options.run}: {problem}")
     carry_out(Train(settings=_settings(options), **given))
 
 
 def _settings(options: Namespace) -> TrainingSettings:
     """The settings of a new run. Raises StgaError for options that do not go together."""
     given = given_options(options, TrainingSettings)
-    paper, other_method = (
-        given.get("schedule") == "paper",
-        given.get("strategy") == "gaussian-avatars",
-    )
+    paper = given.get("schedule") == "paper"
+    other_method = given.get("strategy") == "gaussian-avatars"
     for named, is_replaced, by in (
         ("--schedule paper", paper and other_method, "--strategy gaussian-avatars"),
         ("--preset", "preset" in given and paper, "--schedule paper"),
@@ -140,9 +137,8 @@ def _settings(options: Namespace) -> TrainingSettings:
         given.setdefault("effects", {})
     settings, selection = make_settings(**given), given_options(options, SelectionOptions)
     if selection and settings.strategy != "selective":
-        raise StgaError(
-            "--threshold: has no effect without --strategy selective, or --schedule paper"
-        )
+        problem = "has no effect without --strategy selective, or --schedule paper"
+        raise StgaError(f"--threshold: {problem}")
     return replace(settings, selection=replace(settings.selection, **selection))
 
 
@@ -155,15 +151,13 @@ def _refuse_changes(options: Namespace, run: Run) -> None:
         for spec in option_fields(kind):
             value, given = getattr(began_with, spec.name), getattr(options, spec.name, None)
             if given not in (None, value) and spec.name != "effects":
-                raise StgaError(
-                    f"{flag_of(spec)}: this run began with {value}, which cannot change; use another --out"
-                )
+                problem = f"this run began with {value}, which cannot change; use another --out"
+                raise StgaError(f"{flag_of(spec)}: {problem}")
     decided = {decision.effect: "on" if decision.on else "off" for decision in run.effect_plan}
     for name, choice in options.effects or ():
         if name not in decided or choice not in ("auto", decided[name]):
-            raise StgaError(
-                f"--effect {name}={choice}: differs from what was decided for this run; use another --out"
-            )
+            problem = "differs from what was decided for this run; use another --out"
+            raise StgaError(f"--effect {name}={choice}: {problem}")
 
 
 @dataclass(frozen=True)
@@ -249,9 +243,8 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
         else:
             folder = given.setdefault("run", next_folder(options.parent))
             if has_run(folder):
-                raise StgaError(
-                    f"{folder}: already holds a run; choose another --out, or give --resume and this folder"
-                )
+                problem = "choose another --out, or give --resume and this folder"
+                raise StgaError(f"{folder}: already holds a run; {problem}")
             if not {"seconds", "iterations"} & given.keys():
                 given["seconds"] = seconds
             carry_out(kind(**given))
@@ -265,13 +258,11 @@ def _resume(kind: Any, given: dict[str, Any], select_only: Path | None) -> None:
     flags += ["--select-only"] if select_only else []
     useless = next((flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None)
     if useless is not None:
-        raise StgaError(
-            f"{useless}: cannot be combined with --resume, which continues the run in RUN as it began"
-        )
+        problem = "cannot be combined with --resume, which continues the run in RUN as it began"
+        raise StgaError(f"{useless}: {problem}")
     if read_run(given["parent"]).continuation is None:
-        raise StgaError(
-            f"{given['parent']}: does not continue another run; resume it with `stga train --resume`"
-        )
+        problem = "does not continue another run; resume it with `stga train --resume`"
+        raise StgaError(f"{given['parent']}: {problem}")
     carry_out(
         Resume(
             given["parent"], **{name: given[name] for name in ("flame", "device") if name in given}

@@ -138,10 +138,8 @@ def _fitted(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> Head
 def _named(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
     """The map of a model without identity components whose expressions are ARKit's shapes."""
     columns = [COLUMN[name] for name in person.expression_names]
-    targets, expressions = (
-        np.zeros((COUNT, used.sum(), 3)),
-        np.zeros((FEATURES, person.n_expression)),
-    )
+    targets = np.zeros((COUNT, used.sum(), 3))
+    expressions = np.zeros((FEATURES, person.n_expression))
     targets[columns] = [
         points.on(shape, person.faces) for shape in np.moveaxis(person.shapedirs, 2, 0)
     ]

@@ -231,14 +231,10 @@ class Motion:
 
 
 def open_motion(
-    path: Path,
-    flame: Path | None,
-    neutral: np.ndarray,
-    faces: np.ndarray,
-    options: MotionOptions | None = None,
-    trained: TrainedRange | None = None,
+    path: Path, flame: Path | None, neutral: np.ndarray, faces: np.ndarray,
+    options: MotionOptions | None = None, trained: TrainedRange | None = None,
     fps: float | None = None,
-) -> Motion:
+) -> Motion:  # fmt: skip
     """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles
     `faces` (F, 3).
 
@@ -271,9 +267,8 @@ def open_motion(
         )
     capture = open_capture(path, flame)
     if capture.flame is None:
-        raise StgaError(
-            f"{path}: was not tracked with FLAME, so it has no parameters of expression and pose"
-        )
+        problem = "was not tracked with FLAME, so it has no parameters of expression and pose"
+        raise StgaError(f"{path}: {problem}")
     _check_faces(path, capture.flame.model, faces)
     sequence = transferred_motion(capture.flame, neutral)
     frames, beyond = adapted(
@@ -285,13 +280,9 @@ def open_motion(
 
 
 def performed(
-    performance: Performance,
-    person: FlameSequence,
-    name: str,
-    options: MotionOptions,
-    trained: TrainedRange | None = None,
-    fps: float | None = None,
-) -> Motion:
+    performance: Performance, person: FlameSequence, name: str, options: MotionOptions,
+    trained: TrainedRange | None = None, fps: float | None = None,
+) -> Motion:  # fmt: skip
     """A performance on a person's head, a timestep per 1/fps seconds; `name` is for errors."""
     # `frames_of` applies it
     prepared = prepared_performance(performance, replace(options, strength=1.0), fps)
@@ -389,6 +380,5 @@ def _with_frames(
 
 def _check_faces(path: Path, model: FlameModel, faces: np.ndarray) -> None:
     if not np.array_equal(model.faces, faces):
-        raise StgaError(
-            f"{path}: its mesh has other triangles than the one this avatar was trained on"
-        )
+        problem = "its mesh has other triangles than the one this avatar was trained on"
+        raise StgaError(f"{path}: {problem}")

@@ -72,9 +72,8 @@ def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
     if not missing:
         return found
     if len(missing) > COUNT // 2:
-        raise StgaError(
-            f"{where}: names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut"
-        )
+        problem = f"names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut"
+        raise StgaError(f"{where}: {problem}")
     more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
     raise StgaError(f"{where}: lacks {', '.join(missing[:MAX_NAMED])}{more}{_unknown(listed)}")
 

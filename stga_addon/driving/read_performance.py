@@ -31,9 +31,8 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     for row, text in enumerate(texts):
         found = PATTERN.fullmatch(text.strip())
         if found is None:
-            raise StgaError(
-                f"{where}: row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
-            )
+            problem = f"row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
+            raise StgaError(f"{where}: {problem}")
         hours, minutes, whole = (int(found[group]) for group in (1, 2, 3))
         fields.append(
             (hours, minutes, whole, int(found[5]), float(f"0.{found[6] or 0}"), found[4] == ";")
@@ -118,17 +117,13 @@ MAX_ROWS = 1 << 20
 DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
 MIN_FPS, MAX_FPS = 1.0, 1000.0
 HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
-COUNT_COLUMN, TIMECODE_COLUMNS, SECONDS_COLUMNS = (
-    "blendshapecount",
-    ("timecode",),
-    ("time", "timestamp", "seconds"),
-)
+COUNT_COLUMN = "blendshapecount"
+TIMECODE_COLUMNS = ("timecode",)
+SECONDS_COLUMNS = ("time", "timestamp", "seconds")
 TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
 """Endings of files that Live Link Face writes beside a take's own."""
-FRAME_KEYS, NAME_KEYS = (
-    ("frames", "weightMat", "weights"),
-    ("facsNames", "names", "blendShapeNames", "blendshapes"),
-)
+FRAME_KEYS = ("frames", "weightMat", "weights")
+NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes")
 WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
 CATEGORY_KEYS = (("categoryName", "category_name", "name"), ("score", "value", "weight"))
 
@@ -166,9 +161,8 @@ def read_performance(path: Path) -> Performance:
         return _read_csv(path)
     if suffix == ".txt":
         return _read_packets(path)
-    raise StgaError(
-        f"{path}: is no performance; expected {', '.join(SUFFIXES)} or the folder of a take"
-    )
+    problem = f"is no performance; expected {', '.join(SUFFIXES)} or the folder of a take"
+    raise StgaError(f"{path}: {problem}")
 
 
 def _take_files(folder: Path) -> list[Path]:
@@ -247,9 +241,8 @@ def _number(path: Path, row: list[str], number: int, index: int, header: list[st
     try:
         return float(text)
     except ValueError:
-        raise StgaError(
-            f"{path}: row {number + 1}: {shorten(header[index])} is {shorten(text)}, expected a number"
-        ) from None
+        problem = f"{shorten(header[index])} is {shorten(text)}, expected a number"
+        raise StgaError(f"{path}: row {number + 1}: {problem}") from None
 
 
 def _read_packets(path: Path) -> Performance:
@@ -257,9 +250,8 @@ def _read_packets(path: Path) -> Performance:
     packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
     if not known:
-        raise StgaError(
-            f"{path}: has no line of iFacialMocap, such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
-        )
+        problem = "such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
+        raise StgaError(f"{path}: has no line of iFacialMocap, {problem}")
     columns_of(str(path), known[0].names)
     weights = np.stack([packet.weights for packet in known if packet.weights is not None])
     heads = [packet.head for packet in known]
@@ -336,23 +328,18 @@ def _is_number(value: Any) -> bool:
 
 
 def _performance(
-    path: Path,
-    times: np.ndarray | None,
-    weights: np.ndarray,
-    head: np.ndarray | None,
+    path: Path, times: np.ndarray | None, weights: np.ndarray, head: np.ndarray | None,
     fps: float | None = None,
-) -> Performance:
+) -> Performance:  # fmt: skip
     """The checked performance in the order of its times; of rows with the same time the first."""
     if len(weights) > MAX_ROWS:
         raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")
     if not (np.abs(weights) <= MAX_WEIGHT).all():
-        raise StgaError(
-            f"{path}: holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
-        )
+        problem = f"holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
+        raise StgaError(f"{path}: {problem}")
     if head is not None and not (np.abs(head) <= 4 * math.pi).all():
-        raise StgaError(
-            f"{path}: head rotation is beyond two turns, or not finite; expected radians"
-        )
+        problem = "head rotation is beyond two turns, or not finite; expected radians"
+        raise StgaError(f"{path}: {problem}")
     if times is None:
         rate = DEFAULT_FPS if fps is None else fps
         times = (
@@ -361,14 +348,12 @@ def _performance(
             else np.full(len(weights), np.nan)
         )
     if not np.isfinite(times).all():
-        raise StgaError(
-            f"{path}: its times or its rate are not usable; expected {MIN_FPS:g} to {MAX_FPS:g} a second"
-        )
+        expected = f"expected {MIN_FPS:g} to {MAX_FPS:g} a second"
+        raise StgaError(f"{path}: its times or its rate are not usable; {expected}")
     times, first = np.unique(times - times.min(), return_index=True)
     steps = np.diff(times)
     rate = fps or (1 / float(np.median(steps)) if len(steps) else DEFAULT_FPS)
     if not MIN_FPS <= rate <= MAX_FPS or times[-1] * rate > MAX_ROWS:
-        raise StgaError(
-            f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, expected {MIN_FPS:g} to {MAX_FPS:g}"
-        )
+        expected = f"expected {MIN_FPS:g} to {MAX_FPS:g}"
+        raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
     return Performance(times, weights[first], None if head is None else head[first], rate)

@@ -92,9 +92,8 @@ class Export:
             and self.file_format in held["timestep"]
             and self.timestep is None
         ):
-            raise StgaError(
-                f"--motion: has no effect with --format {self.file_format} without --timestep"
-            )
+            problem = f"has no effect with --format {self.file_format} without --timestep"
+            raise StgaError(f"--motion: {problem}")
         check_suffix(self.output, self.file_format)
 
 
@@ -155,13 +154,9 @@ SPLITS = ("val", "train", "test")
 
 
 def capture_playback(
-    request: Export,
-    avatar: Avatar,
-    capture: Capture,
-    timesteps: tuple[int, ...],
-    fps: float,
+    request: Export, avatar: Avatar, capture: Capture, timesteps: tuple[int, ...], fps: float,
     say: Say,
-) -> tuple[Playback, FlameSequence | None]:
+) -> tuple[Playback, FlameSequence | None]:  # fmt: skip
     """What a page shows of timesteps, and its FLAME motion. Says what of FLAME it holds."""
     chosen: Mapping[int, np.ndarray] | None = None
     if request.played is not None:

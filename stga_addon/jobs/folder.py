@@ -43,9 +43,8 @@ def check_request(request: Request) -> None:
     """Raise StgaError for what can be known to fail before a worker is started."""
     match request:
         case Train() | Refine() | Extend() if has_run(request.run):
-            raise StgaError(
-                f"{request.run}: already holds a run; resume it, or choose another folder"
-            )
+            problem = "already holds a run; resume it, or choose another folder"
+            raise StgaError(f"{request.run}: {problem}")
         case Resume():
             read_run(request.run)
         case Track() if is_written(request.out):
@@ -125,9 +124,8 @@ def _read(path: Path, arrays_path: Path, kinds: Any) -> Any:
         values.pop("format", None),
         values.pop("version", None),
     ) != (FORMAT, VERSION):
-        raise StgaError(
-            f"{path}: is not a request that this version reads (format '{FORMAT}', version {VERSION})"
-        )
+        problem = f"is not a request that this version reads (format '{FORMAT}', version {VERSION})"
+        raise StgaError(f"{path}: {problem}")
     try:
         return from_json(
             kinds, values, arrays=read_npz(arrays_path) if os.path.exists(arrays_path) else {}

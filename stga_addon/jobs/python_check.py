@@ -51,9 +51,8 @@ def finish_check(
     except (ValueError, IndexError, KeyError, TypeError) as error:
         with suppress(OSError):  # the stream may be closed
             print(output + errors, file=sys.stderr, flush=True)
-        raise StgaError(
-            f"{python}: is not a Python that runs this add-on (exit status {process.returncode})"
-        ) from error
+        problem = f"is not a Python that runs this add-on (exit status {process.returncode})"
+        raise StgaError(f"{python}: {problem}") from error
 
 
 def describe_check(python: str, report: dict[str, Any]) -> str:
@@ -67,7 +66,6 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
             (text for text in failures.values() if not text.startswith("ModuleNotFoundError")), ""
         )
         failed = f" ({why})" if why else ""
-        raise StgaError(
-            f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that there"
-        )
+        problem = f"Python {version} lacks {', '.join(missing)}{failed}; install that there"
+        raise StgaError(f"{python}: {problem}")
     return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"

@@ -60,12 +60,9 @@ class Render:
         None, 0, 360, metavar="DEGREES", bare=0.0,
     )  # fmt: skip
     camera: int | None = option(
-        "camera of the video (default: the central one)",
-        None,
-        0,
-        metavar="INDEX",
+        "camera of the video (default: the central one)", None, 0, metavar="INDEX",
         needs=(("video", "turntable"),),
-    )
+    )  # fmt: skip
     fps: float | None = option(
         f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})", None, 0
     )
@@ -117,9 +114,8 @@ class Render:
         if self.cameras is None and not self.is_film:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
         if self.frames is not None and self.turntable is not None:
-            raise StgaError(
-                "--frames: has no effect with --turntable, which plays all of the motion"
-            )
+            problem = "has no effect with --turntable, which plays all of the motion"
+            raise StgaError(f"--frames: {problem}")
 
 
 # Work
@@ -263,9 +259,8 @@ def _chosen_camera(request: Render, views: Sequence[View]) -> View:
         indices = sorted(first)
         return first[indices[central_camera([first[index].camera for index in indices])]]
     if request.camera not in first:
-        raise StgaError(
-            f"--camera {request.camera}: there are only {', '.join(map(str, sorted(first)))}"
-        )
+        problem = f"there are only {', '.join(map(str, sorted(first)))}"
+        raise StgaError(f"--camera {request.camera}: {problem}")
     return first[request.camera]
 
 
@@ -273,9 +268,8 @@ def _subject(request: Render, composer: Composer) -> _Subject:
     """An avatar with its capture, or a plain world-space PLY."""
     if is_ply(request.source):
         if request.light is not None:
-            raise StgaError(
-                f"{request.source}: is a PLY, whose light is not known; --light needs an avatar"
-            )
+            problem = "is a PLY, whose light is not known; --light needs an avatar"
+            raise StgaError(f"{request.source}: {problem}")
         if request.world:
             raise StgaError(f"{request.source}: is a PLY; --world needs the folder of a run")
         from ..render.render import render
@@ -289,15 +283,13 @@ def _subject(request: Render, composer: Composer) -> _Subject:
         )
     avatar, capture = open_avatar(request)
     if capture is None:
-        raise StgaError(
-            f"{request.source}: an avatar needs the meshes of a capture to follow; give --capture"
-        )
+        problem = "an avatar needs the meshes of a capture to follow; give --capture"
+        raise StgaError(f"{request.source}: {problem}")
 
     def mesh(view: View) -> np.ndarray:
         if view.timestep not in capture.timesteps:
-            raise StgaError(
-                f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for"
-            )
+            problem = f"has no mesh for timestep {view.timestep}, which {view.name} asks for"
+            raise StgaError(f"{capture.root}: {problem}")
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
@@ -312,9 +304,8 @@ def _subject(request: Render, composer: Composer) -> _Subject:
 def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
     """An avatar moved by another person's motion."""
     if is_ply(request.source):
-        raise StgaError(
-            f"{request.source}: is a PLY, whose splats are bound to no mesh that a motion could move"
-        )
+        problem = "is a PLY, whose splats are bound to no mesh that a motion could move"
+        raise StgaError(f"{request.source}: {problem}")
     avatar = read_avatar(avatar_path(request.source))
     motion = open_avatar_motion(request, avatar, say)
     sequence = motion.sequence
@@ -362,9 +353,8 @@ def _world(source: Path) -> Splats:
     """Raises StgaError where the run of an avatar has no world."""
     path = avatar_path(source).with_name(WORLD_FILE)
     if not path.is_file():
-        raise StgaError(
-            f"{path}: is missing; --world shows what a training with --effect world=on has written"
-        )
+        problem = "is missing; --world shows what a training with --effect world=on has written"
+        raise StgaError(f"{path}: {problem}")
     return read_ply(path)
 
 

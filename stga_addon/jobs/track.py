@@ -46,9 +46,8 @@ def _parsed_mattes(text: str) -> str:
 def _parsed_offset(text: str) -> tuple[str, int]:
     name, _, frames = text.rpartition("=")
     if not name or not frames.removeprefix("-").isdecimal() or len(frames) > 9:
-        raise StgaError(
-            f"expected a camera and a number of frames, as in left=-3, not {shorten(text)}"
-        )
+        problem = f"expected a camera and a number of frames, as in left=-3, not {shorten(text)}"
+        raise StgaError(problem)
     return name, int(frames)
 
 
@@ -128,9 +127,8 @@ class MakeAvatar:
         """Raise StgaError where the two do not belong together."""
         wanted = self.out / CAPTURE_FOLDER, self.out / CAPTURE_FOLDER, self.out / RUN_FOLDER
         if (self.track.out, self.train.capture, self.train.run) != wanted:
-            raise StgaError(
-                f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
-            )
+            problem = f"expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
+            raise StgaError(f"{self.out}: {problem}")
 
 
 # Work
@@ -299,9 +297,8 @@ def _tracking_lines(request: MakeAvatar) -> list[str]:
             f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"
         ]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise StgaError(
-            f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})"
-        ) from error
+        problem = f"is not the report of a tracking ({error!s:.100})"
+        raise StgaError(f"{capture / REPORT_FILE}: {problem}") from error
     files = [capture / SHEET_FILE, capture / REPORT_FILE, request.train.run / CURVE]
     return [*lines, f"report: {', '.join(str(path) for path in files if path.exists())}"]
 
@@ -315,9 +312,8 @@ def check_inputs(track: Track) -> None:
         before = {name: stored.get(name, getattr(Track, name, None)) for name in inputs}
         changed = next((name for name in inputs if before[name] != inputs[name]), None)
         if changed is not None:
-            raise StgaError(
-                f"{changed}: {out} began with {shorten(before[changed])}; give another --out"
-            )
+            problem = f"{out} began with {shorten(before[changed])}; give another --out"
+            raise StgaError(f"{changed}: {problem}")
     elif is_written(track.out) or (out / RUN_FOLDER).exists():
         raise StgaError(f"{out}: holds something else ({INPUTS} is missing); give another --out")
 

@@ -112,12 +112,9 @@ class _Continue:
     parent: Path = option("folder of a run", flag="RUN")
     _: KW_ONLY
     growth: float = option(
-        "splats to add, as a share of those on the triangles that are trained",
-        0.0,
-        0,
-        MAX_GROWTH,
+        "splats to add, as a share of those on the triangles that are trained", 0.0, 0, MAX_GROWTH,
         metavar="SHARE",
-    )
+    )  # fmt: skip
     seconds: float | None = like(
         TrainingSettings, "seconds", help="training time (default 20s to refine, 1m to extend)"
     )
@@ -152,9 +149,8 @@ class Refine(_Continue):
     def check(self) -> None:
         """Raise StgaError unless there is one region and one budget."""
         if not self.region and self.weights is None:
-            raise StgaError(
-                "--region: is missing; expected the name of a region or a file of triangle weights"
-            )
+            problem = "is missing; expected the name of a region or a file of triangle weights"
+            raise StgaError(f"--region: {problem}")
         if self.region and self.weights is not None:
             raise StgaError("region: expected its name, its file or painted weights")
         super().check()
@@ -198,11 +194,9 @@ class Prepared:
         """The path of the avatar. Raises as `training.run.session.train`."""
         from ..training.run.session import train
 
-        folder, resumes, falls_back = (
-            self.request.run,
-            isinstance(self.request, Resume),
-            self.request.device == "auto",
-        )
+        folder = self.request.run
+        resumes = isinstance(self.request, Resume)
+        falls_back = self.request.device == "auto"
         return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
 
 
@@ -278,9 +272,8 @@ def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
 def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
     if not isinstance(request, Resume) and has_run(request.run):
-        raise StgaError(
-            f"{request.run}: already holds a run; resume it (--resume), or choose another folder (--out)"
-        )
+        problem = "already holds a run; resume it (--resume), or choose another folder (--out)"
+        raise StgaError(f"{request.run}: {problem}")
     match request:
         case Train():
             return _new_run(request, report, say)
@@ -347,9 +340,8 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         region, name = request.weights >= SELECTED_WEIGHT, "painted"
     else:
         found = request.weights.shape
-        raise StgaError(
-            f"weights: expected one for each triangle ({len(capture.faces)},), got {found}"
-        )
+        problem = f"expected one for each triangle ({len(capture.faces)},), got {found}"
+        raise StgaError(f"weights: {problem}")
     face = read_avatar(request.parent / AVATAR).splats.face
     count = int(region[face].sum())
     if not count:
@@ -432,9 +424,8 @@ def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
     take = open_capture(path, run.flame, run.principal_point)
     require_same_head(opened.capture, take)
     if not take.views.get("train"):
-        raise StgaError(
-            f"{take.root}: has no training views, so there is nothing to extend the avatar with"
-        )
+        problem = "has no training views, so there is nothing to extend the avatar with"
+        raise StgaError(f"{take.root}: {problem}")
     require_same_scale(opened.takes[0], take)
     if any(take.root == old.root for old in opened.takes):
         raise StgaError(f"{take.root}: is a take of this run already")

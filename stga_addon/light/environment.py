@@ -205,9 +205,8 @@ def read_lighting(path: Path) -> Lighting:
         world, suns = split_environment(read_hdr(path))
         return Lighting(world, suns)
     if suffix != ".toml":
-        raise StgaError(
-            f"{path}: expected light as an environment (.hdr) or a list of lights (.toml)"
-        )
+        problem = "expected light as an environment (.hdr) or a list of lights (.toml)"
+        raise StgaError(f"{path}: {problem}")
     values = read_toml(path)
     try:
         entries = values.get("lights", [])
@@ -241,10 +240,8 @@ def turned(lighting: Lighting, center: np.ndarray, degrees: float) -> Lighting:
     """The lighting turned about the upward axis (+y) through center (3,)."""
     angle = np.radians(degrees)
     matrix = np.eye(4)
-    matrix[0, [0, 2]], matrix[2, [0, 2]] = (
-        (np.cos(angle), np.sin(angle)),
-        (-np.sin(angle), np.cos(angle)),
-    )
+    matrix[0, [0, 2]] = (np.cos(angle), np.sin(angle))
+    matrix[2, [0, 2]] = (-np.sin(angle), np.cos(angle))
     matrix[:3, 3] = center - matrix[:3, :3] @ center
     lights = tuple(light.transformed(matrix) for light in lighting.lights)
     return replace(lighting, world=rotated(lighting.world, matrix[:3, :3]), lights=lights)

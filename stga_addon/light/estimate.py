@@ -170,9 +170,8 @@ def estimate_light(
 ) -> AvatarLight:
     """The light of the capture and how its head receives it. Raises StgaError without views."""
     if not capture.views.get("train"):
-        raise StgaError(
-            f"{capture.root}: has no training views, from which its light could be estimated"
-        )
+        problem = "has no training views, from which its light could be estimated"
+        raise StgaError(f"{capture.root}: {problem}")
     transfer, occlusion = transfer_of(capture.neutral, capture.faces)
     observed = observe(capture, known.exposure, report)
     posed = np.stack(

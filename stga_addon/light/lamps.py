@@ -109,13 +109,9 @@ class ShadowMap:
     """A light's depth map of a posed head (V, 3) meters and of other objects."""
 
     def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        light: Light,
-        casters: Sequence[Caster] = (),
+        self, vertices: np.ndarray, faces: np.ndarray, light: Light, casters: Sequence[Caster] = (),
         size: int = MAP_SIZE,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._project = light_projection(vertices, light, size)
         self._light, self._texel_m = light, texel_meters(head_bounds(vertices), size)
         is_parallel = light.kind == "sun"
@@ -133,12 +129,9 @@ class ShadowMap:
         )
 
     def lit(
-        self,
-        points: np.ndarray,
-        bias: float = BIAS_M,
-        step: float = TAP_STEP,
+        self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP,
         normals: np.ndarray | None = None,
-    ) -> np.ndarray:
+    ) -> np.ndarray:  # fmt: skip
         """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the
         surface.
 
@@ -186,12 +179,9 @@ class Lamps:
     """Lights around a head posed as mesh (V, 3) meters, with what blocks them."""
 
     def __init__(
-        self,
-        lighting: Lighting,
-        mesh: np.ndarray,
-        faces: np.ndarray,
+        self, lighting: Lighting, mesh: np.ndarray, faces: np.ndarray,
         casters: Sequence[Caster] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         center = (mesh.max(0) + mesh.min(0)) / 2
         self._maps: list[ShadowMap] = []
         rows = [np.zeros((0, 16), np.float32)]
@@ -207,13 +197,9 @@ class Lamps:
         return self.shade(points, normals, np.zeros(3), np.zeros(len(points), np.float32), 0.0)[0]
 
     def shade(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        eye: np.ndarray,
-        roughness: np.ndarray,
+        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray,
         reflectance: float,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Irradiance and highlight (N, 3) at points (N, 3) seen from eye (3,)."""
         found = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
         if not len(self._table):

@@ -256,13 +256,9 @@ class Relighter:
         return lit
 
     def _sky_highlight(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        eye: np.ndarray,
-        world: np.ndarray,
+        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray,
         roughness: np.ndarray,
-    ) -> np.ndarray:
+    ) -> np.ndarray:  # fmt: skip
         """(N, 3) of the world: radiance around the mirrored direction (Karis 2014)."""
         if not np.any(world):
             return np.zeros_like(points)
@@ -306,10 +302,8 @@ class Relighter:
 
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""
-        splats, direction = (
-            self.avatar.splats,
-            self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32)),
-        )
+        splats = self.avatar.splats
+        direction = self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32))
         color = sh_color(splats.sh, direction)
         if self._strained:
             color = color + self._strain_color(mesh)

@@ -185,12 +185,9 @@ class Lashes:
 
 
 def find_lashes(
-    avatar: Avatar,
-    corners: np.ndarray,
-    weights: np.ndarray,
-    roughness: np.ndarray,
+    avatar: Avatar, corners: np.ndarray, weights: np.ndarray, roughness: np.ndarray,
     albedo: np.ndarray,
-) -> Lashes:
+) -> Lashes:  # fmt: skip
     """The lashes of an avatar whose light is known.
 
     corners, weights (N, 3): `surface.surface_points`. roughness (N,) and albedo (N, 3) of the

@@ -79,12 +79,9 @@ class Helpers:
         self._processes = []
 
     def map(
-        self,
-        work: Callable[..., Any],
-        parts: Sequence[tuple],
-        done: Callable[[int], None],
+        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None],
         keep: bool = False,
-    ) -> list[Any]:
+    ) -> list[Any]:  # fmt: skip
         """The results of work(*part, step) of every part, in order.
 
         work: a function of a module, which calls `step` after each of its steps; parts and results
@@ -112,12 +109,9 @@ class Helpers:
         return self._shared(work, [part], done, 1)[0]
 
     def _shared(
-        self,
-        work: Callable[..., Any],
-        parts: Sequence[tuple],
-        done: Callable[[int], None],
+        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None],
         count: int,
-    ) -> list[Any]:
+    ) -> list[Any]:  # fmt: skip
         """The results of so many helping processes."""
         while len(self._processes) < count:
             self._processes.append(_start())

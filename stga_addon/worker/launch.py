@@ -78,9 +78,8 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
     try:
         log = os.open(folder / LOG_FILE, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
     except OSError as error:
-        raise StgaError(
-            f"{folder / LOG_FILE}: cannot be written ({error.strerror or error})"
-        ) from error
+        problem = f"cannot be written ({error.strerror or error})"
+        raise StgaError(f"{folder / LOG_FILE}: {problem}") from error
     try:
         process = start_python(
             python,
@@ -135,9 +134,8 @@ def start_python(
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
         reason = getattr(error, "strerror", None) or error
-        raise StgaError(
-            f"{python}: cannot be started as a Python interpreter ({reason})"
-        ) from error
+        problem = f"cannot be started as a Python interpreter ({reason})"
+        raise StgaError(f"{python}: {problem}") from error
 
 
 def end_with_this_process() -> Callable[[], None] | None:

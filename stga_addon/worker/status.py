@@ -199,9 +199,8 @@ def request_cancel(folder: Path) -> None:
 def refuse_running_worker(folder: Path) -> None:
     """Raises StgaError while a worker is running in the folder."""
     if is_locked(folder / LOCK_FILE):
-        raise StgaError(
-            f"{folder}: another worker is running here (process {lock_owner(folder / LOCK_FILE)})"
-        )
+        problem = f"another worker is running here (process {lock_owner(folder / LOCK_FILE)})"
+        raise StgaError(f"{folder}: {problem}")
 
 
 def remove_status_folder(folder: Path, other_files: Iterable[str] = ()) -> None:
@@ -235,12 +234,9 @@ class StatusWriter:
         self._began_s = time.monotonic()
 
     def update(
-        self,
-        progress: float,
-        message: str,
-        detail: str = "",
+        self, progress: float, message: str, detail: str = "",
         figures: Callable[[], Mapping[str, float]] = dict,
-    ) -> bool:
+    ) -> bool:  # fmt: skip
         """Write the status, at most every STATUS_INTERVAL_S; returns whether to stop and keep what
         there is.
 

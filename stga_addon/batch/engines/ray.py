@@ -37,9 +37,8 @@ class RayEngine:
         Raises StgaError where Ray is not installed, or the cluster cannot be reached.
         """
         if find_spec("ray") is None:
-            raise StgaError(
-                "--engine ray: the package ray is not installed (it is the extra `ray` of stga-addon)"
-            )
+            problem = "the package ray is not installed (it is the extra `ray` of stga-addon)"
+            raise StgaError(f"--engine ray: {problem}")
         # other users of this machine cannot submit to it
         if not address and TOKEN_MODE not in os.environ:
             os.environ.update({TOKEN_MODE: "token", TOKEN: secrets.token_hex(32)})
@@ -54,9 +53,8 @@ class RayEngine:
                 address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own
             )
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-            raise StgaError(
-                f"--address {address or 'local'}: Ray cannot be reached ({error})"
-            ) from error
+            problem = f"Ray cannot be reached ({error})"
+            raise StgaError(f"--address {address or 'local'}: {problem}") from error
         self._ray = ray
         self._task = ray.remote(max_retries=NODE_RETRIES)(_task(PYTHON_VARIABLE))
         self._adopted: dict[str, Job] = {}

@@ -55,9 +55,8 @@ class SlurmEngine:
             (name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None
         )
         if missing is not None:
-            raise StgaError(
-                f"--engine slurm: the program {missing} was not found; start it where SLURM is installed"
-            )
+            problem = f"the program {missing} was not found; start it where SLURM is installed"
+            raise StgaError(f"--engine slurm: {problem}")
         self._jobs: dict[str, _Submitted] = {}
         self._names: dict[str, str] | None = None
         self._states: dict[str, tuple[str, str]] | None = None
