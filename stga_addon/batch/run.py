@@ -2,9 +2,10 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from graphlib import TopologicalSorter
 from importlib.util import find_spec
 from statistics import median
 
@@ -142,23 +143,15 @@ class _Loop:
         self._say = say
         self._entries = batch.entries
         self._shown_s = 0.0
-        self._position = {name: number for number, name in enumerate(self._entries)}
-        self._children: dict[str, list[str]] = {name: [] for name in self._entries}
-        self._waits_for: dict[str, int] = {}
-        for name, entry in self._entries.items():
-            open_ones = [
-                other for other in entry.job.after if not self._entries[other].state.is_done
-            ]
-            self._waits_for[name] = len(open_ones)
-            for other in open_ones:
-                self._children[other].append(name)
-        waiting = [name for name, entry in self._entries.items() if entry.state == JobState.WAITING]
+        waiting = {n: e for n, e in self._entries.items() if e.state == JobState.WAITING}
         self._left = len(waiting)
-        takes_all = engine.takes_all
-        # A dictionary as an ordered set: jobs leave it from anywhere.
-        self._ready = dict.fromkeys(
-            name for name in waiting if takes_all or not self._waits_for[name]
+        self._order = TopologicalSorter(
+            {name: [o for o in e.job.after if o in waiting] for name, e in waiting.items()}
         )
+        self._order.prepare()
+        # A dictionary as an ordered set: jobs leave it from anywhere.
+        free = set(self._order.get_ready())
+        self._ready = dict.fromkeys(n for n in waiting if engine.takes_all or n in free)
 
     def work(self) -> None:
         self._adopt()
@@ -246,67 +239,52 @@ class _Loop:
         """Take note of what has ended; whether something has."""
         ended = self._engine.ended()
         # a job's end before that of those after it
-        for name in sorted(ended, key=self._position.__getitem__):
-            entry, end = self._entries[name], ended[name]
+        for name, entry in self._entries.items() if ended else ():
+            if name not in ended:
+                continue
+            end, state = ended[name], ended[name].snapshot.state
             entry.status = end.snapshot.status
             entry.machine = entry.machine or entry.status.machine
-            self._add_seconds(entry)
-            missing = next(
-                (other for other in entry.job.after if not self._entries[other].state.is_done), None
-            )
-            # an engine that takes all
-            if end.snapshot.state != WorkerState.FINISHED and missing is not None:
-                self._over(
-                    entry, JobState.BLOCKED, f"it comes after {missing}, which is not finished"
-                )
-            elif (
-                retry
-                and end.is_lost
-                and end.snapshot.state in _LOST
-                and entry.retries < MAX_RETRIES
-            ):
+            record = read_record(entry.job)
+            if record is not None:
+                entry.seconds = record.seconds + entry.status.seconds
+                new = replace(record, seconds=entry.seconds, machine=entry.machine)
+                try:
+                    write_record(entry.job, new)
+                except StgaError as error:
+                    self._say(f"warning: {error}")
+            undone = (other for other in entry.job.after if not self._entries[other].state.is_done)
+            missing = next(undone, None)
+            if state != WorkerState.FINISHED and missing is not None:  # an engine that takes all
+                reason = f"it comes after {missing}, which is not finished"
+                self._over(entry, JobState.BLOCKED, reason)
+            elif retry and end.is_lost and state in _LOST and entry.retries < MAX_RETRIES:
                 entry.retries += 1
                 entry.state = JobState.WAITING
                 self._ready[name] = None
                 self._say(f"{name}: its worker was lost; it goes on from its last checkpoint")
             else:
-                self._over(
-                    entry,
-                    _OUTCOMES.get(end.snapshot.state, JobState.FAILED),
-                    end.snapshot.status.error,
-                )
+                outcome = _OUTCOMES.get(state, JobState.FAILED)
+                self._over(entry, outcome, entry.status.error)
         return bool(ended)
-
-    def _add_seconds(self, entry: Entry) -> None:
-        """Add the time that the job's worker has worked to its record."""
-        record = read_record(entry.job)
-        if record is None:
-            return
-        entry.seconds = record.seconds + entry.status.seconds
-        try:
-            write_record(entry.job, replace(record, seconds=entry.seconds, machine=entry.machine))
-        except StgaError as error:
-            self._say(f"warning: {error}")
 
     def _over(self, entry: Entry, state: JobState, error: str = "") -> None:
         """Take note of a job's end; those that come after it can start, or cannot any more."""
         self._end(entry, state, error)
-        name = entry.job.name
         if state == JobState.FINISHED:
-            for child in self._children[name]:
-                self._waits_for[child] -= 1
-                if not self._waits_for[child] and self._entries[child].state == JobState.WAITING:
-                    self._ready[child] = None
+            with suppress(ValueError):  # an engine that takes all finished it before another
+                self._order.done(entry.job.name)
+            for name in self._order.get_ready():
+                if self._entries[name].state == JobState.WAITING:
+                    self._ready[name] = None
             return
         after = JobState.CANCELLED if state == JobState.CANCELLED else JobState.BLOCKED
-        left = [(child, name) for child in self._children[name]]
-        while left:
-            child, missing = left.pop()
-            if self._entries[child].state == JobState.WAITING:
-                self._end(
-                    self._entries[child], after, f"it comes after {missing}, which is not finished"
-                )
-                left += [(other, child) for other in self._children[child]]
+        missing = {entry.job.name}
+        for child in self._entries.values():  # each after those that it comes after
+            cause = next((other for other in child.job.after if other in missing), None)
+            if cause is not None and child.state == JobState.WAITING:
+                self._end(child, after, f"it comes after {cause}, which is not finished")
+                missing.add(child.job.name)
 
     def _end(self, entry: Entry, state: JobState, error: str) -> None:
         self._ready.pop(entry.job.name, None)

@@ -58,9 +58,8 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     chosen = EngineOptions(**given_options(options, EngineOptions))
     plan = batch_plan(options)
     is_here = chosen.engine == "local" and not options.commands
-    plan = with_threads(
-        plan, chosen.threads or (max(1, processors() // len(plan.jobs)) if is_here else 1)
-    )
+    share = max(1, processors() // len(plan.jobs)) if is_here else 1
+    plan = with_threads(plan, chosen.threads or share)
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:
@@ -99,9 +98,8 @@ def batch_plan(options: Namespace) -> Plan:
     if missing is not None:
         expected = f"expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
         raise StgaError(f"{missing}: is not a folder; {expected}")
-    settings: dict[str, Any] = {
-        name: given[name] for name in ("preset", "seconds", "iterations", "seed") if name in given
-    }
+    named = ("preset", "seconds", "iterations", "seed")
+    settings: dict[str, Any] = {name: given[name] for name in named if name in given}
     if not {"preset", "seconds", "iterations"} & settings.keys():
         raise StgaError("--preset: is missing; expected it, --budget or --iterations")
     fields: dict[str, Any] = {name: given[name] for name in given if name not in settings}
@@ -112,12 +110,10 @@ def batch_plan(options: Namespace) -> Plan:
 
 def with_threads(plan: Plan, threads: int) -> Plan:
     """The plan with so many threads for the jobs that name none."""
-    jobs = [
-        job
-        if job.resources.threads
-        else replace(job, resources=replace(job.resources, threads=threads))
-        for job in plan.jobs
-    ]
+    jobs = []
+    for job in plan.jobs:
+        resources = replace(job.resources, threads=job.resources.threads or threads)
+        jobs.append(replace(job, resources=resources))
     return replace(plan, jobs=tuple(jobs))
 
 

@@ -5,7 +5,7 @@ import os
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -99,16 +99,17 @@ def _asking(kind: Any, with_bar: bool = True, **more: Any) -> Command:
 # Training
 
 
-@dataclass(frozen=True)
-class TrainOptions:
-    resume: bool = option("continue the run in the folder", False)
+def _lone(name: str, kind: Any, spec: Any) -> Any:
+    """A dataclass of one option that no request has."""
+    return make_dataclass("Lone", [(name, kind, spec)], frozen=True)
+
+
+RESUME_RUN = _lone("resume", bool, option("continue the run in the folder", False))
 
 
 def _train(options: Namespace, head: OpenHead | None) -> None:
-    given = {
-        **given_options(options, Train),
-        "selection": None if head is None else head.selection(),
-    }
+    given = given_options(options, Train)
+    given["selection"] = None if head is None else head.selection()
     if options.resume:
         _refuse_changes(options, read_run(options.run))
         carry_out(Resume(**given))
@@ -144,11 +145,8 @@ def _settings(options: Namespace) -> TrainingSettings:
 
 def _refuse_changes(options: Namespace, run: Run) -> None:
     """Raise StgaError for an option that differs from what the run to be resumed began with."""
-    for kind, began_with in (
-        (TrainingSettings, run.settings),
-        (SelectionOptions, run.settings.selection),
-    ):
-        for spec in option_fields(kind):
+    for began_with in (run.settings, run.settings.selection):
+        for spec in option_fields(type(began_with)):
             value, given = getattr(began_with, spec.name), getattr(options, spec.name, None)
             if given not in (None, value) and spec.name != "effects":
                 problem = f"this run began with {value}, which cannot change; use another --out"
@@ -176,9 +174,8 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
     if options.no_blend:
         return
     if find_spec("bpy") is None:
-        print(
-            "warning: no .blend file: this Python has no bpy (install bpy, or run the command in Blender)"
-        )
+        hint = "(install bpy, or run the command in Blender)"
+        print(f"warning: no .blend file: this Python has no bpy {hint}")
         return
     from ..training.run.folder import with_refined_tracking
 
@@ -214,18 +211,13 @@ def write_blend(
 # Continuing a finished run
 
 
-@dataclass(frozen=True)
-class ContinueOptions:
-    resume: bool = option("RUN was stopped: continue it", False)
-
-
-@dataclass(frozen=True)
-class SelectOptions:
-    select_only: Path | None = option(
-        "only write which triangles it would train: timestep of the take -> triangles",
-        None,
-        metavar="NPZ",
-    )
+CONTINUE = _lone("resume", bool, option("RUN was stopped: continue it", False))
+SELECT_ONLY = option(
+    "only write which triangles it would train: timestep of the take -> triangles", None,
+    metavar="NPZ",
+)  # fmt: skip
+SELECT_OUT = option("also write timestep -> triangles", None, metavar="NPZ")
+INFO_JSON = option("print the effects alone, as JSON", False)
 
 
 def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
@@ -249,7 +241,7 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
                 given["seconds"] = seconds
             carry_out(kind(**given))
 
-    return Command(_about(kind), run, (kind, ContinueOptions, *more), may_lack=("run", "captures"))
+    return Command(_about(kind), run, (kind, CONTINUE, *more), may_lack=("run", "captures"))
 
 
 def _resume(kind: Any, given: dict[str, Any], select_only: Path | None) -> None:
@@ -263,19 +255,15 @@ def _resume(kind: Any, given: dict[str, Any], select_only: Path | None) -> None:
     if read_run(given["parent"]).continuation is None:
         problem = "does not continue another run; resume it with `stga train --resume`"
         raise StgaError(f"{given['parent']}: {problem}")
-    carry_out(
-        Resume(
-            given["parent"], **{name: given[name] for name in ("flame", "device") if name in given}
-        )
-    )
+    same = {name: given[name] for name in ("flame", "device") if name in given}
+    carry_out(Resume(given["parent"], **same))
 
 
 # Captures
 
 
-@dataclass(frozen=True)
-class SelectOutput:
-    out: Path | None = option("also write timestep -> triangles", None, metavar="NPZ")
+def _select(options: Namespace, head: OpenHead | None) -> None:
+    _write_selection(Select(**given_options(options, Select)), options.out)
 
 
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
@@ -283,16 +271,8 @@ def _write_selection(request: Select | SelectForTake, path: Path | None) -> None
     found = carry_out(request, with_bar=False)
     assert isinstance(found, Selected)
     if path is not None:
-        write_npz(
-            path,
-            {f"{timestep:05d}": faces for timestep, faces in found.selection.items()},
-            compressed=True,
-        )
-
-
-@dataclass(frozen=True)
-class InfoOptions:
-    json: bool = option("print the effects alone, as JSON", False)
+        faces = {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}
+        write_npz(path, faces, compressed=True)
 
 
 def _info(options: Namespace, head: OpenHead | None) -> None:
@@ -301,11 +281,9 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         from ..jobs.finished_run import describe_light
 
         avatar = read_avatar(avatar_path(path))
-        light = (
-            describe_light(avatar.light)
-            if avatar.light
-            else ("light: unknown; `stga relight RUN` estimates it",)
-        )
+        light: tuple[str, ...] = ("light: unknown; `stga relight RUN` estimates it",)
+        if avatar.light:
+            light = describe_light(avatar.light)
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
@@ -350,9 +328,8 @@ def _export(options: Namespace, head: OpenHead | None) -> None:
     given = given_options(options, Export)
     if head is not None:
         given.setdefault("fps", head.fps)
-        if options.motion is None and (
-            FORMATS[options.file_format].source != "frame" or options.timestep is not None
-        ):
+        moves = FORMATS[options.file_format].source != "frame" or options.timestep is not None
+        if options.motion is None and moves:
             given["played"] = head.played()
     carry_out(Export(**given))
 
@@ -385,37 +362,38 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
 
 COMMANDS = {
     "avatar": Command(
-        "Make an avatar from footage: track, train, and write a report and a .blend file. Called again with the same "
-        "arguments, it continues where it was interrupted.",
-        _avatar,
-        ((Track, *(spec.name for spec in option_fields(Track) if spec.name != "out")), AvatarOptions,
-         TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
+        "Make an avatar from footage: track, train, and write a report and a .blend file. Called "
+        "again with the same arguments, it continues where it was interrupted.", _avatar,
+        ((Track, *(spec.name for spec in option_fields(Track) if spec.name != "out")),
+         AvatarOptions, TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
         may_lack=("model",),
     ),
     "track": _asking(Track, may_lack=("model",)),
     "train": Command(
-        _about(Train), _train, (Train, TrainingSettings, (SelectionOptions, "threshold"), TrainOptions), uses_head=True
+        _about(Train), _train,
+        (Train, TrainingSettings, (SelectionOptions, "threshold"), RESUME_RUN), uses_head=True,
     ),
     "refine": _continuing(Refine, REFINE_SECONDS),
-    "extend": _continuing(Extend, EXTEND_SECONDS, SelectOptions),
+    "extend": _continuing(Extend, EXTEND_SECONDS, _lone("select_only", Path | None, SELECT_ONLY)),
     "relight": _asking(Relight),
     "perform": Command(
-        "Carry out the request that a folder holds, as a worker of Blender's panel or of a render farm does. The "
-        "folder holds request.json; status, previews and result are written beside it.",
-        _perform, (PerformOptions,),
+        "Carry out the request that a folder holds, as a worker of Blender's panel or of a render "
+        "farm does. The folder holds request.json; status, previews and result are written beside "
+        "it.", _perform, (PerformOptions,),
     ),
     "batch": Command(
-        "Carry out a plan of many jobs, or train many captures, on this machine or on the engine that is there.",
-        run_batch_command, (BatchOptions, EngineOptions),
+        "Carry out a plan of many jobs, or train many captures, on this machine or on the engine "
+        "that is there.", run_batch_command, (BatchOptions, EngineOptions),
     ),
     "render": Command(_about(Render), _render, (RenderOutput, Render), uses_head=True),
     "eval": _asking(Evaluate, with_bar=False),
     "select": Command(
-        _about(Select), lambda options, head: _write_selection(Select(**given_options(options, Select)), options.out),
-        (Select, SelectOutput), uses_head=True,
+        _about(Select), _select, (Select, _lone("out", Path | None, SELECT_OUT)), uses_head=True
     ),
     "export": Command(_about(Export), _export, (Export,), uses_head=True),
     "drive": _asking(ConvertMotion),
-    "info": Command(_about(Analyze), _info, (Analyze, InfoOptions), uses_head=True),
+    "info": Command(
+        _about(Analyze), _info, (Analyze, _lone("json", bool, INFO_JSON)), uses_head=True
+    ),
     "presets": _asking(TimePresets, with_bar=False, uses_head=True),
 }  # fmt: skip

@@ -11,13 +11,13 @@ import pickle
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Lock, Thread
+from queue import SimpleQueue
 from traceback import format_exc
-from types import TracebackType
 from typing import IO, Any, BinaryIO
 
 import numpy as np
@@ -48,23 +48,21 @@ def processors() -> int:
 class Helpers:
     """Processes that are started when there is work for two, and end with the `with` block.
 
-    count: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to
+    limit: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to
     MAX_HELPERS. With one, all work is done in this process. folder: of the results that `map`
     keeps; None: none is kept.
     """
 
-    def __init__(self, count: int | None = None, folder: Path | None = None) -> None:
-        limit = os.environ.get(THREADS_VARIABLE, "")
-        usual = min(int(limit) if limit.isdecimal() else processors(), MAX_HELPERS)
-        self._count, self._folder = usual if count is None else count, folder
+    def __init__(self, limit: int | None = None, folder: Path | None = None) -> None:
+        threads = os.environ.get(THREADS_VARIABLE, "")
+        usual = min(int(threads) if threads.isdecimal() else processors(), MAX_HELPERS)
+        self._count, self._folder = usual if limit is None else limit, folder
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> "Helpers":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
 
     def end(self) -> None:
@@ -92,51 +90,65 @@ class Helpers:
         StgaError where a helper ends before its work does.
         """
         if keep and self._folder is not None:
-            work, parts = (
-                _kept,
-                [(self._folder / f"{_digest(work, part)}.npz", work, part) for part in parts],
-            )
-        count = min(self._count, len(parts))
-        if count < 2:
-            steps = _Counter()
-            return [work(*part, lambda: done(steps.add())) for part in parts]
-        return self._shared(work, parts, done, count)
+            files = [self._folder / f"{_digest(work, part)}.npz" for part in parts]
+            parts = [(file, work, part) for file, part in zip(files, parts, strict=True)]
+            work = _kept
+        if min(self._count, len(parts)) >= 2:
+            return self._shared(work, parts, done)
+        steps = count(1)
+        return [work(*part, lambda: done(next(steps))) for part in parts]
 
     def run(self, work: Callable[..., Any], part: tuple, done: Callable[[int], None]) -> Any:
         """The result of work(*part, step) of one helper, as `map`; for what is not worth two."""
-        if self._count < 2:
-            return self.map(work, [part], done)[0]
-        return self._shared(work, [part], done, 1)[0]
+        shared = self._shared if self._count >= 2 else self.map
+        return shared(work, [part], done)[0]
 
     def _shared(
-        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None],
-        count: int,
-    ) -> list[Any]:  # fmt: skip
-        """The results of so many helping processes."""
-        while len(self._processes) < count:
+        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None]
+    ) -> list[Any]:
+        """The results of as many helping processes as there are parts for."""
+        number = min(self._count, len(parts))
+        while len(self._processes) < number:
             self._processes.append(_start())
-        task = _Task(work, parts)
-        threads = [
-            Thread(target=task.feed, args=(process,), daemon=True)
-            for process in self._processes[:count]
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            while thread.is_alive() and not task.errors:
-                thread.join(REPORT_INTERVAL_S)
-                done(task.steps.value)
-        if task.errors:
-            raise task.errors[0]
-        done(task.steps.value)
-        return task.results
+        idle: SimpleQueue[subprocess.Popen[bytes]] = SimpleQueue()
+        for process in self._processes[:number]:
+            idle.put(process)
+        steps: list[None] = []  # threads append one for each
+
+        def answer(part: tuple) -> Any:
+            process = idle.get()
+            assert process.stdin is not None
+            assert process.stdout is not None
+            try:
+                _send(process.stdin, (work, part))
+                while (message := _Unpickler(process.stdout).load())[0] == STEP:
+                    steps.append(None)
+            except (EOFError, OSError, pickle.UnpicklingError) as error:
+                problem = f"before its work did (exit status {process.poll()})"
+                raise StgaError(f"a helping process ended {problem}") from error
+            idle.put(process)
+            if message[0] == ERROR:
+                raise message[1]
+            return message[1]
+
+        pool = ThreadPoolExecutor(number)
+        try:
+            answers = [pool.submit(answer, part) for part in parts]
+            waiting: Collection[Future[Any]] = answers
+            while waiting:
+                ended, waiting = wait(waiting, REPORT_INTERVAL_S, FIRST_EXCEPTION)
+                for one in ended:
+                    one.result()
+                done(len(steps))
+            return [one.result() for one in answers]
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _digest(work: Callable[..., Any], part: tuple) -> str:
     """Changes with any of the arguments."""
-    return hashlib.sha256(
-        pickle.dumps((work.__qualname__, part), pickle.HIGHEST_PROTOCOL)
-    ).hexdigest()[:32]
+    arguments = pickle.dumps((work.__qualname__, part), pickle.HIGHEST_PROTOCOL)
+    return hashlib.sha256(arguments).hexdigest()[:32]
 
 
 def _kept(
@@ -148,77 +160,23 @@ def _kept(
         for _ in range(int(found.pop(STEPS_KEY))):
             step()
         return found
-    steps = _Counter()
+    taken = 0
 
     def counted() -> None:
-        steps.add()
+        nonlocal taken
+        taken += 1
         step()
 
     found = work(*part, counted)
-    write_npz(file, {**found, STEPS_KEY: np.array(steps.value)})
+    write_npz(file, {**found, STEPS_KEY: np.array(taken)})
     return found
 
 
-class _Counter:
-    """A number that threads add to."""
-
-    def __init__(self) -> None:
-        self.value, self._lock = 0, Lock()
-
-    def add(self) -> int:
-        with self._lock:
-            self.value += 1
-            return self.value
-
-
-class _Task:
-    """What `Helpers.map` does at a time: parts that are left, results and errors."""
-
-    def __init__(self, work: Callable[..., Any], parts: Sequence[tuple]) -> None:
-        self.results: list[Any] = [None] * len(parts)
-        self.errors: list[BaseException] = []
-        self.steps, self._work = _Counter(), work
-        self._left: SimpleQueue[tuple[int, tuple]] = SimpleQueue()
-        for numbered in enumerate(parts):
-            self._left.put(numbered)
-
-    def feed(self, process: "subprocess.Popen[bytes]") -> None:
-        """Hand parts to a process until none is left."""
-        try:
-            while not self.errors:
-                number, part = self._left.get_nowait()
-                self.results[number] = self._answer(process, part)
-        except Empty:
-            return
-        except (EOFError, OSError, pickle.UnpicklingError):
-            code = process.poll()
-            self.errors.append(
-                StgaError(f"a helping process ended before its work did (exit status {code})")
-            )
-        except BaseException as error:  # raised again by the thread that waits
-            self.errors.append(error)
-
-    def _answer(self, process: "subprocess.Popen[bytes]", part: tuple) -> Any:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        _send(process.stdin, (self._work, part))
-        while True:
-            kind, value = _Unpickler(process.stdout).load()
-            if kind == STEP:
-                self.steps.add()
-            elif kind == ERROR:
-                raise value
-            else:
-                return value
-
-
 def _start() -> "subprocess.Popen[bytes]":
+    quiet: dict[str, Any] = {"preexec_fn": end_with_this_process()}
+    if os.name == "nt":
+        quiet = {"creationflags": 0x08000000}  # no console window
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    quiet = (
-        {"creationflags": 0x08000000}
-        if os.name == "nt"
-        else {"preexec_fn": end_with_this_process()}
-    )
     return start_python(own_python(), ["stga_addon.worker.helpers"], SINGLE, **pipes, **quiet)
 
 
