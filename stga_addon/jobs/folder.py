@@ -60,13 +60,7 @@ def check_request(request: Request) -> None:
 def worker_arguments(folder: Path, threads: int | None = None, resume: bool = False) -> list[str]:
     """What a worker's interpreter runs after `-m` for the request in the folder."""
     limit = [] if threads is None else ["--threads", str(threads)]
-    return [
-        "stga_addon",
-        "perform",
-        str(folder.resolve()),
-        *limit,
-        *(["--resume"] if resume else []),
-    ]
+    return ["stga_addon", "perform", str(folder.resolve()), *limit, *["--resume"] * resume]
 
 
 def write_request(folder: Path, request: Request) -> None:
@@ -120,15 +114,12 @@ def _write(path: Path, arrays_path: Path, value: Any, kinds: Any) -> None:
 
 def _read(path: Path, arrays_path: Path, kinds: Any) -> Any:
     values = read_json(path)
-    if not isinstance(values, dict) or (
-        values.pop("format", None),
-        values.pop("version", None),
-    ) != (FORMAT, VERSION):
-        problem = f"is not a request that this version reads (format '{FORMAT}', version {VERSION})"
-        raise StgaError(f"{path}: {problem}")
+    named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
+    if named != (FORMAT, VERSION):
+        known = f"(format '{FORMAT}', version {VERSION})"
+        raise StgaError(f"{path}: is not a request that this version reads {known}")
+    arrays = read_npz(arrays_path) if os.path.exists(arrays_path) else {}
     try:
-        return from_json(
-            kinds, values, arrays=read_npz(arrays_path) if os.path.exists(arrays_path) else {}
-        )
+        return from_json(kinds, values, arrays=arrays)
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error

@@ -68,9 +68,8 @@ def perform_in_folder(
             if resume and isinstance(request, Track) and is_written(request.out):
                 result: Result = Written(request.out)
             else:
-                result = perform(
-                    remaining(request) if resume else request, _StatusReport(writer, also), say
-                )
+                left = remaining(request) if resume else request
+                result = perform(left, _StatusReport(writer, also), say)
         except Cancelled:
             return None
         write_result(folder, result)

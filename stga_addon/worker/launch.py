@@ -75,21 +75,14 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
     Raises StgaError where the interpreter cannot be started; then only the status is removed from
     the folder.
     """
+    path, nothing = folder / LOG_FILE, subprocess.DEVNULL
     try:
-        log = os.open(folder / LOG_FILE, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
+        log = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
     except OSError as error:
-        problem = f"cannot be written ({error.strerror or error})"
-        raise StgaError(f"{folder / LOG_FILE}: {problem}") from error
+        raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
+    streams = {"stdin": nothing, "stdout": log, "stderr": subprocess.STDOUT}
     try:
-        process = start_python(
-            python,
-            arguments,
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            **_DETACHED,
-        )
+        process = start_python(python, arguments, cwd=folder, **streams, **_DETACHED)
     except StgaError:
         remove_status_folder(folder)
         raise
@@ -101,10 +94,8 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
 
 def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
     """Start `python -m ARGUMENTS…` at low priority, without status and output."""
-    nothing = subprocess.DEVNULL
-    process = start_python(
-        python, arguments, stdin=nothing, stdout=nothing, stderr=nothing, **_DETACHED
-    )
+    nothing = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    process = start_python(python, arguments, **nothing, **_DETACHED)
     _give_precedence(process, BACKGROUND_NICENESS)
     return process
 
@@ -113,9 +104,8 @@ def _give_precedence(process: subprocess.Popen[bytes], niceness: int) -> None:
     """Lower the priority of a process on Linux and macOS; Windows starts it with a low one."""
     if os.name != "nt":
         with suppress(OSError):  # the process has ended already
-            os.setpriority(
-                os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness
-            )
+            own = os.getpriority(os.PRIO_PROCESS, 0)
+            os.setpriority(os.PRIO_PROCESS, process.pid, own + niceness)
 
 
 def start_python(
@@ -169,26 +159,18 @@ def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, s
     """
     is_own = python in (sys.executable, own_python())
     cache = variables.get(CACHE_VARIABLE) if is_own else None
-    compiled = (
-        {
-            "PYTHONPYCACHEPREFIX": os.path.join(cache, BYTECODE),
-            "MPLCONFIGDIR": os.path.join(cache, CHARTS),
-        }
-        if cache
-        else {"PYTHONDONTWRITEBYTECODE": "1"}  # the extension's folder belongs to Blender
-    )
-    own_paths = filter(None, sys.path) if is_own else ()
     dropped = ("PYTHON",) if is_own else ("PYTHONHOME", "PYTHONSTARTUP")
     kept = {name: value for name, value in variables.items() if not name.startswith(dropped)}
-    return {
-        **kept,
-        **({"PYTHONNOUSERSITE": "1"} if is_own else {}),
-        **compiled,
-        "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *own_paths]),
-        "PYTHONSAFEPATH": "1",
-        "PYTHONUNBUFFERED": "1",
-        "PYTHONUTF8": "1",
-    }
+    if is_own:
+        kept["PYTHONNOUSERSITE"] = "1"
+    if cache:
+        kept["PYTHONPYCACHEPREFIX"] = os.path.join(cache, BYTECODE)
+        kept["MPLCONFIGDIR"] = os.path.join(cache, CHARTS)
+    else:
+        kept["PYTHONDONTWRITEBYTECODE"] = "1"  # the extension's folder belongs to Blender
+    path = os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path if is_own else ())])
+    always = dict.fromkeys(("PYTHONSAFEPATH", "PYTHONUNBUFFERED", "PYTHONUTF8"), "1")
+    return {**kept, **always, "PYTHONPATH": path}
 
 
 def same_interpreter_environment(variables: Mapping[str, str]) -> dict[str, str]:

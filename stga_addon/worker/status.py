@@ -19,9 +19,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 from ..errors import StgaError
-from ..files import file_size, read_json, write_json
+from ..files import RENAME_PATIENCE_S, file_size, read_json, write_json
 from .lock import hold_lock, is_locked, lock_owner
 
 STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
@@ -50,6 +51,9 @@ class WorkerState(StrEnum):
     @property
     def failed(self) -> bool:
         return self in (WorkerState.FAILED, WorkerState.LOST)
+
+
+ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
 
 
 @dataclass(frozen=True)
@@ -88,11 +92,7 @@ class WorkerSnapshot:
 def derive_state(
     status: WorkerStatus | None, alive: bool, cancel_requested: bool, started: bool
 ) -> WorkerState:
-    """State of a worker.
-
-    status: the latest one, or None. alive: whether the process lives. started: whether one was ever
-    started.
-    """
+    """State of a worker by its latest status, whether its process lives, and one ever started."""
     if status is not None and status.state != WorkerState.WORKING:
         return WorkerState(status.state)
     if not alive:
@@ -112,16 +112,14 @@ def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None)
     # status by then.
     alive = (process is not None and code is None) or is_locked(folder / LOCK_FILE)
     status = read_status(folder)
-    state = derive_state(
-        status, alive, (folder / CANCEL_FILE).exists(), (folder / LOG_FILE).exists()
-    )
+    cancelled, started = ((folder / name).exists() for name in (CANCEL_FILE, LOG_FILE))
+    state = derive_state(status, alive, cancelled, started)
     status = status or WorkerStatus()
     if state == WorkerState.LOST:
         error = describe_lost_worker(folder, code)
         status = replace(status, state=WorkerState.LOST, message="", detail="", error=error)
-    return WorkerSnapshot(
-        state, status, tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ()
-    )
+    log_tail = tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ()
+    return WorkerSnapshot(state, status, log_tail)
 
 
 def describe_lost_worker(folder: Path, exit_code: int | None = None) -> str:
@@ -130,37 +128,27 @@ def describe_lost_worker(folder: Path, exit_code: int | None = None) -> str:
         if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
             return f"Worker exited unexpectedly: the disk that holds {folder} is full"
     if exit_code is not None and exit_code > 0:
-        last = log_lines(folder, 1)
-        return f"Worker exited with status {exit_code}: {last[0].strip() if last else 'its log is empty'}"
+        last = log_lines(folder, 1) or ["its log is empty"]
+        return f"Worker exited with status {exit_code}: {last[0].strip()}"
     signal = f" (signal {-exit_code})" if exit_code else ""
-    return f"Worker exited unexpectedly{signal}; it was killed or may have run out of memory. Log: {folder / LOG_FILE}"
+    why = f"it was killed or may have run out of memory. Log: {folder / LOG_FILE}"
+    return f"Worker exited unexpectedly{signal}; {why}"
 
 
 def read_status(folder: Path) -> WorkerStatus | None:
     """The latest status; None where status.json is missing or malformed."""
     try:
-        values = read_json(folder / STATUS_FILE)
-        status = WorkerStatus(**values)
-        texts = (status.message, status.detail, status.error, status.traceback)
-        machine = status.machine
+        status = WorkerStatus(**read_json(folder / STATUS_FILE))
+        texts = (status.message, status.detail, status.error, status.traceback, status.machine)
         figures = {str(name): float(value) for name, value in status.figures.items()}
-        states = (
-            WorkerState.WORKING,
-            WorkerState.FINISHED,
-            WorkerState.CANCELLED,
-            WorkerState.FAILED,
-        )
-        if status.state not in states or not all(
-            isinstance(text, str) for text in (*texts, machine)
-        ):
-            return None
-        if not 0 <= status.progress <= 1 or not 0 <= status.seconds < math.inf:
-            return None
+        progress, seconds = float(status.progress), float(status.seconds)
     except (StgaError, TypeError, ValueError, AttributeError):
         return None
-    return WorkerStatus(
-        status.state, float(status.progress), *texts, figures, machine, float(status.seconds)
-    )
+    is_known = status.state in (WorkerState.WORKING, *ENDS)
+    are_numbers = 0 <= progress <= 1 and 0 <= seconds < math.inf
+    if not (is_known and are_numbers and all(isinstance(text, str) for text in texts)):
+        return None
+    return replace(status, progress=progress, figures=figures, seconds=seconds)
 
 
 def log_lines(folder: Path, count: int) -> list[str]:
@@ -246,29 +234,21 @@ class StatusWriter:
         now = time.monotonic()
         if message != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
             finite = {name: value for name, value in figures().items() if math.isfinite(value)}
-            progress = min(max(progress, 0.0), 1.0)
-            working = WorkerState.WORKING
-            self._status = replace(
-                self._status, state=working, progress=progress, message=message, detail=detail, figures=finite,
-                seconds=self._seconds(),
-            )  # fmt: skip
-            self._written_s = now
-            # a missing status stops no work; the work itself reports a full disk
-            with suppress(StgaError):
-                # the next one comes soon
-                write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=0.0)
+            share, self._written_s = min(max(progress, 0.0), 1.0), now
+            # the next one comes soon
+            self._write(0.0, progress=share, message=message, detail=detail, figures=finite)
         return self.cancel_requested
 
     def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:
         """Write the final status."""
-        final = replace(
-            self._status, state=state, error=error, traceback=trace, seconds=self._seconds()
-        )
-        with suppress(StgaError):  # `inspect_worker` reports a worker that is gone
-            write_json(self.folder / STATUS_FILE, asdict(final))
+        self._write(RENAME_PATIENCE_S, state=state, error=error, traceback=trace)
 
-    def _seconds(self) -> float:
-        return round(time.monotonic() - self._began_s, 3)
+    def _write(self, patience_s: float, **changes: Any) -> None:
+        seconds = round(time.monotonic() - self._began_s, 3)
+        self._status = replace(self._status, seconds=seconds, **changes)
+        # A missing status stops no work, and `inspect_worker` reports a worker that is gone.
+        with suppress(StgaError):
+            write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s)
 
 
 @contextmanager
@@ -298,13 +278,10 @@ def status_writer(folder: Path) -> Iterator[StatusWriter]:
             writer.finish(WorkerState.CANCELLED)
             raise
         except BaseException as error:
-            writer.finish(WorkerState.FAILED, _summarize(error), traceback.format_exc())
+            lines = str(error).strip().splitlines()
+            summary = ": ".join([type(error).__name__, *lines[:1]])
+            if isinstance(error, ModuleNotFoundError):
+                summary = f"{sys.executable} lacks the package '{error.name}'"
+            writer.finish(WorkerState.FAILED, summary, traceback.format_exc())
             raise
         writer.finish(WorkerState.CANCELLED if writer.cancel_requested else WorkerState.FINISHED)
-
-
-def _summarize(error: BaseException) -> str:
-    if isinstance(error, ModuleNotFoundError):
-        return f"{sys.executable} lacks the package '{error.name}'"
-    lines = str(error).strip().splitlines()
-    return ": ".join([type(error).__name__, *lines[:1]])

@@ -51,14 +51,11 @@ def own_python() -> str:
     if Path(sys.executable).is_relative_to(prefix):
         return sys.executable
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    names = (
-        ("bin/python.exe", "python.exe")
-        if os.name == "nt"
-        else (f"bin/python{version}", "bin/python3")
-    )
-    return next(
-        (str(path) for path in (prefix / name for name in names) if path.is_file()), sys.executable
-    )
+    names = (f"bin/python{version}", "bin/python3")
+    if os.name == "nt":
+        names = ("bin/python.exe", "python.exe")
+    paths = (prefix / name for name in names)
+    return next((str(path) for path in paths if path.is_file()), sys.executable)
 
 
 def find_training_python(preferred: str = "") -> str:
@@ -74,8 +71,9 @@ def find_training_python(preferred: str = "") -> str:
     if missing:
         version = sys.version.split()[0]
         raise StgaError(
-            f"{own_python()} (Python {version}) lacks {', '.join(missing)}. Install the complete edition of the "
-            f"add-on, or choose a Python that has them in its preferences or by {PYTHON_VARIABLE}"
+            f"{own_python()} (Python {version}) lacks {', '.join(missing)}. Install the complete "
+            "edition of the add-on, or choose a Python that has them in its preferences or by "
+            f"{PYTHON_VARIABLE}"
         )
     return own_python()
 
