@@ -59,13 +59,14 @@ class Export:
         "of a format that holds several (default: all)", None, metavar="FIRST:LAST"
     )
     fps: float | None = option(
-        f"frames per second of usd and web (default: the scene's or the capture's, else {DEFAULT_FPS:g})",
+        "frames per second of usd and web (default: the scene's or the capture's, else "
+        f"{DEFAULT_FPS:g})",
         None,
         above=0,
     )
     motion_only: bool = option(
-        "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take stay in the page, and "
-        "FLAME's licence decides who may receive it either way",
+        "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take "
+        "stay in the page, and FLAME's licence decides who may receive it either way",
         False,
     )
     motion: Path | None = motion_field()
@@ -81,19 +82,15 @@ class Export:
             "frames": [name for name, format in FORMATS.items() if format.source == "range"],
             "motion_only": [name for name, format in FORMATS.items() if format.is_page],
         }
+        chosen = f"--format {self.file_format}"
         for name, formats in held.items():
             if getattr(self, name) not in (None, False) and self.file_format not in formats:
                 flag = flag_of(type(self).__dataclass_fields__[name])
-                raise StgaError(
-                    f"{flag} cannot be combined with --format {self.file_format}, only with {', '.join(formats)}"
-                )
-        if (
-            self.motion is not None
-            and self.file_format in held["timestep"]
-            and self.timestep is None
-        ):
-            problem = f"has no effect with --format {self.file_format} without --timestep"
-            raise StgaError(f"--motion: {problem}")
+                only = f"only with {', '.join(formats)}"
+                raise StgaError(f"{flag} cannot be combined with {chosen}, {only}")
+        is_frame = self.file_format in held["timestep"]
+        if self.motion is not None and is_frame and self.timestep is None:
+            raise StgaError(f"--motion: has no effect with {chosen} without --timestep")
         check_suffix(self.output, self.file_format)
 
 
@@ -144,8 +141,8 @@ def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
     """Say how large the file will be. Raises StgaError where the disk has too little free space."""
     size = FORMATS[request.file_format].size(avatar, frames)
     check_free_space(request.output, size)
-    plural = "" if frames == 1 else "s"
-    say(f"{frames} frame{plural} of {len(avatar.splats)} splats: about {format_bytes(size)}")
+    count = f"{frames} frame{'' if frames == 1 else 's'}"
+    say(f"{count} of {len(avatar.splats)} splats: about {format_bytes(size)}")
 
 
 # Web pages
@@ -158,6 +155,7 @@ def capture_playback(
     say: Say,
 ) -> tuple[Playback, FlameSequence | None]:  # fmt: skip
     """What a page shows of timesteps, and its FLAME motion. Says what of FLAME it holds."""
+    # what each timestep trains: the open file's or the run's selection, else by the rule
     chosen: Mapping[int, np.ndarray] | None = None
     if request.played is not None:
         chosen = request.played.selection
@@ -168,31 +166,20 @@ def capture_playback(
         chosen = read_selection(request.source, len(capture.faces))
     if not chosen and request.played is None:
         chosen = select_capture(capture, SelectionOptions())
-    everything = np.ones(len(capture.faces), bool)
+    everything, motion_only = np.ones(len(capture.faces), bool), request.motion_only
     playback = Playback(
-        title=_title(request),
-        fps=fps,
-        views=capture_views(capture),
-        up=_up(capture),
-        selection=(
-            [chosen.get(timestep, everything) for timestep in timesteps] if chosen else None
-        ),
-        motion_only=request.motion_only,
-        controls=None if request.motion_only else page_controls(capture.flame),
-    )
-    sequence = (
-        None
-        if capture.flame is None
-        else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
-    )
-    notice = flame_notice(avatar, sequence, request.motion_only)
-    has_rig = sequence is not None and not request.motion_only
-    _say_licence(
-        f"{notice} --motion-only leaves them out, but not the meshes of the take."
-        if has_rig
-        else notice,
-        say,
-    )
+        title=_title(request), fps=fps, views=capture_views(capture), up=_up(capture),
+        selection=[chosen.get(t, everything) for t in timesteps] if chosen else None,
+        motion_only=motion_only, controls=None if motion_only else page_controls(capture.flame),
+    )  # fmt: skip
+    sequence = capture.flame
+    if sequence is not None:  # an open head numbers the capture's timesteps by the scene's frames
+        numbered = dict(zip(capture.timesteps, sequence.timesteps, strict=True))
+        sequence = replace(sequence, timesteps=tuple(numbered[t] for t in timesteps))
+    notice = flame_notice(avatar, sequence, motion_only)
+    if sequence is not None and not motion_only:
+        notice += " --motion-only leaves them out, but not the meshes of the take."
+    _say_licence(notice, say)
     return playback, sequence
 
 
@@ -226,10 +213,3 @@ def _up(capture: Capture) -> tuple[float, float, float]:
     axis = np.zeros(3)
     axis[np.abs(mean).argmax()] = np.sign(mean[np.abs(mean).argmax()])
     return (float(axis[0]), float(axis[1]), float(axis[2]))
-
-
-def _flame_timesteps(capture: Capture, timesteps: tuple[int, ...]) -> tuple[int, ...]:
-    """Timesteps of `capture.flame` for the capture's, which an open head numbers by frames."""
-    assert capture.flame is not None
-    numbered = dict(zip(capture.timesteps, capture.flame.timesteps, strict=True))
-    return tuple(numbered[timestep] for timestep in timesteps)

@@ -40,8 +40,8 @@ class Relight:
         "environment of the studio, instead of an estimate", None, metavar="FILE.hdr"
     )
     card: tuple[float, float, float] | None = option(
-        "sRGB in 0…1 of an 18 % gray card at the face that faces the central camera: level and white balance",
-        None, 0, 1, flag="--gray-card", metavar="R,G,B",
+        "sRGB in 0…1 of an 18 % gray card at the face that faces the central camera: level and "
+        "white balance", None, 0, 1, flag="--gray-card", metavar="R,G,B",
     )  # fmt: skip
     flame: Path | None = option("FLAME model file, if it has moved", None, metavar="FILE")
     capture: Path | None = option("the run's capture, if it has moved", None)
@@ -65,14 +65,12 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
         card = srgb_to_linear(np.array(request.card))
         if not card.min() > 0:
             raise StgaError(f"--gray-card: expected three numbers above 0, got {request.card}")
-        first = {
-            view.camera_index: view.camera for views in capture.views.values() for view in views
-        }
-        if not first:
+        views = [view for split in capture.views.values() for view in split]
+        cameras = list({view.camera_index: view.camera for view in views}.values())
+        if not cameras:
             raise StgaError(f"{capture.root}: has no camera that a gray card could face")
-        cameras = list(first.values())
-        offset = cameras[central_camera(cameras)].position - capture.neutral.mean(0)
-        known = Known(card=card[None], toward=np.asarray(offset / np.linalg.norm(offset))[None])
+        toward = cameras[central_camera(cameras)].position - capture.neutral.mean(0)
+        known = Known(card=card[None], toward=(toward / np.linalg.norm(toward))[None])
     return Written(folder / AVATAR, add_light(folder / AVATAR, capture, known, report))
 
 
@@ -141,19 +139,23 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
         quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})
-    lines = [
-        f"  {name}: {_describe(quality.regions[region])}"
-        for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region"))
-        if region in quality.regions
-    ]
-    if quality.psnr_recorded is not None:
-        lines.append(
-            f"  in front of its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB"
-        )
-    if quality.psnr_unmatched is not None:
-        lines.append(
-            f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB"
-        )
+    lines = [f"{split}: {len(views)} views, {_describe(quality)}"]
+    trained = {view.timestep for view in capture.views.get("train", ())}
+    if tracked.flame is not None and capture.flame is not None:
+        before, after = tracked.flame.frame, capture.flame.frame
+        unseen = {view.timestep for view in views} - trained
+        if any(not np.array_equal(after(t).parameters, before(t).parameters) for t in unseen):
+            how = "with heads tracked by the avatar, its splats fixed; as tracked before"
+            lines.append(f"  {how}: {_describe(evaluate_avatar(avatar, tracked, split))}")
+    for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region")):
+        if region in quality.regions:
+            lines.append(f"  {name}: {_describe(quality.regions[region])}")
+    for psnr, how in (
+        (quality.psnr_recorded, "in front of its world, against whole images as recorded"),
+        (quality.psnr_unmatched, "exposure of each view fitted inside the mask; without"),
+    ):
+        if psnr is not None:
+            lines.append(f"  {how}: PSNR {psnr:.3f} dB")
     if quality.lpips is None:
         from ..training.evaluate.lpips import MIN_SIDE_PX
 
@@ -162,22 +164,6 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
             f"LPIPS was not measured: it needs {weights}",
             f"and images of at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels",
         ]
-    lines = [f"{split}: {len(views)} views, {_describe(quality)}", *lines]
-    unseen = {view.timestep for view in views} - {
-        view.timestep for view in capture.views.get("train", ())
-    }
-    if (
-        tracked.flame is not None
-        and capture.flame is not None
-        and any(
-            not np.array_equal(capture.flame.frame(t).parameters, tracked.flame.frame(t).parameters)
-            for t in unseen
-        )
-    ):
-        before = _describe(evaluate_avatar(avatar, tracked, split))
-        lines.insert(
-            1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}"
-        )
     return Written(path, tuple(lines))
 
 

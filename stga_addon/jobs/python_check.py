@@ -68,4 +68,5 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
         failed = f" ({why})" if why else ""
         problem = f"Python {version} lacks {', '.join(missing)}{failed}; install that there"
         raise StgaError(f"{python}: {problem}")
-    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"
+    known = f"torch {versions['torch']}, numba {versions['numba']}"
+    return f"Python {version}, {known}, {report['device']}"

@@ -8,7 +8,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..avatar.file import Avatar, read_avatar
-from ..avatar.splats import Splats
 from ..capture.camera import TURNTABLE_S, central_camera, covered_angles, to_and_fro, turntable
 from ..capture.model import View
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
@@ -56,8 +55,8 @@ class Render:
         None, metavar="TRANSFORMS.json",
     )  # fmt: skip
     turntable: float | None = option(
-        "move one camera around the head: 360 for a full turn, less to both sides (default: what cameras saw)",
-        None, 0, 360, metavar="DEGREES", bare=0.0,
+        "move one camera around the head: 360 for a full turn, less to both sides (default: what "
+        "cameras saw)", None, 0, 360, metavar="DEGREES", bare=0.0,
     )  # fmt: skip
     camera: int | None = option(
         "camera of the video (default: the central one)", None, 0, metavar="INDEX",
@@ -67,8 +66,8 @@ class Render:
         f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})", None, 0
     )
     seconds: float = option(
-        f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
-        TURNTABLE_S, 0, metavar="S",
+        f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to "
+        "and fro", TURNTABLE_S, 0, metavar="S",
     )  # fmt: skip
     frames: tuple[int, int] | None = option(
         "timesteps to render (default: all), not of a turntable", None, 0, metavar="FIRST:LAST"
@@ -129,7 +128,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
     """
     if request.turntable is not None:
         _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
-    views = None
+    views: Sequence[View] = ()
     if request.cameras is not None:
         principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # a PLY has none
         if request.principal_point is None and not is_ply(request.source):
@@ -137,26 +136,20 @@ def render(request: Render, report: Report, say: Say) -> Written:
         views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
     composer = Composer(request.device)
     composer.choose()
-    subject = (
-        _subject(request, composer)
-        if request.motion is None
-        else _reenacted(request, composer, say)
-    )
+    subject = _subject(request, composer, say)
     if request.is_film:
-        _film(request, subject, subject.views if views is None else views, report)
-    else:
-        assert views is not None
-        if request.motion is not None:  # each timestep as the first pose of each camera sees it
-            cameras = {view.camera_index: view for view in reversed(views)}
-            views = [
-                replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")
-                for timestep in subject.timesteps
-                for index in sorted(cameras)
-            ]
-        timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
-        _write_pictures(
-            request.output, subject, [view for view in views if view.timestep in timesteps], report
-        )
+        _film(request, subject, subject.views if request.cameras is None else views, report)
+        return Written(request.output)
+    if request.motion is not None:  # each timestep as the first pose of each camera sees it
+        cameras = sorted({view.camera_index: view for view in reversed(views)}.items())
+        views = [
+            replace(view, timestep=timestep, name=f"{timestep:05d}_{index:02d}")
+            for timestep in subject.timesteps
+            for index, view in cameras
+        ]
+    timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
+    shown = [view for view in views if view.timestep in timesteps]
+    _write_pictures(request.output, subject, shown, report)
     return Written(request.output)
 
 
@@ -199,31 +192,31 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
     """Write the subject's motion as one camera sees it, which stands still or orbits."""
     from ..render.render import to_uint8
 
-    start = _chosen_camera(request, views)
+    first = {view.camera_index: view for view in reversed(views)}
+    indices, index = sorted(first), request.camera
+    if not first:
+        raise StgaError(f"{request.source}: there is no camera to render from; give --cameras")
+    if index is None:
+        index = indices[central_camera([first[each].camera for each in indices])]
+    if index not in first:
+        raise StgaError(f"--camera {index}: there are only {', '.join(map(str, indices))}")
+    start = first[index]
     timesteps: Sequence[int] = _timesteps(request, subject.timesteps) or (0,)
-    path = [start] * len(timesteps)
+    cameras = [start.camera] * len(timesteps)
     if request.turntable is not None:
         count = max(len(timesteps), _turntable_images(request, subject.fps), 1)
         timesteps = to_and_fro(timesteps, count)
         center, half = subject.center(), np.radians(request.turntable) / 2
-        angles = (
-            (-half, half)
-            if half
-            else covered_angles([view.camera for view in views], start.camera, center)
-        )
-        path = [
-            replace(start, camera=camera)
-            for camera in turntable(start.camera, center, count, angles)
-        ]
+        angles = (-half, half)
+        if not half:
+            angles = covered_angles([view.camera for view in views], start.camera, center)
+        cameras = turntable(start.camera, center, count, angles)
     path = [
-        replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)
+        replace(start, camera=camera, timestep=timestep)
+        for camera, timestep in zip(cameras, timesteps, strict=True)
     ]
-    writer = (
-        video_writer(request.output, subject.fps)
-        if request.video
-        else sequence_writer(request.output)
-    )
-    with writer as write:
+    out = request.output
+    with video_writer(out, subject.fps) if request.video else sequence_writer(out) as write:
         for n, view in enumerate(counted(path, len(path), report, "Rendering", "Image")):
             write(to_uint8(subject.image(view, n / len(path))))
 
@@ -243,48 +236,44 @@ def _turntable_images(request: Render, fps: float) -> int:
     """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
     images = request.seconds * fps
     if images > MAX_TURNTABLE_IMAGES:
-        asked = (
-            f"--seconds {request.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
-        )
-        raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
+        asked = f"is {images:.0f} images at {fps:g} frames per second"
+        limit = f"expected up to {MAX_TURNTABLE_IMAGES}"
+        raise StgaError(f"--seconds {request.seconds:g}: {asked}; {limit}")
     return round(images)
 
 
-def _chosen_camera(request: Render, views: Sequence[View]) -> View:
-    """The first view of the camera to film with."""
-    first = {view.camera_index: view for view in reversed(views)}
-    if not first:
-        raise StgaError(f"{request.source}: there is no camera to render from; give --cameras")
-    if request.camera is None:
-        indices = sorted(first)
-        return first[indices[central_camera([first[index].camera for index in indices])]]
-    if request.camera not in first:
-        problem = f"there are only {', '.join(map(str, sorted(first)))}"
-        raise StgaError(f"--camera {request.camera}: {problem}")
-    return first[request.camera]
-
-
-def _subject(request: Render, composer: Composer) -> _Subject:
-    """An avatar with its capture, or a plain world-space PLY."""
-    if is_ply(request.source):
-        if request.light is not None:
-            problem = "is a PLY, whose light is not known; --light needs an avatar"
-            raise StgaError(f"{request.source}: {problem}")
-        if request.world:
-            raise StgaError(f"{request.source}: is a PLY; --world needs the folder of a run")
+def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
+    """An avatar with its capture or moved by another person's motion, or a world-space PLY."""
+    source = request.source
+    if is_ply(source):
+        refused = (
+            (request.motion, "splats are bound to no mesh that a motion could move"),
+            (request.light, "light is not known; --light needs an avatar"),
+            (request.world, "folder is not that of a run, which --world needs"),
+        )
+        for given, why in refused:
+            if given:
+                raise StgaError(f"{source}: is a PLY, whose {why}")
         from ..render.render import render
 
-        splats = read_ply(request.source)
+        splats = read_ply(source)
         return _Subject(
-            lambda view, _: render(splats, view.camera, request.background, composer=composer),
-            (),
-            lambda: np.median(splats.xyz, axis=0),
-            playback_fps(None, request.fps),
-        )
+            lambda view, _: render(splats, view.camera, request.background, composer=composer), (),
+            lambda: np.median(splats.xyz, axis=0), playback_fps(None, request.fps),
+        )  # fmt: skip
+    if request.motion is not None:
+        avatar = read_avatar(avatar_path(source))
+        motion = open_avatar_motion(request, avatar, say)
+        sequence, fps = motion.sequence, request.fps or motion.fps or DEFAULT_FPS
+        return _Subject(
+            _pictured(request, avatar, lambda v: sequence_mesh(sequence, v.timestep), composer),
+            tuple(sequence.timesteps),
+            lambda: _middle(sequence_mesh(sequence, sequence.timesteps[0])), fps,
+        )  # fmt: skip
     avatar, capture = open_avatar(request)
     if capture is None:
         problem = "an avatar needs the meshes of a capture to follow; give --capture"
-        raise StgaError(f"{request.source}: {problem}")
+        raise StgaError(f"{source}: {problem}")
 
     def mesh(view: View) -> np.ndarray:
         if view.timestep not in capture.timesteps:
@@ -293,32 +282,10 @@ def _subject(request: Render, composer: Composer) -> _Subject:
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
-        _pictured(request, avatar, mesh, composer),
-        capture.timesteps,
-        lambda: _middle(capture.mesh(capture.timesteps[0])),
-        playback_fps(capture, request.fps),
+        _pictured(request, avatar, mesh, composer), capture.timesteps,
+        lambda: _middle(capture.mesh(capture.timesteps[0])), playback_fps(capture, request.fps),
         [view for views in capture.views.values() for view in views],
-    )
-
-
-def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
-    """An avatar moved by another person's motion."""
-    if is_ply(request.source):
-        problem = "is a PLY, whose splats are bound to no mesh that a motion could move"
-        raise StgaError(f"{request.source}: {problem}")
-    avatar = read_avatar(avatar_path(request.source))
-    motion = open_avatar_motion(request, avatar, say)
-    sequence = motion.sequence
-
-    def mesh(timestep: int) -> np.ndarray:
-        return sequence_mesh(sequence, timestep)
-
-    return _Subject(
-        _pictured(request, avatar, lambda view: mesh(view.timestep), composer),
-        tuple(sequence.timesteps),
-        lambda: _middle(mesh(sequence.timesteps[0])),
-        request.fps or motion.fps or DEFAULT_FPS,
-    )
+    )  # fmt: skip
 
 
 def _pictured(
@@ -327,35 +294,27 @@ def _pictured(
     """The picture of an avatar on the mesh of a view, as recorded or under the asked light."""
     from ..render.render import render_avatar, render_colors
 
-    behind = _world(request.source) if request.world else None
+    background, behind = request.background, None
+    if request.world:
+        path = avatar_path(request.source).with_name(WORLD_FILE)
+        if not path.is_file():
+            shown = "--world shows what a training with --effect world=on has written"
+            raise StgaError(f"{path}: is missing; {shown}")
+        behind = read_ply(path)
     if request.light is None:
         return lambda view, _: render_avatar(
-            avatar, mesh(view), view.camera, request.background, composer, behind
+            avatar, mesh(view), view.camera, background, composer, behind
         )
     relighter, lighting = Relighter(avatar), read_lighting(request.light)
 
     def picture(view: View, share: float) -> np.ndarray:
-        posed = mesh(view)
-        light = (
-            turned(lighting, _middle(posed), request.light_turn * share)
-            if request.light_turn
-            else lighting
-        )
+        posed, light = mesh(view), lighting
+        if request.light_turn:
+            light = turned(lighting, _middle(posed), request.light_turn * share)
         colors = relighter.colors(posed, view.camera.position, light)
-        return render_colors(
-            avatar, posed, view.camera, colors, request.background, composer, behind
-        )
+        return render_colors(avatar, posed, view.camera, colors, background, composer, behind)
 
     return picture
-
-
-def _world(source: Path) -> Splats:
-    """Raises StgaError where the run of an avatar has no world."""
-    path = avatar_path(source).with_name(WORLD_FILE)
-    if not path.is_file():
-        problem = "is missing; --world shows what a training with --effect world=on has written"
-        raise StgaError(f"{path}: {problem}")
-    return read_ply(path)
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:

@@ -65,7 +65,8 @@ class Train:
     device: str = option(
         "gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto "
         "(default): that of the run, else a GPU if it is right and faster than the CPU in a trial "
-        "of a second, else the CPU", "auto", accepts=is_device, expected=EXPECTED_DEVICE, metavar="{auto,cpu,gpu,gpu:NAME}",
+        "of a second, else the CPU", "auto", accepts=is_device,
+        expected=EXPECTED_DEVICE, metavar="{auto,cpu,gpu,gpu:NAME}",
     )  # fmt: skip
     selection: Selection | None = None
 
