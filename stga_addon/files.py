@@ -120,11 +120,8 @@ class NumberedFiles:
         """Raises StgaError where the folder holds one of these names that is not listed."""
         self.folder, self._names, self._written = folder, names, dict[str, str]()
         self._list = folder / SEQUENCE_FILE
-        listed = (
-            set(self._list.read_text(errors="replace").splitlines())
-            if self._list.is_file()
-            else set()
-        )
+        text = self._list.read_text(errors="replace") if self._list.is_file() else ""
+        listed = set(text.splitlines())
         with _naming(folder):
             self._earlier = [
                 path for path in self._found() if self._line(path.name, path) in listed

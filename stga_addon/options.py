@@ -38,15 +38,8 @@ def option(
     group    options of one group exclude each other
     needs    fields that have to be given with it, else it has no effect; of a tuple, one
     """
-    asked = {
-        "help": help,
-        "flag": flag,
-        "metavar": metavar,
-        "parse": parse,
-        "bare": bare,
-        "group": group,
-    }
-    asked |= {"needs": needs, "offered": offered or limits.get("choices")}
+    asked = {"help": help, "flag": flag, "metavar": metavar, "parse": parse, "bare": bare}
+    asked |= {"group": group, "needs": needs, "offered": offered or limits.get("choices")}
     return setting(default, minimum, maximum, **limits, **asked)
 
 
@@ -141,11 +134,8 @@ def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
         if value is None:
             continue
         if isinstance(value, list):
-            value = (
-                dict(value)
-                if any(get_origin(part) is Mapping for part in alternatives(hint))
-                else tuple(value)
-            )
+            is_mapping = any(get_origin(part) is Mapping for part in alternatives(hint))
+            value = dict(value) if is_mapping else tuple(value)
         found[spec.name] = value
     return found
 

@@ -75,18 +75,14 @@ def report_run(folder: Path) -> list[str]:
     write_curve(folder)
     run, metrics = read_run(folder), read_metrics(folder)
     continued = run.continuation is not None
-    lines = (
-        summarize_continuation(metrics)
-        if continued
-        else summarize_run(metrics, run.settings.target_psnr)
-    )
+    lines = summarize_run(metrics, run.settings.target_psnr)
+    if continued:
+        lines = summarize_continuation(metrics)
     if (folder / CURVE).exists():
         return lines
-    reason = (
-        "matplotlib is not installed"
-        if curve_of(metrics)
-        else "no held-out views (split 'val') were evaluated"
-    )
+    reason = "no held-out views (split 'val') were evaluated"
+    if curve_of(metrics):
+        reason = "matplotlib is not installed"
     return [*lines, f"{CURVE} was not drawn: {reason}"]
 
 
@@ -121,10 +117,8 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     if checked:
         lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
-    lines.append(
-        f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}"
-    )
-    return lines
+    share = f"{evaluation_share(metrics):.1%} of the training time"
+    return [*lines, f"evaluation took {share}, in addition to it{memory}"]
 
 
 def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -38,14 +38,8 @@ def setting(
     is_path           whether a text is that of a path, where it can be a name as well
     option            what the command line and Blender ask for it with (`options.option`)
     """
-    limits = {
-        "minimum": minimum,
-        "maximum": maximum,
-        "above": above,
-        "choices": choices,
-        "accepts": accepts,
-    }
-    metadata = {**limits, "expected": expected, IS_PATH: is_path, **option}
+    limits = {"minimum": minimum, "maximum": maximum, "above": above, "choices": choices}
+    metadata = {**limits, "accepts": accepts, "expected": expected, IS_PATH: is_path, **option}
     if default_factory is not dataclasses.MISSING:
         return field(default_factory=default_factory, metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -177,12 +171,10 @@ def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None) -> Any:
 def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
     if dataclasses.is_dataclass(value):
         hints = type_hints(type(value))  # type: ignore[arg-type]
-        fields = {
-            spec.name: _plain(
-                getattr(value, spec.name), hints[spec.name], arrays, _joined(name, spec.name)
-            )
-            for spec in dataclasses.fields(value)
-        }
+        fields = {}
+        for spec in dataclasses.fields(value):
+            found, path = getattr(value, spec.name), _joined(name, spec.name)
+            fields[spec.name] = _plain(found, hints[spec.name], arrays, path)
         several = sum(dataclasses.is_dataclass(kind) for kind in alternatives(hint)) > 1
         return {KIND: type(value).__name__, **fields} if several else fields
     if isinstance(value, np.ndarray):
@@ -246,12 +238,11 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
             fields = ", ".join(sorted(map(str, differing)))[:200]
             problem = f"{where}{': ' if where else ''}fields are missing or unknown ({fields})"
             raise StgaError(problem)
-        return kind(
-            **{
-                name: _parsed(hint, value[name], _joined(where, name), arrays)
-                for name, hint in hints.items()
-            }
-        )
+        parsed = {
+            name: _parsed(hint, value[name], _joined(where, name), arrays)
+            for name, hint in hints.items()
+        }
+        return kind(**parsed)
     if isinstance(value, str) and Path in kinds and str not in kinds:
         return Path(value)
     if isinstance(value, list):

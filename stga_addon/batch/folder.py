@@ -145,10 +145,7 @@ def read_record(job: Job) -> JobRecord | None:
     """None where the job was never prepared, or by another version."""
     try:
         values = read_json(job.request_folder / JOB_FILE)
-        named = isinstance(values, dict) and (
-            values.pop("format", None),
-            values.pop("version", None),
-        )
+        named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
         record: JobRecord | None = (
             from_json(JobRecord, values) if named == (FORMAT, VERSION) else None
         )

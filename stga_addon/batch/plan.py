@@ -239,10 +239,8 @@ def plan_of_captures(
     """A training of each capture; fields: of `Train`, settings: of `make_settings`."""
     folders = [path.resolve() for path in captures]
     table = {"request": "train", "settings": dict(settings), **fields}
-    jobs = {
-        f"train-{name}": {**table, "capture": str(path)}
-        for name, path in zip(_names(folders), folders, strict=True)
-    }
+    names = zip(_names(folders), folders, strict=True)
+    jobs = {f"train-{name}": {**table, "capture": str(path)} for name, path in names}
     return make_plan({"out": str(out.resolve()), "job": jobs}, Path.cwd(), "CAPTURES")
 
 

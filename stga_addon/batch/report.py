@@ -57,18 +57,11 @@ class LiveTable:
 def table_lines(batch: Batch) -> list[str]:
     """A line on the whole batch, and one for each job that runs or has failed."""
     shown = [entry for entry in batch.entries.values() if entry.state == JobState.RUNNING]
-    shown += [
-        entry
-        for entry in batch.entries.values()
-        if entry.state in (JobState.FAILED, JobState.BLOCKED)
-    ]
+    shown += batch.failures
     width = max((len(entry.job.name) for entry in shown[:MAX_LIVE_ROWS]), default=0)
     lines = [summary_line(batch), *(_row(entry, width) for entry in shown[:MAX_LIVE_ROWS])]
-    return (
-        lines
-        if len(shown) <= MAX_LIVE_ROWS
-        else [*lines, f"… and {len(shown) - MAX_LIVE_ROWS} more"]
-    )
+    more = [f"… and {len(shown) - MAX_LIVE_ROWS} more"] if len(shown) > MAX_LIVE_ROWS else []
+    return lines + more
 
 
 def summary_line(batch: Batch) -> str:
@@ -116,10 +109,10 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     """What --dry-run prints: each job, its state, its forecast, and the sum."""
     rows = [_plan_row(entry) for entry in batch.entries.values()]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    lines = []
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        lines.append("  ".join(cells).rstrip())
     unfinished = [entry for entry in batch.entries.values() if not entry.state.is_over]
     known = [entry.forecast_s for entry in unfinished if entry.forecast_s]
     total = sum(known)
@@ -131,11 +124,8 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     )
     shared = max(on_cores / max(1, cores), *known, 0.0)
     text += f", about {format_duration(shared)} on this machine" if known else ""
-    text += (
-        f"; of {unknown} jobs the time is not known before one of their kind is finished"
-        if unknown
-        else ""
-    )
+    if unknown:
+        text += f"; of {unknown} jobs the time is not known before one of their kind is finished"
     return [*lines, text]
 
 
@@ -157,11 +147,11 @@ PICTURE_HEIGHT_PX = 240
 JPEG_QUALITY = 85
 LOG_LINES = 12
 STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 70rem; padding: 0 1rem; color: #1c1c1c;
-       background: #fff; }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 70rem; padding: 0 1rem;
+       color: #1c1c1c; background: #fff; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-table { border-collapse: collapse; width: 100%; } th, td { text-align: left; padding: .25rem .6rem .25rem 0;
-       border-bottom: 1px solid #ddd; vertical-align: top; }
+table { border-collapse: collapse; width: 100%; } th, td { text-align: left; vertical-align: top;
+       padding: .25rem .6rem .25rem 0; border-bottom: 1px solid #ddd; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 .failed { color: #a3200d; } .quiet { color: #666; }
 pre { background: #f4f4f4; padding: .6rem; overflow-x: auto; font-size: 13px; }
@@ -182,7 +172,8 @@ def write_report(batch: Batch) -> Path:
     runs = sorted(found, key=lambda run: _figures(run).get("psnr", -np.inf))
     parts = [_summary(batch), _failures(batch), _chart(runs), _pictures(runs), _table(batch, runs)]
     title = html.escape(batch.plan.out.name)
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+    head = '<!doctype html><html lang="en"><meta charset="utf-8">'
+    head += f"<title>{title}</title><style>{STYLE}</style>"
     path = batch.plan.out / REPORT
     with replacing(path) as partial:
         partial.write_text(
@@ -196,11 +187,8 @@ def _figures(run: Run) -> dict[str, Any]:
     entry, metrics = run
     lines = [line for line in metrics if "psnr" in line]
     with suppress(StgaError):
-        return (
-            dict(saved_line(lines, read_run(entry.job.folder).settings.target_psnr))
-            if lines
-            else {}
-        )
+        target = read_run(entry.job.folder).settings.target_psnr
+        return dict(saved_line(lines, target)) if lines else {}
     return {}
 
 
@@ -221,7 +209,8 @@ def _summary(batch: Batch) -> str:
         f" Forecasts were off by {np.median(off):.0%} (median of {len(off)})." if off else ""
     )
     source = html.escape(batch.plan.source)
-    return f"<p>{source}: {len(entries)} jobs: {text}. {format_duration(seconds)} of work.{forecasts}</p>"
+    worked = f"{format_duration(seconds)} of work"
+    return f"<p>{source}: {len(entries)} jobs: {text}. {worked}.{forecasts}</p>"
 
 
 def _forecast_error(entry: Entry) -> float | None:

@@ -33,8 +33,9 @@ JAW_STEPS = 4
 MAX_JAW_RAD = 0.8  # A jaw turns less; further, the fit has left what it is linear in
 # jawOpen, jawLeft and jawRight at which the other shapes are combined.
 JAW_POSES = (
-    (0, 0, 0), (0.25, 0, 0), (0.5, 0, 0), (0.75, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0.5, 0), (0, 0, 0.5),
-    (0.5, 0.5, 0), (0.5, 0, 0.5), (1, 1, 0), (1, 0, 1), (0.25, 1, 0), (0.25, 0, 1),
+    (0, 0, 0), (0.25, 0, 0), (0.5, 0, 0), (0.75, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1),
+    (0, 0.5, 0), (0, 0, 0.5), (0.5, 0.5, 0), (0.5, 0, 0.5), (1, 1, 0), (1, 0, 1), (0.25, 1, 0),
+    (0.25, 0, 1),
 )  # fmt: skip
 COMBINATIONS = 60  # Random combinations of the other shapes at each of the poses of the jaw
 ACTIVE_SHARE = 0.35  # Of the shapes in a combination
@@ -66,10 +67,8 @@ class HeadMap:
     def parameters(self, weights: np.ndarray) -> np.ndarray:
         """(T, E + 9) expression coefficients, jaw and eyes of weights (T, 52)."""
         effective = effective_weights(weights)
-        return np.concatenate(
-            [features(weights) @ self.expressions, effective @ self.jaw, effective @ self.eyes],
-            axis=1,
-        )
+        expressions = features(weights) @ self.expressions
+        return np.hstack([expressions, effective @ self.jaw, effective @ self.eyes])
 
     def frames(self, performance: Performance) -> list[FlameFrame]:
         """One frame per row of the performance; the head's rotation turns the neck."""
@@ -239,11 +238,9 @@ def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
     weights = np.eye(COUNT)
     weights[MOUTH_CLOSE, JAW_OPEN] = 1
     values = found.parameters(weights)
+    count = fit.count
     moved = np.stack(
-        [
-            fit.posed.positions(row[: fit.count], fit.rigid(row[fit.count : fit.count + 3]))
-            for row in values
-        ]
+        [fit.posed.positions(row[:count], fit.rigid(row[count : count + 3])) for row in values]
     )
     done = moved - fit.neutral
     done[MOUTH_CLOSE] = moved[MOUTH_CLOSE] - moved[JAW_OPEN]

@@ -22,8 +22,9 @@ RIDGE = 1e-9
 """Share of the mean squared displacement that keeps weights apart which this head cannot tell
 apart."""
 TIMECODE_BASE = 60
-EXTRA_COLUMNS = ("HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw", "LeftEyePitch", "LeftEyeRoll", "RightEyeYaw",
-                 "RightEyePitch", "RightEyeRoll")  # fmt: skip
+EXTRA_COLUMNS = tuple(
+    f"{part}{turn}" for part in ("Head", "LeftEye", "RightEye") for turn in ("Yaw", "Pitch", "Roll")
+)
 
 
 def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Performance:

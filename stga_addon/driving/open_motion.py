@@ -187,12 +187,12 @@ class MotionOptions:
     """
 
     strength: float = option(
-        "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first pose",
-        1.0, 0, MAX_FACTOR,
+        "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first "
+        "pose", 1.0, 0, MAX_FACTOR,
     )  # fmt: skip
     neutral: str = option(
-        "what the motion is taken relative to, so that this head's own face is moved, not the performer's",
-        "none", choices=NEUTRALS,
+        "what the motion is taken relative to, so that this head's own face is moved, not the "
+        "performer's", "none", choices=NEUTRALS,
     )  # fmt: skip
     smoothing: float = option(
         "smooth a face performance in time, by this standard deviation",
@@ -200,13 +200,12 @@ class MotionOptions:
     )  # fmt: skip
     mirror: bool = option("exchange left and right of a face performance", False)
     gains: Mapping[str, float] = option(
-        "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may be repeated",
-        default_factory=dict, flag="--gain", metavar="NAME=FACTOR", parse=parsed_gain,
+        "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may "
+        "be repeated", default_factory=dict, flag="--gain", metavar="NAME=FACTOR", parse=parsed_gain,
     )  # fmt: skip
     stay_trained: float | None = option(
-        "lead the motion softly back to the range that the run was trained on, and print how far it was outside; "
-        "0: print only, 1 (default): fully",
-        None, 0, 1, metavar="SHARE", bare=1.0,
+        "lead the motion softly back to the range that the run was trained on, and print how far "
+        "it was outside; 0: print only, 1 (default): fully", None, 0, 1, metavar="SHARE", bare=1.0,
     )  # fmt: skip
     exchange: tuple[str, ...] = option(
         "exchange left and right of one pair alone, which some senders exchange; may be repeated",
@@ -253,18 +252,11 @@ def open_motion(
     if is_performance(path):
         model = flame_model(flame)
         if flame is None and len(model.faces) != len(faces):
-            raise StgaError(
-                f"{path}: needs the FLAME model file (.pkl or .npz) of the head that it moves; give it with --flame"
-            )
+            problem = "needs the FLAME model file (.pkl or .npz) of the head that it moves"
+            raise StgaError(f"{path}: {problem}; give it with --flame")
         _check_faces(path, model, faces)
-        return performed(
-            read_performance(path),
-            person_of(model, neutral),
-            str(flame or path),
-            options,
-            trained,
-            fps,
-        )
+        person, name = person_of(model, neutral), str(flame or path)
+        return performed(read_performance(path), person, name, options, trained, fps)
     capture = open_capture(path, flame)
     if capture.flame is None:
         problem = "was not tracked with FLAME, so it has no parameters of expression and pose"
@@ -308,14 +300,12 @@ def prepared_performance(
 ) -> Performance:
     """Evenly sampled, relative to its neutral, smoothed, `corrected`, at the strength."""
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
-        raise StgaError(
-            f"a performance cannot be resampled to {fps:g} frames per second, expected {MIN_FPS:g} to {MAX_FPS:g}"
-        )
+        problem = f"cannot be resampled to {fps:g} frames per second"
+        raise StgaError(f"a performance {problem}, expected {MIN_FPS:g} to {MAX_FPS:g}")
     rate = fps or performance.fps
     if performance.times[-1] * rate > MAX_ROWS:
-        raise StgaError(
-            f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is too long"
-        )
+        length = f"{performance.times[-1]:.0f} s at {rate:g} frames per second"
+        raise StgaError(f"a performance of {length} is too long")
     rest = None
     if options.neutral in ("quiet", "first"):
         weights = (

@@ -41,13 +41,9 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     second = 3600 * hours + 60 * minutes + whole
     base = _base(second, frames + parts)
     if dropping.any():
-        total_minutes = 60 * hours + minutes
-        counted = (
-            second * base
-            + frames
-            + parts
-            - round(base / 15) * (total_minutes - np.floor(total_minutes / 10))
-        )
+        minute = 60 * hours + minutes
+        left_out = round(base / 15) * (minute - np.floor(minute / 10))
+        counted = second * base + frames + parts - left_out
         elapsed = counted / (base * DROP_RATIO)
     else:
         elapsed = second + (frames + parts) / base
@@ -131,11 +127,8 @@ CATEGORY_KEYS = (("categoryName", "category_name", "name"), ("score", "value", "
 def is_performance(path: Path) -> bool:
     """Whether a path is one of `SUFFIXES`, or the folder of a Live Link Face take."""
     if path.is_dir():
-        return (
-            not (path / "flame_param").is_dir()
-            and bool(_take_files(path))
-            and not any(path.glob("transforms*.json"))
-        )
+        is_capture = (path / "flame_param").is_dir() or any(path.glob("transforms*.json"))
+        return not is_capture and bool(_take_files(path))
     return path.suffix.lower() in SUFFIXES
 
 
@@ -226,11 +219,8 @@ def _csv_times(
     codes = [] if code is None else [row[code] if code < len(row) else "" for row in body]
     if any(":" in text for text in codes):
         return seconds_of(str(path), codes)
-    at = (
-        code
-        if code is not None
-        else next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
-    )
+    at = next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
+    at = at if code is None else code
     if at is None:
         return None
     return np.array([_number(path, row, number, at, header) for number, row in enumerate(body)])
@@ -342,11 +332,8 @@ def _performance(
         raise StgaError(f"{path}: {problem}")
     if times is None:
         rate = DEFAULT_FPS if fps is None else fps
-        times = (
-            np.arange(len(weights)) / rate
-            if MIN_FPS <= rate <= MAX_FPS
-            else np.full(len(weights), np.nan)
-        )
+        rate = rate if MIN_FPS <= rate <= MAX_FPS else np.nan
+        times = np.arange(len(weights)) / rate
     if not np.isfinite(times).all():
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g} a second"
         raise StgaError(f"{path}: its times or its rate are not usable; {expected}")

@@ -103,9 +103,10 @@ def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray
             pupils.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
     apart = float(pupils[1][0] - pupils[0][0])
     if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
+        low, high = 1000 * MIN_EYE_DISTANCE_M, 1000 * MAX_EYE_DISTANCE_M
         raise StgaError(
-            f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {1000 * MIN_EYE_DISTANCE_M:.0f} to "
-            f"{1000 * MAX_EYE_DISTANCE_M:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
+            f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {low:.0f} to "
+            f"{high:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
         )
     pupils = np.array(pupils)
     skin = source.reliable & (np.arange(len(source.points)) < SKIN_POINTS)
@@ -140,12 +141,10 @@ class _Surface:
         turned = np.einsum("nkc,nc->nk", self.normals[near], normals) < MIN_COSINE
         best = (distance + FAR_M * turned).argmin(axis=1)
         rows = np.arange(len(points))
-        return (
-            near[rows, best],
-            barycentric[rows, best],
-            positions[rows, best],
-            distance[rows, best],
+        first, second, third, fourth = (
+            values[rows, best] for values in (near, barycentric, positions, distance)
         )
+        return first, second, third, fourth
 
 
 def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -211,21 +210,12 @@ def _aligned(
         face, _, target, distance = surface.nearest(points[skin], normals[skin])
         kept = distance < max(MEDIANS * float(np.median(distance)), MAX_MATCH_M)
         moved, normal, target = basis[skin][kept], surface.normals[face[kept]], target[kept]
-        rows = np.concatenate(
-            [
-                np.einsum("na,nak->nk", normal, moved),
-                TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count),
-                anchors,
-                prior,
-            ]
-        )
+        towards = np.einsum("na,nak->nk", normal, moved)
+        along = TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count)
+        rows = np.concatenate([towards, along, anchors, prior])
         expected = AFFINE_WEIGHT * np.trace(linear) / 3 * np.eye(3).ravel()
-        wanted = [
-            (normal * target).sum(1),
-            TANGENTIAL_WEIGHT * target.ravel(),
-            PUPIL_WEIGHT * pupils.ravel(),
-            expected,
-        ]
+        wanted = [(normal * target).sum(1), TANGENTIAL_WEIGHT * target.ravel()]
+        wanted += [PUPIL_WEIGHT * pupils.ravel(), expected]
         found = np.linalg.lstsq(rows, np.concatenate([*wanted, np.zeros(count)]), rcond=None)[0]
         linear = found[entries].reshape(3, 3)
         points = basis @ found

@@ -168,16 +168,9 @@ class Failed:
 
 
 Event = (
-    Started
-    | CancelAsked
-    | Dismissed
-    | SceneRead
-    | StatusRead
-    | SceneFree
-    | SliceBuilt
-    | Shown
+    Started | CancelAsked | Dismissed | SceneRead | StatusRead | SceneFree | SliceBuilt | Shown
     | Failed
-)
+)  # fmt: skip
 
 
 # Effects
@@ -237,17 +230,9 @@ class Redraw:
 
 
 Effect = (
-    Store
-    | StoreAvatar
-    | LoadAvatar
-    | Show
-    | ReadCurve
-    | StopWorker
-    | KillWorker
-    | RemoveFiles
-    | PushUndo
-    | Redraw
-)
+    Store | StoreAvatar | LoadAvatar | Show | ReadCurve | StopWorker | KillWorker | RemoveFiles
+    | PushUndo | Redraw
+)  # fmt: skip
 Outcome = tuple[RequestState, tuple[Effect, ...]]
 
 

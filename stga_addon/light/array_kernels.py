@@ -23,12 +23,8 @@ def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None
     corners = np.stack([points[faces[:, k]].T for k in range(3)]).astype(np.float64)
     low, high = np.clip(corners.min(0)[:2], 0, size), np.clip(corners.max(0)[:2], 0, size)
     area = _crossed(corners[1] - corners[0], corners[2] - corners[0], 0, 1)
-    drawn = (
-        np.isfinite(corners).all((0, 1))
-        & (np.abs(area) > 1e-12)
-        & (low < size).all(0)
-        & (high > 0).all(0)
-    )
+    drawn = np.isfinite(corners).all((0, 1)) & (np.abs(area) > 1e-12)
+    drawn &= (low < size).all(0) & (high > 0).all(0)
     order = np.flatnonzero(drawn)
     # From far to near, so that the nearest are mostly written last.
     order = order[np.argsort(-corners[:, 2, order].sum(0))]
@@ -146,8 +142,9 @@ def _looked_up(
 
 
 def add_lights(
-    points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray, reflectance: np.ndarray,
-    lights: np.ndarray, lit: np.ndarray, irradiance: np.ndarray, highlight: np.ndarray,
+    points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray,
+    reflectance: np.ndarray, lights: np.ndarray, lit: np.ndarray, irradiance: np.ndarray,
+    highlight: np.ndarray,
 ) -> None:  # fmt: skip
     """As `raster.cpu.shade.add_lights`."""
     for start in range(0, len(points), CHUNK_POINTS):
@@ -155,13 +152,8 @@ def add_lights(
         place, normal = (np.ascontiguousarray(rows[part].T) for rows in (points, normals))
         view = eye[:, None] - place
         view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
-        surface = (
-            normal,
-            view,
-            np.maximum(_dot(normal, view), MIN_FACING),
-            roughness[part],
-            reflectance[part],
-        )
+        facing = np.maximum(_dot(normal, view), MIN_FACING)
+        surface = normal, view, facing, roughness[part], reflectance[part]
         arriving, reflected = np.zeros_like(view), np.zeros_like(view)
         for light in lights:
             toward, strength, width = toward_light(light, place)
@@ -203,8 +195,8 @@ def toward_light(
 
 
 def _gloss(
-    toward: np.ndarray, width: np.ndarray, normal: np.ndarray, view: np.ndarray, toward_eye: np.ndarray,
-    roughness: np.ndarray, reflectance: np.ndarray,
+    toward: np.ndarray, width: np.ndarray, normal: np.ndarray, view: np.ndarray,
+    toward_eye: np.ndarray, roughness: np.ndarray, reflectance: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """(N,) as `raster.cpu.shade.ggx` of lights `width` (N,) wide; 0 without roughness."""
     half = toward + view

@@ -92,14 +92,8 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     polar = np.pi * (np.arange(height) + 0.5) / height
     turn = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
     ring = np.sin(polar)[:, None]
-    vectors = np.stack(
-        [
-            ring * np.cos(turn),
-            ring * np.sin(turn),
-            np.broadcast_to(np.cos(polar)[:, None], (height, width)),
-        ],
-        axis=-1,
-    )
+    height_of = np.broadcast_to(np.cos(polar)[:, None], (height, width))
+    vectors = np.stack([ring * np.cos(turn), ring * np.sin(turn), height_of], axis=-1)
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     return vectors, ((edges[:-1] - edges[1:]) * 2 * np.pi / width)[:, None]
 
@@ -230,10 +224,8 @@ def _completed(kind: type, values: Any) -> Any:
     if not isinstance(values, dict):
         return values
     defaults = {spec.name: spec.default for spec in fields(kind) if spec.default is not MISSING}
-    return {
-        **{name: list(v) if isinstance(v, tuple) else v for name, v in defaults.items()},
-        **values,
-    }
+    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in defaults.items()}
+    return {**plain, **values}
 
 
 def turned(lighting: Lighting, center: np.ndarray, degrees: float) -> Lighting:

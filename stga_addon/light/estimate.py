@@ -174,13 +174,9 @@ def estimate_light(
         raise StgaError(f"{capture.root}: {problem}")
     transfer, occlusion = transfer_of(capture.neutral, capture.faces)
     observed = observe(capture, known.exposure, report)
-    posed = np.stack(
-        [
-            transfer_of(capture.mesh(time), capture.faces, POSED_DIRECTIONS)[0]
-            for time in views_by_time(capture)
-        ]
-    )
-    radiance, residual = fit_light(observed.color, posed[:, capture.faces].mean(2), known.radiance)
+    times, faces = views_by_time(capture), capture.faces
+    posed = np.stack([transfer_of(capture.mesh(t), faces, POSED_DIRECTIONS)[0] for t in times])
+    radiance, residual = fit_light(observed.color, posed[:, faces].mean(2), known.radiance)
     source = "estimated"
     if known.radiance is not None:
         source = "file"
@@ -188,27 +184,17 @@ def estimate_light(
         assert known.toward is not None
         # At the level and white balance at which gray that faces `toward` shows the card's colors.
         arriving = np.maximum((basis(known.toward) * LAMBERT @ radiance).mean(0), 1e-6)
-        radiance, source = (
-            radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving),
-            "gray_card",
-        )
-    bounce = Bounce(capture.neutral, capture.faces, occlusion)
-    irradiance = recorded_irradiance(
-        np.maximum(posed @ radiance, DARK), observed.cameras, capture.faces, bounce
-    )
-    damping = MAX_DAMPING * float(
-        np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1)
-    )
+        radiance = radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving)
+        source = "gray_card"
+    bounce, direct = Bounce(capture.neutral, faces, occlusion), np.maximum(posed @ radiance, DARK)
+    irradiance = recorded_irradiance(direct, observed.cameras, faces, bounce)
+    hardness = (residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL)
+    damping = MAX_DAMPING * float(np.clip(hardness, 0, 1))
     return AvatarLight(
-        radiance=radiance.astype(np.float32),
-        transfer=transfer,
-        occlusion=occlusion,
-        irradiance=irradiance.astype(np.float32),
-        roughness=wet_roughness(capture.neutral, capture.faces),
-        residual=residual,
-        damping=round(damping, 3),
-        source=source,
-    )
+        radiance=radiance.astype(np.float32), transfer=transfer, occlusion=occlusion,
+        irradiance=irradiance.astype(np.float32), roughness=wet_roughness(capture.neutral, faces),
+        residual=residual, damping=round(damping, 3), source=source,
+    )  # fmt: skip
 
 
 def recorded_irradiance(
@@ -267,17 +253,15 @@ def fit_light(
 
 
 def _albedo(
-    color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray, typical: np.ndarray, faces: int,
-    times: int,
+    color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray,
+    typical: np.ndarray, faces: int, times: int,
 ) -> np.ndarray:  # fmt: skip
     """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical`."""
     prior = PRIOR * times * (arriving**2).mean(0)
     found = np.empty_like(color)
     for k in range(3):
-        upper = (
-            np.bincount(face, weight[:, k] * color[:, k] * arriving[:, k], faces)
-            + prior[k] * typical[k]
-        )
+        weighted = weight[:, k] * color[:, k] * arriving[:, k]
+        upper = np.bincount(face, weighted, faces) + prior[k] * typical[k]
         lower = np.bincount(face, weight[:, k] * arriving[:, k] ** 2, faces) + prior[k]
         found[:, k] = (upper / lower)[face]
     return found

@@ -122,11 +122,9 @@ class ShadowMap:
             if not is_parallel:
                 points[:, 2] = -1 / points[:, 2]
             kernels("shadow").add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
-        self.depth = (
-            depth
-            if is_parallel
-            else np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
-        )
+        if not is_parallel:
+            depth = np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
+        self.depth = depth
 
     def lit(
         self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP,
@@ -163,11 +161,8 @@ class ShadowMap:
 
 def kernels(name: str) -> Any:
     """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`), or NumPy's."""
-    return (
-        array_kernels
-        if find_spec("numba") is None
-        else import_module(f"...raster.cpu.{name}", __name__)
-    )
+    has_numba = find_spec("numba") is not None
+    return import_module(f"...raster.cpu.{name}", __name__) if has_numba else array_kernels
 
 
 FEW, SOME, MANY = 1, 2, 3

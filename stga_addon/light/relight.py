@@ -242,11 +242,9 @@ class Relighter:
         )
         arriving += np.maximum(self.transfer @ world, 0) + at_splats[:, 6:]
         highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
-        albedo = (
-            self._albedo(self.diffuse_color + self._strain_color(mesh))
-            if self._strained
-            else self.albedo
-        )
+        albedo = self.albedo
+        if self._strained:
+            albedo = self._albedo(self.diffuse_color + self._strain_color(mesh))
         lit = np.asarray(
             albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight
         )
@@ -294,11 +292,8 @@ class Relighter:
 
     def _strain_color(self, mesh: np.ndarray) -> np.ndarray:
         splats = self.avatar.splats
-        return np.asarray(
-            np.einsum(
-                "ns,nsc->nc", self.avatar.frames(mesh).strain[splats.face], splats.strain_color
-            )
-        )
+        strain = self.avatar.frames(mesh).strain[splats.face]
+        return np.asarray(np.einsum("ns,nsc->nc", strain, splats.strain_color))
 
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""

@@ -32,10 +32,8 @@ def transfer_of(
     normals = vertex_normals(vertices, faces)
     points, sky = vertices + LIFT_M * normals, even_directions(directions)
     harmonics = basis(sky) * (4 * np.pi / directions)
-    transfer, open_sky, whole_sky = (
-        np.zeros((len(vertices), harmonics.shape[1])),
-        *np.zeros((2, len(vertices))),
-    )
+    transfer = np.zeros((len(vertices), harmonics.shape[1]))
+    open_sky, whole_sky = np.zeros((2, len(vertices)))
     for direction, harmonic in zip(sky, harmonics, strict=True):
         cosine = np.maximum(normals @ direction, 0)
         depths = ShadowMap(
@@ -208,12 +206,8 @@ def find_lashes(
     scale = np.exp(rows.log_scale.astype(np.float64))
     longest = np.argsort(-scale, axis=1, kind="stable")[:, :2]
     axes = np.swapaxes(to_matrices(rows.rotation), 1, 2)
-    first, second = (
-        EXTENT
-        * np.take_along_axis(scale, longest[:, k, None], 1)
-        * axes[np.arange(len(found)), longest[:, k]]
-        for k in range(2)
-    )
+    splat, lengths = np.arange(len(found)), EXTENT * np.take_along_axis(scale, longest, 1)
+    first, second = (lengths[:, k, None] * axes[splat, longest[:, k]] for k in range(2))
     offsets = np.stack([first, second, -first, -second], axis=1)
     return Lashes(avatar, splats.face[found], np.asarray(rows.xyz[:, None] + offsets, np.float32))
 

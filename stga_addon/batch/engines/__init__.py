@@ -7,13 +7,10 @@ from ...errors import StgaError
 from ..plan import Engine
 
 ENGINES = {
-    "local": (
-        "LocalEngine",
-        "this machine, as many jobs at once as its processors and memory allow",
-    ),
+    "local": ("LocalEngine", "this machine, as many jobs as its processors and memory allow"),
     "ray": ("RayEngine", "a Ray cluster at --address, or one started here"),
     "slurm": ("SlurmEngine", "a SLURM cluster, as arrays of sbatch"),
-}  # Name on the command line, which is the file's -> class, and what it is, for the help
+}
 
 
 def make_engine(name: str, address: str = "") -> Engine:

@@ -44,11 +44,8 @@ class LocalEngine:
         wanted = [job.resources, *(other.resources for other, _ in self._jobs.values())]
         threads = sum(resources.threads or self._cores for resources in wanted)
         memory = sum(resources.memory_gb for resources in wanted)
-        return (
-            threads <= self._cores
-            and memory <= self._memory_gb
-            and sum(r.gpu for r in wanted) <= GPUS
-        )
+        fits = threads <= self._cores and memory <= self._memory_gb
+        return fits and sum(resources.gpu for resources in wanted) <= GPUS
 
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
@@ -90,7 +87,5 @@ def free_memory_gb() -> float:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
         return math.inf
-    return next(
-        (int(line.split()[1]) * 1024 / 1e9 for line in lines if line.startswith("MemAvailable:")),
-        math.inf,
-    )
+    found = (line.split()[1] for line in lines if line.startswith("MemAvailable:"))
+    return float(next(found, "inf")) * 1024 / 1e9

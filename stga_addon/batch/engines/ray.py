@@ -66,11 +66,8 @@ class RayEngine:
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
             needs = job.resources
-            options = {
-                "num_cpus": needs.threads or 1,
-                "num_gpus": int(needs.gpu),
-                "memory": needs.memory_gb * 1e9,
-            }
+            memory, gpus = needs.memory_gb * 1e9, int(needs.gpu)
+            options = {"num_cpus": needs.threads or 1, "num_gpus": gpus, "memory": memory}
             task = self._task.options(name=job.name, **options)
             log = str(job.request_folder / LOG_FILE)
             self._jobs[task.remote(job_command(job), str(PACKAGES_FOLDER), log)] = job
@@ -147,12 +144,8 @@ def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
         end_with_this = None if prctl is None else lambda: prctl(1, signal.SIGKILL)
         with open(log, "ab") as out:
             return subprocess.call(
-                command,
-                env=variables,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=out,
+                command, env=variables, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
                 preexec_fn=end_with_this,
-            )
+            )  # fmt: skip
 
     return run_command

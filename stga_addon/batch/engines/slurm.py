@@ -100,9 +100,9 @@ class SlurmEngine:
         }
         waits = sorted({_array(name) for name in names if name})
         command = [
-            "sbatch", "--parsable", "--requeue", f"--job-name=stga-{kind}", f"--array=0-{len(jobs) - 1}",
-            f"--cpus-per-task={needs.threads or 1}", f"--mem={round(1000 * needs.memory_gb)}M", "--output=/dev/null",
-            *(["--gres=gpu:1"] if needs.gpu else []),
+            "sbatch", "--parsable", "--requeue", "--output=/dev/null", f"--job-name=stga-{kind}",
+            f"--array=0-{len(jobs) - 1}", f"--cpus-per-task={needs.threads or 1}",
+            f"--mem={round(1000 * needs.memory_gb)}M", *(["--gres=gpu:1"] if needs.gpu else []),
             *([f"--dependency=afterany:{':'.join(waits)}"] if waits else []),
             str(script),
         ]  # fmt: skip
@@ -155,20 +155,11 @@ class SlurmEngine:
     def withdraw(self) -> Sequence[str]:
         """Take back the jobs that wait in the queue."""
         self._ask()
-        states = self._states or {}
-        waiting = [
-            name
-            for name, one in self._jobs.items()
-            if states.get(one.name, ("", ""))[0] == "PENDING"
-        ]
+        pending = {name for name, (state, _) in (self._states or {}).items() if state == "PENDING"}
+        waiting = [name for name, one in self._jobs.items() if one.name in pending]
         if waiting:
-            _call(
-                [
-                    "scancel",
-                    "--state=PENDING",
-                    *sorted({_array(self._jobs[name].name) for name in waiting}),
-                ]
-            )
+            arrays = {_array(self._jobs[name].name) for name in waiting}
+            _call(["scancel", "--state=PENDING", *sorted(arrays)])
         for name in waiting:
             del self._jobs[name]
         return waiting

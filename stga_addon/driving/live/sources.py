@@ -53,25 +53,20 @@ def _single(decode: Callable[[bytes], FacePacket | None]) -> Callable[[bytes, An
 
 SOURCES = {
     "live_link_face": Source(
-        "Live Link Face",
-        11111,
-        _single(live_link_face.decode),
-        hint="Choose the mode Live Link (ARKit) in the app; its MetaHuman Animator mode sends no such weights",
+        "Live Link Face", 11111, _single(live_link_face.decode),
+        hint="Choose the mode Live Link (ARKit) in the app; its MetaHuman Animator mode sends no "
+        "such weights",
     ),
     "facial_mocap": Source(
-        "iFacialMocap",
-        49983,
-        _single(read_performance.parse_packet),
-        request=read_performance.REQUEST,
-        hint="A request is sent to the phone, which answers until it is closed",
+        "iFacialMocap", 49983, _single(read_performance.parse_packet), read_performance.REQUEST,
+        "A request is sent to the phone, which answers until it is closed",
     ),
     "vmc": Source(
-        "VMC (OSC)",
-        39539,
-        lambda data, known: vmc.decode(data, known or vmc.Received()),
-        hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are left out",
+        "VMC (OSC)", 39539, lambda data, known: vmc.decode(data, known or vmc.Received()),
+        hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are "
+        "left out",
     ),
-}
+}  # fmt: skip
 
 
 LOOPBACK = "127.0.0.1"
@@ -105,9 +100,10 @@ class Receiver:
             self._socket.bind((str(where), self.port))
         except OSError as error:
             self._socket.close()
+            problem = f"port {self.port} of {where} cannot be opened ({error.strerror or error})"
             raise StgaError(
-                f"{source.label}: port {self.port} of {where} cannot be opened ({error.strerror or error}); another "
-                "program may be listening on it, or this computer has no such address"
+                f"{source.label}: {problem}; another program may be listening on it, or this "
+                "computer has no such address"
             ) from error
         self.port = self._socket.getsockname()[1]
 
@@ -371,10 +367,7 @@ class Recording:
         rows = [row_of(packet) for packet in self._packets]
         heads = [row.head for row in rows if row.head is not None]
         times = np.array(self._times) - self._times[0]
-        raw = Performance(
-            times,
-            np.concatenate([row.weights for row in rows]),
-            np.concatenate(heads) if len(heads) == len(rows) else None,
-            1 / float(np.median(np.diff(times))),
-        )
+        weights = np.concatenate([row.weights for row in rows])
+        head = np.concatenate(heads) if len(heads) == len(rows) else None
+        raw = Performance(times, weights, head, 1 / float(np.median(np.diff(times))))
         return corrected(raw, MotionOptions(exchange=self.exchange), self.rest)
