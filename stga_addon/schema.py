@@ -219,30 +219,27 @@ def from_json(
 def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:
     """The value in the types of the hint, or as it is, for `validate` to name."""
     kinds = [kind for kind in alternatives(hint) if kind is not types.NoneType]
-    classes = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
+    classes: list[Any] = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
     if isinstance(value, dict) and ARRAY in value and np.ndarray in kinds:
         return arrays.get(value[ARRAY]) if isinstance(value[ARRAY], str) else None
     if classes and (value is not None or len(kinds) == len(alternatives(hint))):
-        kind = classes[0]
+        chosen: Any = classes[0]
         if len(classes) > 1:
-            names = {cls.__name__: cls for cls in classes}
+            names: dict[str, Any] = {each.__name__: each for each in classes}
             named = value.get(KIND) if isinstance(value, dict) else None
             if not isinstance(named, str) or named not in names:
-                raise StgaError(
-                    complaint(_joined(where, KIND), f"one of {', '.join(names)}", named)
-                )
-            kind, value = names[named], {name: item for name, item in value.items() if name != KIND}
-        hints = type_hints(kind)
+                expected = f"one of {', '.join(names)}"
+                raise StgaError(complaint(_joined(where, KIND), expected, named))
+            chosen = names[named]
+            value = {name: item for name, item in value.items() if name != KIND}
+        hints = type_hints(chosen)
         if not isinstance(value, dict) or value.keys() != hints.keys():
             differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
             fields = ", ".join(sorted(map(str, differing)))[:200]
-            problem = f"{where}{': ' if where else ''}fields are missing or unknown ({fields})"
-            raise StgaError(problem)
-        parsed = {
-            name: _parsed(hint, value[name], _joined(where, name), arrays)
-            for name, hint in hints.items()
-        }
-        return kind(**parsed)
+            prefix = f"{where}: " if where else ""
+            raise StgaError(f"{prefix}fields are missing or unknown ({fields})")
+        paths = {name: _joined(where, name) for name in hints}
+        return chosen(**{n: _parsed(hints[n], value[n], paths[n], arrays) for n in hints})
     if isinstance(value, str) and Path in kinds and str not in kinds:
         return Path(value)
     if isinstance(value, list):
@@ -253,12 +250,12 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
         )
     mappings = [get_args(kind) for kind in kinds if get_origin(kind) in (dict, Mapping)]
     if isinstance(value, dict) and mappings:
-        hints = mappings[0]
+        key_hint, item_hint = mappings[0]
         for key in value:
-            if hints[0] is int and not re.fullmatch(r"-?\d{1,15}", key, re.ASCII):
+            if key_hint is int and not re.fullmatch(r"-?\d{1,15}", key, re.ASCII):
                 raise StgaError(complaint(where, "whole numbers as names", key))
         return {
-            hints[0](key): _parsed(hints[1], item, _joined(where, key), arrays)
+            key_hint(key): _parsed(item_hint, item, _joined(where, key), arrays)
             for key, item in value.items()
         }
     return value

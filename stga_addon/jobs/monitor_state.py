@@ -290,13 +290,9 @@ def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     before, worker = state, event.snapshot.state
     error = "" if state.stopped else state.error
     state = replace(
-        state,
-        folder=event.folder,
-        files=event.files,
-        snapshot=event.snapshot,
-        error=error,
+        state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error,
         stopped=False,
-    )
+    )  # fmt: skip
     drawn, drawn_before = (
         (each.folder, each.files.metrics, each.files.picture) for each in (state, before)
     )
@@ -352,10 +348,7 @@ def _loading_ended(state: RequestState, undoable: bool = False, error: str = "")
         forgotten, removed = _forgotten(state, error=error)
         return forgotten, (*undo, *removed)
     state = replace(
-        state,
-        loading=None,
-        building=False,
-        error=error,
+        state, loading=None, building=False, error=error,
         result_shown=state.result_shown or was_result,
-    )
+    )  # fmt: skip
     return state, (*(_stored(state) if was_result else ()), *undo, Redraw())

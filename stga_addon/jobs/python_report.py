@@ -17,12 +17,9 @@ def main() -> None:
             failures[name] = f"{type(error).__name__}: {error}".splitlines()[0]
     names, device = _adapters()
     report = {
-        "python": platform.python_version(),
-        "versions": versions,
-        "failures": failures,
-        "device": device,
-        "adapters": names,
-    }
+        "python": platform.python_version(), "versions": versions, "failures": failures,
+        "device": device, "adapters": names,
+    }  # fmt: skip
     print(json.dumps(report))
 
 

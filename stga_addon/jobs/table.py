@@ -81,17 +81,14 @@ JOBS: dict[type[Request], Job] = {
     SolveAgain: Job(".track.solve_again", Kind.TRACKING, "capture"),
     MakeAvatar: Job(".track.make_avatar", Kind.AVATAR, "out"),
     Analyze: Job(".analyze.analyze", Kind.ANALYSIS, "capture"),
-    TimePresets: Job(".analyze.time_each_preset"),
-    Select: Job(".analyze.select"),
+    TimePresets: Job(".analyze.time_each_preset"), Select: Job(".analyze.select"),
     Evaluate: Job(".finished_run.evaluate"),
-    Relight: Job(".finished_run.relight", Kind.LIGHT, "run"),
-    Render: Job(".render.render"),
+    Relight: Job(".finished_run.relight", Kind.LIGHT, "run"), Render: Job(".render.render"),
     RenderRecording: Job(".blender.render_recording", Kind.VIDEO, "output"),
-    RenderBlend: Job(".blender.render_blend"),
-    Export: Job(".export.export"),
+    RenderBlend: Job(".blender.render_blend"), Export: Job(".export.export"),
     ConvertMotion: Job(".convert_motion.convert_motion", Kind.PERFORMANCE, "output"),
     Benchmark: Job("..development.benchmark.slice.train_slice"),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -136,20 +136,12 @@ class MakeAvatar:
 
 
 STAGES = {
-    "Opening the footage": (0.0, 0.0),
-    "Head model": (0.0, 0.01),
-    "Landmarks": (0.01, 0.06),
-    "Focal length": (0.06, 0.07),
-    "Fit": (0.07, 0.12),
-    "Dense tracking": (0.12, 0.3),
-    "Surface": (0.3, 0.34),
-    "Refinement": (0.34, 0.51),
-    "Mattes": (0.51, 0.64),
-    "Torso": (0.64, 0.97),
-    "Contact sheet": (0.97, 0.985),
-    "Images": (0.985, 0.99),
+    "Opening the footage": (0.0, 0.0), "Head model": (0.0, 0.01), "Landmarks": (0.01, 0.06),
+    "Focal length": (0.06, 0.07), "Fit": (0.07, 0.12), "Dense tracking": (0.12, 0.3),
+    "Surface": (0.3, 0.34), "Refinement": (0.34, 0.51), "Mattes": (0.51, 0.64),
+    "Torso": (0.64, 0.97), "Contact sheet": (0.97, 0.985), "Images": (0.985, 0.99),
     "Heads": (0.99, 1.0),
-}
+}  # fmt: skip
 """Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its
 share of the time on two processors where one camera recorded a video of 1080p."""
 FOCAL_SOURCES = {

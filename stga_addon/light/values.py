@@ -77,13 +77,10 @@ class Light:
         """
         scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
         return replace(
-            self,
-            position=matrix[:3, :3] @ self.position + matrix[:3, 3],
-            direction=matrix[:3, :3] @ self.direction,
-            tangent=matrix[:3, :3] @ self.tangent,
-            radius=self.radius * scale,
-            size=(self.size[0] * scale, self.size[1] * scale),
-        )
+            self, position=matrix[:3, :3] @ self.position + matrix[:3, 3],
+            direction=matrix[:3, :3] @ self.direction, tangent=matrix[:3, :3] @ self.tangent,
+            radius=self.radius * scale, size=(self.size[0] * scale, self.size[1] * scale),
+        )  # fmt: skip
 
 
 def no_world() -> np.ndarray:

@@ -34,12 +34,9 @@ docs/batch.md."""
 
 
 def killer(
-    jobs: tuple[Job, ...],
-    kills: int,
-    ended: threading.Event,
-    killed: list[str],
+    jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str],
     resumable: list[str],
-) -> None:
+) -> None:  # fmt: skip
     """Kill workers, none more than four times: in turn at a random moment, and when there is a
     checkpoint.
 
@@ -119,27 +116,16 @@ def test_captures_of_the_command(
     tiny_plan(tmp_path)
     capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
     options = [
-        "--iterations",
-        "2",
-        "--device",
-        "cpu",
-        "--threads",
-        "1",
-        "--principal-point",
-        "opencv",
-        "--seed",
-        "5",
-    ]
+        "--iterations", "2", "--device", "cpu", "--threads", "1", "--principal-point", "opencv",
+        "--seed", "5",
+    ]  # fmt: skip
     assert main(["batch", capture, "--out", out, *options]) == 0
     assert "1 of 1 jobs finished" in capsys.readouterr().out
     run = read_run(tmp_path / "out/train-capture")
     settings = run.settings
     assert (run.principal_point, settings.iterations, settings.seed, run.device) == (
-        "opencv",
-        2,
-        5,
-        "cpu",
-    )
+        "opencv", 2, 5, "cpu",
+    )  # fmt: skip
     assert main(["batch", capture, "--preset", "draft"]) == 2
     assert "--out: is missing" in capsys.readouterr().err
     assert main(["batch", capture, "--out", out]) == 2

@@ -69,12 +69,9 @@ def test_jobs_of_a_plan(base: Path) -> None:
     )
     default = make_settings(iterations=1).selection
     settings = make_settings(
-        iterations=30,
-        seed=7,
-        effects={},
-        sh_steps=(0.5,),
+        iterations=30, seed=7, effects={}, sh_steps=(0.5,),
         selection=replace(default, threshold=0.02),
-    )
+    )  # fmt: skip
     training = jobs["anna"]
     assert training.request == Train(runs / "anna", runs / "tracked", settings)
     assert training.after == ("tracked",)

@@ -89,13 +89,9 @@ def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
     """Lines that a script prints in a process of its own, which Ray leaves its settings to."""
     command = [sys.executable, "-c", script, str(ROOT), *map(str, arguments)]
     done = subprocess.run(
-        command,
-        env={**ray_variables(), **variables},
-        capture_output=True,
-        text=True,
-        timeout=1200,
+        command, env={**ray_variables(), **variables}, capture_output=True, text=True, timeout=1200,
         cwd=ROOT,
-    )
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     return done.stdout.splitlines()
 

@@ -245,12 +245,9 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
     def job(name: str, **needs: float) -> Job:
         found = empty_jobs(tmp_path, 1).jobs[0]
         return Job(
-            name,
-            "look",
-            found.request,
-            tmp_path / name,
+            name, "look", found.request, tmp_path / name,
             resources=Resources(**{"threads": 1, **needs}),
-        )
+        )  # fmt: skip
 
     assert engine.has_room(job("huge", threads=64, memory_gb=100.0))
     engine.adopt(job("a", threads=2, memory_gb=3.0, gpu=True))

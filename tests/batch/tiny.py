@@ -84,13 +84,9 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     )
     command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]
     started = subprocess.Popen(
-        command,
-        cwd=ROOT,
-        env=ray_variables(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+        command, cwd=ROOT, env=ray_variables(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True,
-    )
+    )  # fmt: skip
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         status, failed = (read_status(base / f"runs/train-{name}/job") for name in ("good", "bad"))

@@ -5,6 +5,7 @@ from contextlib import redirect_stdout
 from io import StringIO
 
 import pytest
+from command_line import stga
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
@@ -17,14 +18,9 @@ from stga_addon.tracking.torso import FollowedTorso
 
 def make(take, out, *more):
     arguments = [
-        "--model",
-        str(take / "head.npz"),
-        "--out",
-        str(out),
-        "--landmarks",
-        str(take / "points"),
-    ]
-    return main(["avatar", str(take / "footage"), *arguments, "--iterations", "6", *more])
+        "--model", str(take / "head.npz"), "--out", str(out), "--landmarks", str(take / "points"),
+    ]  # fmt: skip
+    return stga("avatar", take / "footage", *arguments, "--iterations 6", *more)
 
 
 @pytest.fixture(scope="module")
@@ -122,13 +118,9 @@ def test_a_mistyped_footage_leaves_nothing_behind(take, tmp_path, capsys):
     """Catches a folder that remembers the mistake, and refuses the mended command as one of other
     inputs."""
     mistyped = [
-        "avatar",
-        str(tmp_path / "nowhere"),
-        "--model",
-        str(take / "head.npz"),
-        "--out",
+        "avatar", str(tmp_path / "nowhere"), "--model", str(take / "head.npz"), "--out",
         str(tmp_path / "out"),
-    ]
+    ]  # fmt: skip
     assert main(mistyped) == 2
     assert "nowhere: is neither a folder nor a video" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

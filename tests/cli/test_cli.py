@@ -14,6 +14,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from capture import factory
+from command_line import stga
 from PIL import Image
 
 from stga_addon import __version__
@@ -98,15 +99,8 @@ def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
     """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
     out = tmp_path / "run"
     arguments = [
-        "train",
-        str(root),
-        "--out",
-        str(out),
-        "--budget",
-        "0.2s",
-        "--strategy",
-        "gaussian-avatars",
-    ]
+        "train", str(root), "--out", str(out), "--budget", "0.2s", "--strategy", "gaussian-avatars",
+    ]  # fmt: skip
     assert main(arguments) == 0
     first = read_checkpoint(out)
     assert 0.2 <= first.elapsed_s < 1.5
@@ -163,21 +157,7 @@ def test_render_on_a_gpu(
     cameras = root / "transforms_val.json"
     for device in ("cpu", "gpu"):
         out = tmp_path / device
-        assert (
-            main(
-                [
-                    "render",
-                    str(trained),
-                    "--cameras",
-                    str(cameras),
-                    "--out",
-                    str(out),
-                    "--device",
-                    device,
-                ]
-            )
-            == 0
-        )
+        assert stga("render", trained, "--cameras", cameras, "--out", out, "--device", device) == 0
     names = sorted(path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.png"))
     assert rendered.call_count == len(names) > 0
     for name in names:
@@ -198,19 +178,7 @@ def test_render_background(
     """Catches a background that is not the one asked for."""
     cameras = str(root / "transforms_val.json")
     assert (
-        main(
-            [
-                "render",
-                str(trained),
-                "--cameras",
-                cameras,
-                "--out",
-                str(tmp_path),
-                "--background",
-                name,
-            ]
-        )
-        == 0
+        stga("render", trained, "--cameras", cameras, "--out", tmp_path, "--background", name) == 0
     )
     assert pixels(tmp_path / "00000_02.png")[1, 1].tolist() == list(value)
 
@@ -225,9 +193,7 @@ def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -
     ):
         assert main(["render", *map(str, source), *cameras, "--out", str(tmp_path / name)]) == 0
     ply = tmp_path / "frame.ply"
-    assert (
-        main(["export", str(trained), "--format", "ply", "--timestep", "1", "--out", str(ply)]) == 0
-    )
+    assert stga("export", trained, "--format ply --timestep 1 --out", ply) == 0
     assert main(["render", str(ply), *cameras, "--out", str(tmp_path / "ply")]) == 0
     for name in ("00000_02.png", "00001_02.png"):
         np.testing.assert_array_equal(
@@ -268,11 +234,8 @@ def test_names_of_a_long_capture() -> None:
     assert unique_names(paths) == [Path(path).name for path in paths]
     assert process_time() - begin < 5
     assert unique_names(["a.png", "a.png", "a_2.png", "a.png"]) == [
-        "a.png",
-        "a_2.png",
-        "a_2_2.png",
-        "a_3.png",
-    ]
+        "a.png", "a_2.png", "a_2_2.png", "a_3.png",
+    ]  # fmt: skip
 
 
 def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
@@ -320,23 +283,7 @@ def test_export_a_range_as_usd(
     """Catches timesteps outside the range, and a size that is not told before."""
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     out = tmp_path / "a.usdc"
-    assert (
-        main(
-            [
-                "export",
-                str(trained),
-                "--format",
-                "usd",
-                "--frames",
-                "1:3",
-                "--fps",
-                "50",
-                "--out",
-                str(out),
-            ]
-        )
-        == 0
-    )
+    assert stga("export", trained, "--format usd --frames 1:3 --fps 50 --out", out) == 0
     assert "2 frames of" in capsys.readouterr().out
     stage = usd.Stage.Open(str(out))
     assert stage.GetTimeCodesPerSecond() == 50
@@ -364,12 +311,9 @@ def test_export_one_frame(
 
 @pytest.mark.parametrize("format", ["ply-sequence", "web"])
 def test_export_to_a_full_disk(
-    trained: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    format: str,
-) -> None:
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, format: str,
+) -> None:  # fmt: skip
     """Catches a range that fills the disk."""
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
     out = tmp_path / ("o.html" if format == "web" else "o")
@@ -436,19 +380,15 @@ NONSENSE_OPTIONS = [
     ("command", "option", "value"), NONSENSE_OPTIONS, ids=lambda text: ascii(text)[:20]
 )
 def test_option_values_without_meaning(
-    root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    command: str,
-    option: str,
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, option: str,
     value: str,
-) -> None:
+) -> None:  # fmt: skip
     """Catches a traceback from deep inside, a run that trains nothing, for ever or everything, a
     selection of nothing or everything, one of two budgets that is ignored, and a long sentence."""
     *others, name = option.split()
     out = [f"--out={tmp_path / 'run'}"] if name != "--out" else []
     with pytest.raises(SystemExit, match="2"):
-        main([command, str(root), *out, *others, f"{name}={value}"])
+        stga(command, root, *out, *others, f"{name}={value}")
     error = capsys.readouterr().err
     assert f"argument {name}: " in error
     assert len(error) < 3000
@@ -480,16 +420,8 @@ def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that the parser lost, and an extension without `development` whose parser
     needs it."""
     shipped = {
-        "train",
-        "refine",
-        "presets",
-        "render",
-        "eval",
-        "select",
-        "export",
-        "info",
-        "perform",
-    }
+        "train", "refine", "presets", "render", "eval", "select", "export", "info", "perform",
+    }  # fmt: skip
     shipped |= {"avatar", "batch", "drive", "extend", "relight", "track"}
     assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
     monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
@@ -511,13 +443,8 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
     asked for where none is needed."""
     flame, model = factory.write_flame_capture(tmp_path / "flame")
     exported = [
-        "export",
-        str(trained / "avatar.npz"),
-        "--format",
-        "ply",
-        "--out",
-        str(tmp_path / "a.ply"),
-    ]
+        "export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(tmp_path / "a.ply"),
+    ]  # fmt: skip
     for missing, arguments, says in (
         (
             "torch numba wgpu",
@@ -560,7 +487,7 @@ def test_interruption_and_mistakes_have_their_codes(
     assert "nested too deeply" in refused(capsys, "info", root)
     fails_with(RuntimeError("a bug"))
     with pytest.raises(RuntimeError, match="a bug"):
-        main(["info", str(root)])
+        stga("info", root)
 
 
 # In a process of its own
@@ -597,28 +524,11 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     """Catches a refinement that is put into the run's own folder, one that cannot be evaluated or
     refined again, and one that says nothing about what it gained."""
     runs = Path(shutil.copytree(trained, tmp_path / "anna"))
-    assert (
-        main(["refine", str(runs), "--region", "mouth", "--frames", "1-3", "--iterations", "6"])
-        == 0
-    )
+    assert stga("refine", runs, "--region mouth --frames 1-3 --iterations 6") == 0
     printed = capsys.readouterr().out
     assert "region: " in printed
     assert f"avatar: {tmp_path / 'anna_2' / 'avatar.npz'}" in printed
-    assert (
-        main(
-            [
-                "refine",
-                str(tmp_path / "anna_2"),
-                "--region",
-                "mouth",
-                "--iterations",
-                "3",
-                "--growth",
-                "0.5",
-            ]
-        )
-        == 0
-    )
+    assert stga("refine", tmp_path / "anna_2", "--region mouth --iterations 3 --growth 0.5") == 0
     assert read_checkpoint(tmp_path / "anna_3").iteration == 3
     assert main(["refine", str(tmp_path / "anna_3"), "--resume"]) == 0
     assert main(["eval", str(tmp_path / "anna_3")]) == 0

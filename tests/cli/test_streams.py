@@ -25,13 +25,9 @@ def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     code."""
     script = f'stga() {{ {STGA} "$@"; }}\n{command}\nexit ${{PIPESTATUS[0]}}'
     return subprocess.run(
-        ["bash", "-c", script],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env={**os.environ, **environment},
-        timeout=120,
-    )
+        ["bash", "-c", script], capture_output=True, text=True, cwd=ROOT,
+        env={**os.environ, **environment}, timeout=120,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("command", ["info", "select", "presets --help"])
@@ -97,16 +93,9 @@ def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path)
     than 130 after Ctrl-C."""
     out = tmp_path / "run"
     command = [
-        sys.executable,
-        "-m",
-        "stga_addon",
-        "train",
-        str(capture),
-        "--out",
-        str(out),
-        "--budget",
+        sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out), "--budget",
         "60s",
-    ]
+    ]  # fmt: skip
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )

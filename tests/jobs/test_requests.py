@@ -217,12 +217,8 @@ def test_figures_in_short_lines() -> None:
     """Catches a panel that shows what is not known yet, or numbers that nobody can read."""
     assert describe_figures({}) == []
     figures = {
-        "iteration": 900,
-        "per_second": 12.34,
-        "left_s": 125.0,
-        "splats": 61234.0,
-        "psnr": 30.0,
-    }
+        "iteration": 900, "per_second": 12.34, "left_s": 125.0, "splats": 61234.0, "psnr": 30.0,
+    }  # fmt: skip
     assert describe_figures(figures) == [
         "12.3 it/s   2.1 min left",
         "PSNR 30.00 dB",
@@ -266,17 +262,8 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(
     write_avatar(avatar, Avatar(splats, "stga", ball.neutral.astype(np.float32), ball.faces))
     given = [str(avatar), "--capture", str(capture)]
     turned = [
-        "--turntable",
-        "120",
-        "--seconds",
-        "0.5",
-        "--fps",
-        "8",
-        "--camera",
-        "1",
-        "--device",
-        "cpu",
-    ]
+        "--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1", "--device", "cpu",
+    ]  # fmt: skip
     asked_for: dict[str, tuple[list[str], Request]] = {
         "pictures": (
             ["render", *given, "--cameras", str(cameras), "--background", "black", "--out"],

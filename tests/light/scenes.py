@@ -66,10 +66,7 @@ def lit_avatar(
     splats = Splats(
         xyz=np.zeros((count, 3), np.float32),
         rotation=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scale=np.full((count, 3), -6, np.float32),
-        opacity=np.full(count, 3, np.float32),
-        sh=sh,
-        face=np.arange(count, dtype=np.int32),
-        unbound=np.zeros(count, bool),
-    )
+        log_scale=np.full((count, 3), -6, np.float32), opacity=np.full(count, 3, np.float32), sh=sh,
+        face=np.arange(count, dtype=np.int32), unbound=np.zeros(count, bool),
+    )  # fmt: skip
     return Avatar(splats, "stga", vertices.astype(np.float32), faces, light=avatar_light)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture import factory
+from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar, write_avatar
@@ -38,27 +39,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert (
-        main(["train", str(root), "--out", str(out), "--iterations", "10", "--schedule", "paper"])
-        == 0
-    )
+    assert stga("train", root, "--out", out, "--iterations 10 --schedule paper") == 0
     return out
 
 
 def rendered(run: Path, root: Path, out: Path, *options: str) -> np.ndarray:
     assert (
-        main(
-            [
-                "render",
-                str(run),
-                "--cameras",
-                str(root / "transforms_val.json"),
-                "--out",
-                str(out),
-                *options,
-            ]
-        )
-        == 0
+        stga("render", run, "--cameras", root / "transforms_val.json", "--out", out, *options) == 0
     )
     with Image.open(sorted(out.iterdir())[0]) as image:
         return np.asarray(image).astype(int)

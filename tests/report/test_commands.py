@@ -60,11 +60,8 @@ def test_a_preset_brings_its_iterations(
     assert "held-out views: " in out
     settings = read_run(tmp_path / "preset").settings
     assert (settings.preset, settings.iterations, settings.lattice, settings.target_psnr) == (
-        "draft",
-        800,
-        1,
-        5.0,
-    )
+        "draft", 800, 1, 5.0,
+    )  # fmt: skip
     assert main([*train, str(tmp_path / "counted"), "--preset", "final", "--iterations", "3"]) == 0
     settings = read_run(tmp_path / "counted").settings
     assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)
