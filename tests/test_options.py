@@ -78,9 +78,7 @@ def test_what_is_given_reaches_its_field() -> None:
         ("--hidden 3", "unrecognized arguments: --hidden 3"),
     ],
 )
-def test_values_without_meaning(
-    words: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_values_without_meaning(words, message, capsys):
     """Catches limits that the command line does not know, and a refusal that does not name the
     option."""
     with pytest.raises(SystemExit, match="2"):

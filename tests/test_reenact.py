@@ -74,9 +74,7 @@ def test_the_other_person_moves_the_avatar(parts: dict[str, Path], tmp_path: Pat
     )
 
 
-def test_mistakes(
-    parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes(parts, tmp_path, capsys):
     """Catches tracebacks for what a person gets wrong first."""
     assert render(parts, tmp_path / "out") == 2
     assert "give the FLAME model file" in capsys.readouterr().err

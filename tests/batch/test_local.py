@@ -14,14 +14,13 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.batch.engines.local import LocalEngine
-from stga_addon.batch.plan import Job, read_plan
+from stga_addon.batch.plan import read_plan
 from stga_addon.batch.run import Batch, JobState
 from stga_addon.cli.main import main
 from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE
 
-from .conftest import TrainedHere
 from .simulated import InProcessEngine, carry_out
 from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
 
@@ -33,10 +32,7 @@ KILLS = int(os.environ.get("STGA_BATCH_KILLS", 2))
 docs/batch.md."""
 
 
-def killer(
-    jobs: tuple[Job, ...], kills: int, ended: threading.Event, killed: list[str],
-    resumable: list[str],
-) -> None:  # fmt: skip
+def killer(jobs, kills, ended, killed, resumable):
     """Kill workers, none more than four times: in turn at a random moment, and when there is a
     checkpoint.
 
@@ -66,9 +62,7 @@ def killer(
 
 
 @pytest.mark.nightly
-def test_killed_workers_resume_to_the_same_bits(
-    tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_workers_resume_to_the_same_bits(tmp_path, trained_here, monkeypatch):
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     seeds, iterations = max(1, KILLS // 3), max(ITERATIONS, 80 * KILLS)
@@ -107,9 +101,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "2 jobs, 2 to do; 12 s of work" in printed
 
 
-def test_captures_of_the_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     """Catches options that are forgotten where captures are given, or silently ignored where a plan
     is."""
     monkeypatch.setattr("stga_addon.batch.engines.make_engine", lambda *_: InProcessEngine())

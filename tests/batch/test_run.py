@@ -266,9 +266,7 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
         (True, "exit 2", False),
     ],
 )
-def test_a_killed_worker_is_told_from_a_mistake(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, windows: bool, ending: str, is_lost: bool
-) -> None:
+def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, ending, is_lost):
     """Catches a killed worker that is not tried again on Windows, where a kill is an exit status
     like others."""
     monkeypatch.setattr(local, "IS_WINDOWS", windows)
@@ -328,9 +326,7 @@ def _hold(folder: str, held: Any) -> None:
 
 
 @pytest.mark.parametrize("locks", ["work", "fail"])
-def test_two_batches_cannot_take_one_folder(
-    tmp_path: Path, locks: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
     """Catches two batches that write into each other's jobs, also where the storage knows no file
     locks."""
     if locks == "fail":

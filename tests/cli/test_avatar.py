@@ -10,7 +10,6 @@ from command_line import stga
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
 from stga_addon.cli.main import main
-from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.tracking import write_capture
 from stga_addon.tracking.torso import FollowedTorso
@@ -146,10 +145,3 @@ def test_a_python_without_blender_says_so(take, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(commands, "carry_out", lambda request: None)
     assert make(take, tmp_path / "out") == 0
     assert "this Python has no bpy" in capsys.readouterr().out
-
-
-def test_a_blend_file_needs_an_avatar(tmp_path):
-    """Catches a traceback for a folder that `stga avatar` did not finish."""
-    with pytest.raises(StgaError, match=r"inputs\.json"):
-        commands.write_blend(tmp_path, lambda capture: capture)
-    assert not list(tmp_path.iterdir())

@@ -77,24 +77,6 @@ def test_train(trained: Path, root: Path) -> None:
     assert len(read_avatar(trained / "avatar.npz").splats) >= 15 * 320
 
 
-def test_train_with_defaults_and_every_option(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches defaults without the lattice, and a strategy, threshold or seed that is ignored."""
-    out = tmp_path / "run"
-    options = "--iterations 3 --strategy selective --threshold 0.0005 --seed 5 --device cpu --principal-point vhap"
-    assert main(["train", str(root), "--out", str(out), *options.split()]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"avatar: {out / 'avatar.npz'}"
-    run = read_run(out)
-    assert (run.settings.seed, run.settings.selection.threshold, run.settings.strategy) == (
-        5,
-        0.0005,
-        "selective",
-    )
-    splats = read_avatar(out / "avatar.npz").splats
-    assert (~splats.unbound).sum() == 6 * 320
-
-
 def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
     """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
     out = tmp_path / "run"
@@ -146,9 +128,7 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.needs("adapter")
-def test_render_on_a_gpu(
-    trained: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_render_on_a_gpu(trained, root, tmp_path, monkeypatch):
     """Catches a device that renders something else, or is not asked."""
     from stga_addon.raster.gpu import compose as gpu
 
@@ -169,20 +149,6 @@ def test_render_on_a_gpu(
         assert one.std() > 5
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("black", (0, 0, 0)), ("1,0,0.2", (255, 0, 51)), ("white", (255, 255, 255))]
-)
-def test_render_background(
-    trained: Path, root: Path, tmp_path: Path, name: str, value: tuple[int, int, int]
-) -> None:
-    """Catches a background that is not the one asked for."""
-    cameras = str(root / "transforms_val.json")
-    assert (
-        stga("render", trained, "--cameras", cameras, "--out", tmp_path, "--background", name) == 0
-    )
-    assert pixels(tmp_path / "00000_02.png")[1, 1].tolist() == list(value)
-
-
 def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -> None:
     """Catches an avatar that is not driven by the frame's own mesh, and a PLY that needs a capture
     or differs."""
@@ -201,26 +167,6 @@ def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -
         )
     right, baked = (pixels(tmp_path / kind / "00001_02.png").astype(int) for kind in ("run", "ply"))
     assert np.abs(right - baked).max() <= 1
-
-
-def test_render_names(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches pictures that overwrite each other: a name used in two folders, or twice; images need
-    not exist."""
-    document = json.loads((root / "transforms_val.json").read_text())
-    first = document["frames"][0]
-    paths = ["a/0.png", "b/0.png", "b/1.jpg", "b/1.jpg", "../c/2"]
-    for entry in [first, *document["frames"]]:
-        entry.pop("fg_mask_path", None)
-    document["frames"] = [{**first, "file_path": path} for path in paths]
-    cameras = tmp_path / "ball" / "cameras.json"
-    cameras.parent.mkdir()
-    cameras.write_text(json.dumps(document))
-    out = tmp_path / "out"
-    assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out)]) == 0
-    assert len(pictures(out)) == len(paths)
-    assert {"a_0.png", "b_0.png"} <= set(pictures(out))
-    assert all(name.endswith(".png") for name in pictures(out))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball", "out"]
 
 
 def test_names_of_a_long_capture() -> None:
@@ -260,9 +206,7 @@ def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
     )
 
 
-def test_export_says_which_frames_there_are(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_says_which_frames_there_are(trained, tmp_path, capsys):
     """Catches a range that is cut to the capture's without a message, a message about one that is
     not, and frames numbered from zero instead of by their timestep."""
     sequence = ["export", str(trained), "--format", "ply-sequence"]
@@ -277,43 +221,8 @@ def test_export_says_which_frames_there_are(
     assert low[0] > low[1] > low[2]
 
 
-def test_export_a_range_as_usd(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches timesteps outside the range, and a size that is not told before."""
-    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
-    out = tmp_path / "a.usdc"
-    assert stga("export", trained, "--format usd --frames 1:3 --fps 50 --out", out) == 0
-    assert "2 frames of" in capsys.readouterr().out
-    stage = usd.Stage.Open(str(out))
-    assert stage.GetTimeCodesPerSecond() == 50
-    assert stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions").GetTimeSamples() == [
-        1,
-        3,
-    ]
-
-
-@pytest.mark.parametrize(
-    ("format", "suffix", "magic"), [("gltf", ".glb", b"glTF"), ("spz", ".spz", b"\x1f\x8b")]
-)
-def test_export_one_frame(
-    trained: Path, tmp_path: Path, format: str, suffix: str, magic: bytes
-) -> None:
-    """Catches a format that the command cannot write, or writes for another frame than asked
-    for."""
-    files = [tmp_path / f"neutral{suffix}", tmp_path / f"frame{suffix}"]
-    for out, chosen in zip(files, ([], ["--timestep", "3"]), strict=True):
-        assert main(["export", str(trained), "--format", format, "--out", str(out), *chosen]) == 0
-    neutral, frame = (out.read_bytes() for out in files)
-    assert neutral.startswith(magic)
-    assert neutral != frame
-
-
 @pytest.mark.parametrize("format", ["ply-sequence", "web"])
-def test_export_to_a_full_disk(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch, format: str,
-) -> None:  # fmt: skip
+def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format):
     """Catches a range that fills the disk."""
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
     out = tmp_path / ("o.html" if format == "web" else "o")
@@ -339,9 +248,7 @@ def test_run_of_a_flame_capture(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["eval", str(out), "--flame", str(elsewhere)]) == 0
 
 
-def test_eval_with_a_capture_that_has_moved(
-    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_with_a_capture_that_has_moved(trained, root, tmp_path, capsys):
     """Catches a run that cannot be evaluated where its capture lies elsewhere, and one measured on
     another capture."""
     run, moved = (
@@ -379,10 +286,7 @@ NONSENSE_OPTIONS = [
 @pytest.mark.parametrize(
     ("command", "option", "value"), NONSENSE_OPTIONS, ids=lambda text: ascii(text)[:20]
 )
-def test_option_values_without_meaning(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, option: str,
-    value: str,
-) -> None:  # fmt: skip
+def test_option_values_without_meaning(root, tmp_path, capsys, command, option, value):
     """Catches a traceback from deep inside, a run that trains nothing, for ever or everything, a
     selection of nothing or everything, one of two budgets that is ignored, and a long sentence."""
     *others, name = option.split()
@@ -463,9 +367,7 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
     assert len(read_ply(tmp_path / "a.ply")) == len(read_avatar(trained / "avatar.npz").splats)
 
 
-def test_interruption_and_mistakes_have_their_codes(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
     """Catches a traceback after Ctrl-C, and an unexpected exception reported as the user's
     mistake."""
 
@@ -507,12 +409,7 @@ def test_as_a_module(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["{}", "[]", "null", "3", '{"capture": 5}', "{", None])
-def test_damaged_folder_of_the_open_head(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    content: str | None,
-) -> None:
+def test_damaged_folder_of_the_open_head(tmp_path, capsys, monkeypatch, content):
     """Catches a traceback for a folder in STGA_HEAD that is damaged, empty or missing."""
     if content is not None:
         (tmp_path / "head.json").write_text(content)
@@ -534,9 +431,7 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(["eval", str(tmp_path / "anna_3")]) == 0
 
 
-def test_extend(
-    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_extend(trained, root, tmp_path, capsys):
     """Catches an extended run that cannot be evaluated, rendered or extended again, and one that
     does not say what it learned and forgot."""
     runs, take = (

@@ -85,9 +85,7 @@ REFUSALS = [
 
 
 @pytest.fixture(scope="session")
-def refusable(
-    root: Path, trained: Path, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
+def refusable(root, trained, tmp_path_factory):
     """What REFUSALS name, by name."""
     folder = tmp_path_factory.mktemp("refusals")
     names = {
@@ -134,9 +132,7 @@ def refusable(
 
 
 @pytest.mark.parametrize(("command", "says"), REFUSALS, ids=[command for command, _ in REFUSALS])
-def test_refusals(
-    refusable: dict[str, Path], capsys: pytest.CaptureFixture[str], command: str, says: str
-) -> None:
+def test_refusals(refusable, capsys, command, says):
     """Catches a traceback, an option that does nothing, talk of something else, and a command that
     fails but has made a folder, or overwritten a run or a recording."""
     before = {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()}

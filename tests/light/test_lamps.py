@@ -27,14 +27,10 @@ CASES = {
     ),
     "area": TILTED,
     "disk": Light(
-        "area",
-        np.ones(3) * 40,
-        (0, 0.2, 0.8),
-        direction=(0, 0, -1),
-        size=(0.5, 0.5),
+        "area", np.ones(3) * 40, (0, 0.2, 0.8), direction=(0, 0, -1), size=(0.5, 0.5),
         shape="ellipse",
     ),
-}
+}  # fmt: skip
 
 
 def irradiance(light: Light) -> float:

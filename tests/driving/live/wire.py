@@ -27,9 +27,7 @@ def live_link_face(
     return b"\x06" + names + time + body
 
 
-def facial_mocap(
-    weights: dict[str, float], head: tuple[float, ...] = (0, 0, 0), separator: str = "-"
-) -> bytes:
+def facial_mocap(weights, head=(0, 0, 0), separator="-"):
     """Percent; pitch, yaw and roll in degrees, and a position."""
     fields = []
     for name in ARKIT_SHAPES:
