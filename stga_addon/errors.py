@@ -14,21 +14,16 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class StgaError(Exception):
-    """A failure with a cause outside the code: bad file, bad option, full disk.
-
-    The message is one sentence that names the file, the field and what was expected. The command
-    line prints it and exits with 2; Blender's operators report it; neither shows a traceback.
-    """
+    """A failure with a cause outside the code. Its sentence names file, field and what was
+    expected; the command line prints it and exits with 2, Blender reports it."""
 
     def __init__(self, message: str) -> None:
         super().__init__(one_line(message))
 
 
 class DeviceError(StgaError):
-    """A GPU that failed while it was in use: lost, or out of memory.
-
-    cause  the sentence without --device and the advice
-    """
+    """A GPU that failed in use, lost or out of memory; `cause`: the sentence without --device and
+    advice."""
 
     def __init__(self, cause: str, advice: str) -> None:
         super().__init__(f"--device gpu: {cause}; {advice}")

@@ -138,11 +138,8 @@ class NumberedFiles:
             stream.write(self._written[name] + "\n")
 
     def finish(self) -> None:
-        """Remove the earlier sequence's files that none of the written ones replaced, where
-        anything was written.
-
-        Raises StgaError where one cannot be removed.
-        """
+        """Remove the earlier sequence's files that none of the written ones replaced, if any was
+        written. Raises StgaError where one stays."""
         if not self._written:
             return
         for path in self._earlier:
@@ -184,11 +181,8 @@ def _once_free(action: Callable[[], None], patience_s: float) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise the StgaError of `replacing` where it would not let the file be written; leaves no
-    folder or file behind.
-
-    For work that ends in a file after minutes.
-    """
+    """Raise the StgaError of `replacing` before minutes of work, where the file could not be
+    written; leaves nothing behind."""
     with suppress(_Checked), replacing(path):
         raise _Checked
 
@@ -293,11 +287,8 @@ def write_json(path: Path, value: Any, patience_s: float = RENAME_PATIENCE_S) ->
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read every array of an npz without pickle.
-
-    Raises StgaError naming the file where it is missing, truncated, unpacks to more than 4 GiB or
-    holds objects.
-    """
+    """Read every array of an npz without pickle. Raises StgaError where it is missing, truncated,
+    above 4 GiB unpacked, or holds objects."""
     file_size(path)  # refuses pipes, whose reading need never end
     try:
         with zipfile.ZipFile(path) as archive:

@@ -64,11 +64,8 @@ def option_fields(kind: Any) -> Iterator[Any]:
 
 
 def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] = ()) -> None:
-    """Add an argument for each field of a dataclass that is an option, those of its dataclasses in
-    groups.
-
-    names: some of the fields; none: all. may_lack: fields without a default that need not be given.
-    """
+    """Add an argument for each option of a dataclass, or those of `names`; its dataclasses are
+    groups. may_lack: fields without a default that need not be given."""
     hints, groups = type_hints(kind), {"": parser}
     for spec in option_fields(kind):
         hint, asked = hints[spec.name], spec.metadata

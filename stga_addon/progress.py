@@ -77,11 +77,8 @@ def ignore(progress: Progress) -> bool:
 def counted(
     items: Iterable[Item], total: int, report: Report, stage: str, unit: str
 ) -> Iterator[Item]:
-    """The items, of which each is reported when the next one is asked for; unit: what one of them
-    is called.
-
-    Raises Cancelled where the report says to stop.
-    """
+    """The items, each reported as `unit` when the next one is asked for. Raises Cancelled where the
+    report says to stop."""
     report(Progress(stage=stage))
     for number, item in enumerate(items, 1):
         yield item

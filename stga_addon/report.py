@@ -152,9 +152,8 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#78
 
 
 def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
-    """PSNR of one run in the whole image, the head mask and the moving region, with the latest
-    forecast; and the detail difference, by which the avatar is kept, on an axis of its own with the
-    best at the top."""
+    """PSNR of a run in image, head mask and moving region, its latest forecast, and the detail
+    difference, the best at the top."""
     fitted = " (exposure fitted)" if is_exposure_fitted(metrics) else ""
     figure, axes = psnr_axes(f"PSNR{fitted} and detail difference on held-out views")
     keys = {"whole image": "psnr", "head mask": "psnr_mask", "moving region": "psnr_moving"}

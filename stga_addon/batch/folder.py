@@ -99,11 +99,8 @@ JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[SoftFileLease]:
-    """Hold a batch's folder, which is made; one batch works in it, whichever machine it is started
-    on.
-
-    Raises StgaError while another batch works in it.
-    """
+    """Hold a batch's folder, which is made, on whichever machine. Raises StgaError while another
+    batch works in it."""
     path = folder / LOCK
     with ExitStack() as held:
         try:
@@ -172,11 +169,9 @@ def is_running(job: Job, digest: str) -> bool:
 
 
 def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
-    """Make the job's folder ready for a worker, which continues what an earlier one began.
-
-    What another request wrote there is moved aside; returns where to. Raises StgaError while a
-    worker is running in the folder, or where it holds files that no job wrote.
-    """
+    """Make the job's folder ready for a worker, which continues what an earlier one began; returns
+    where another request's files were moved. Raises StgaError for a running worker, and files of
+    others."""
     record, moved = read_record(job), None
     if record is not None and record.digest != digest:
         prepare_status_folder(job.request_folder)  # raises while a worker is running

@@ -276,11 +276,8 @@ def _pictures(runs: Sequence[Run]) -> str:
 
 
 def held_out_pair(run: Path) -> np.ndarray | None:
-    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None where its capture has
-    no such view.
-
-    Raises StgaError where the run or its capture cannot be opened.
-    """
+    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None without one. Raises
+    StgaError where the run or its capture cannot be opened."""
     from ..avatar.file import read_avatar
     from ..capture.images import read_image
     from ..render.render import render_avatar

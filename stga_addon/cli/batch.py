@@ -128,11 +128,8 @@ def print_plan(plan: Plan) -> None:
 
 
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
-    """Carry out what is not finished, with the live table and the report.
-
-    Raises StgaError where a job failed, KeyboardInterrupt after Ctrl-C when the running jobs have
-    stopped.
-    """
+    """Carry out what is not finished, with table and report. Raises StgaError where a job failed,
+    KeyboardInterrupt after Ctrl-C when the running jobs have stopped."""
     from ..batch.engines import make_engine
     from ..batch.folder import hold_folder
     from ..batch.report import LiveTable, summary_line, write_report

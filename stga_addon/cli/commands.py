@@ -227,7 +227,21 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
         given = given_options(options, kind)
         takes, only = given.get("captures"), getattr(options, "select_only", None)
         if options.resume:
-            _resume(kind, given, only)
+            flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
+            flags += ["--select-only"] if only else []
+            useless = next(
+                (flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None
+            )
+            if useless is not None:
+                problem = (
+                    "cannot be combined with --resume, which continues the run in RUN as it began"
+                )
+                raise StgaError(f"{useless}: {problem}")
+            if read_run(given["parent"]).continuation is None:
+                problem = "does not continue another run; resume it with `stga train --resume`"
+                raise StgaError(f"{given['parent']}: {problem}")
+            same = {name: given[name] for name in ("flame", "device") if name in given}
+            carry_out(Resume(given["parent"], **same))
         elif takes and only:
             if len(takes) != 1:
                 raise StgaError(f"--select-only: expected one CAPTURE, got {len(takes)}")
@@ -242,21 +256,6 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
             carry_out(kind(**given))
 
     return Command(_about(kind), run, (kind, CONTINUE, *more), may_lack=("run", "captures"))
-
-
-def _resume(kind: Any, given: dict[str, Any], select_only: Path | None) -> None:
-    """Raises StgaError for an option that would have no effect, or a run that continues none."""
-    flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
-    flags += ["--select-only"] if select_only else []
-    useless = next((flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None)
-    if useless is not None:
-        problem = "cannot be combined with --resume, which continues the run in RUN as it began"
-        raise StgaError(f"{useless}: {problem}")
-    if read_run(given["parent"]).continuation is None:
-        problem = "does not continue another run; resume it with `stga train --resume`"
-        raise StgaError(f"{given['parent']}: {problem}")
-    same = {name: given[name] for name in ("flame", "device") if name in given}
-    carry_out(Resume(given["parent"], **same))
 
 
 # Captures

@@ -9,11 +9,8 @@ from typing import Any
 
 
 class Output(io.FileIO):
-    """A descriptor whose first write error is kept in `error` instead of raised; what follows is
-    dropped.
-
-    So a training whose terminal or pipe goes away still finishes.
-    """
+    """A descriptor whose first write error is kept in `error` and what follows dropped, so that a
+    training whose terminal or pipe goes away still finishes."""
 
     error: OSError | None = None
 

@@ -101,10 +101,8 @@ def head_turns(angles: np.ndarray) -> np.ndarray:
 
 
 def head_map(sequence: FlameSequence, name: str) -> HeadMap:
-    """The map for the model and identity of a sequence; computed once, then kept in memory.
-
-    `name` is what errors call the head. Raises StgaError as `face_points` does.
-    """
+    """The map for a model and identity, kept in memory; `name` is what errors call the head. Raises
+    StgaError as `face_points` does."""
     person = with_identity(sequence).model
     digest = hashlib.blake2b()
     for field in ("v_template", "shapedirs", "posedirs", "weights", "j_regressor", "faces"):

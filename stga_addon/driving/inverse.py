@@ -98,11 +98,7 @@ def _descended(
     powers: np.ndarray | None = None,
     limits: np.ndarray | float = 1.0,
 ) -> np.ndarray:
-    """(T, K) minimizers from 0 to `limits` of ½ wᵀGw − rᵀw by cyclic coordinate descent, all rows
-    at once.
-
-    gram (P, K, K) with G = Σ powers[:, p] gram[p], powers (T, P); right (T, K).
-    """
+    """(T, K) minimizers in 0…`limits` of ½ wᵀGw − rᵀw, G = Σ powers[:, p] gram[p], row by row."""
     powers = np.ones((len(right), 1)) if powers is None else powers
     limits, weights = np.broadcast_to(limits, right.shape), np.zeros_like(right)
     ridge = RIDGE * float(np.trace(gram[0])) / max(len(gram[0]), 1)

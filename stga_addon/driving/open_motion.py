@@ -50,9 +50,8 @@ nothing."""
 
 @dataclass(frozen=True)
 class TrainedRange:
-    """Middle and half width, per part of the face (`PART_FIELDS`), of the parameters that an avatar
-    was trained on; quiet and first: the trained person's own quiet face, and that of the first
-    frame."""
+    """Middle and half width, per part (`PART_FIELDS`), of what an avatar was trained on; the
+    person's quiet face and that of the first frame."""
 
     middle: dict[str, np.ndarray]
     width: dict[str, np.ndarray]
@@ -75,11 +74,8 @@ def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
 
 
 def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
-    """Part -> the median of its parameters over the frames that are most alike: a face keeps
-    returning to rest.
-
-    Needs no order in time, which recordings of single expressions lack.
-    """
+    """Part -> the median of its parameters over the frames that are most alike, in whatever order:
+    a face keeps returning to rest."""
     frames = evenly_spread(frames, MAX_COMPARED_FRAMES)
     parts = {
         part: np.stack([getattr(frame, name) for frame in frames])
@@ -286,9 +282,8 @@ def performed(
 def adapted(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None = None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of another person's FLAME motion with the options' neutral, strength and range; and
-    part -> (T,) how far they were outside the trained range before they were led back
-    (`transfer.outside`)."""
+    """Frames of another's FLAME motion with the options' neutral, strength and range; and how far
+    they were `outside`."""
     theirs = {"quiet": frames, "first": frames[:1]}.get(options.neutral)
     if theirs is not None:
         frames = exchanged_neutral(frames, quiet_neutral(theirs))
@@ -339,9 +334,8 @@ def frames_of(
     options: MotionOptions,
     trained: TrainedRange | None = None,
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of a performance, as `corrected`, at the strength on the head of a map; and part ->
-    (T,) how far they were outside the trained range before they were led back
-    (`transfer.outside`)."""
+    """Frames of a `corrected` performance at the strength on a map's head; and how far they were
+    `outside`."""
     return _finished(found.frames(performance), options, trained)
 
 

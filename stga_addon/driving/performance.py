@@ -31,11 +31,8 @@ _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
 
 
 def arkit_name(name: str) -> str | None:
-    """ARKit's spelling of a shape's name, or None where it is none of the 52.
-
-    Any capitals and separators, a prefix up to the last dot, and `_L` or `_R` for Left and Right
-    are accepted: `blendShapes.JawOpen`, `mouth_smile_left`, `mouthSmile_L`.
-    """
+    """ARKit's spelling of `blendShapes.JawOpen`, `mouth_smile_left`, `mouthSmile_L`: any capitals,
+    separators and prefix up to the last dot; None where it is none of the 52."""
     plain = name.rsplit(".", 1)[-1].strip()
     side = re.fullmatch(r"(.*)[_\- ]([LR])", plain, re.IGNORECASE | re.DOTALL)
     if side:
@@ -58,11 +55,8 @@ def mirrored_name(name: str) -> str:
 
 
 def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
-    """Column of the 52 -> index in `names` (the first of each).
-
-    Raises StgaError, which begins with `where`, naming the shapes that are missing; those of
-    `OPTIONAL` may be.
-    """
+    """Column of the 52 -> first index in `names`. Raises StgaError, beginning with `where`, with
+    the shapes that are missing, but for those of `OPTIONAL`."""
     listed = list(names)
     found: dict[int, int] = {}
     for index, name in enumerate(listed):

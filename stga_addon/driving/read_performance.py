@@ -22,11 +22,8 @@ slower."""
 
 
 def seconds_of(where: str, texts: list[str]) -> np.ndarray:
-    """(T,) seconds from the first of T timecodes `HH:MM:SS:FF.sub`, which may pass midnight.
-
-    The rate that FF counts in is found from the numbers themselves: rows may come at half of it.
-    Raises StgaError, which begins with `where` and names the row, for text that is no timecode.
-    """
+    """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
+    is found from the numbers. Raises StgaError, beginning with `where`, for other text."""
     fields = []
     for row, text in enumerate(texts):
         found = PATTERN.fullmatch(text.strip())
@@ -72,11 +69,8 @@ _VALUE = re.compile(r"([A-Za-z_]+)[-&](-?\d+(?:\.\d+)?)", re.ASCII)
 
 
 def parse_packet(data: bytes) -> FacePacket | None:
-    """The frame of `mouthSmile_R-0|…|=head#rx,ry,rz,x,y,z|rightEye#x,y,z|leftEye#x,y,z|`, or None
-    for other bytes.
-
-    Version 2 separates names and values by `&`. Source: the protocol's description by its author.
-    """
+    """The frame of `mouthSmile_R-0|…|=head#rx,ry,rz,x,y,z|rightEye#x,y,z|leftEye#x,y,z|` (version
+    2: `&` before values) by the protocol's author, or None for other bytes."""
     if len(data) > MAX_PACKET_BYTES:
         return None
     try:

@@ -87,11 +87,8 @@ MAX_SURFACE_DISTANCE_M = 0.003
 
 
 def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray]:
-    """The 478 points on the neutral head, and (478,) bool which lie reliably on its skin.
-
-    `name` is what errors call the head. Raises StgaError where its eyes are not where a head has
-    them.
-    """
+    """The 478 points on the neutral head, and (478,) bool which lie reliably on its skin. Raises
+    StgaError, with `name`, where its eyes are not where a head has them."""
     source, surface = face_shapes(), _Surface(model.v_template, model.faces)
     joints = joint_positions(model, model.v_template)
     pupils = []

@@ -54,10 +54,8 @@ class Select(_OfCapture):
 
 
 def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
-    """Decide the effects of a training on the capture; also times the presets if asked to.
-
-    Raises StgaError; a capture without training views calls for nothing.
-    """
+    """Decide the effects of a training on the capture; also times the presets if asked to. Raises
+    StgaError."""
     from ..training.effects.plan import plan_effects
 
     report(Progress(stage="Analyzing the capture"))

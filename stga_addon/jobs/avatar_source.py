@@ -68,11 +68,8 @@ def motion_options_field(*needs: str) -> Any:
 
 
 def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
-    """The avatar of a run folder or file, and the capture that was given or that the run was
-    trained on, as an open .blend file's head plays it where the request says so.
-
-    Raises StgaError where the run's own capture has changed, or a given one has other triangles.
-    """
+    """The avatar of a run folder or file, and the capture given or trained on, or what an open head
+    plays. Raises StgaError for a capture that has changed, or of other triangles."""
     source, given, capture = request.source, request.capture, None
     if source.is_dir() and given is None:
         capture = open_refined(source, flame=request.flame)
@@ -102,10 +99,8 @@ def required_capture(capture: Capture | None) -> Capture:
 
 
 def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) -> tuple[int, ...]:
-    """The capture's timesteps from the first to the last of `span`, inclusive; None: all of them.
-
-    Says so where the span reaches beyond them. Raises StgaError where there is none.
-    """
+    """The capture's timesteps within `span`, inclusive; says so where it reaches beyond. Raises
+    StgaError for none."""
     if span is None:
         return tuple(capture.timesteps)
     first, last = span
@@ -233,10 +228,8 @@ class _Stored:
 
 
 def write_head(folder: Path, head: OpenHead, played: bool) -> None:
-    """Write the head into the folder; `played`: with the meshes of the scene's frames.
-
-    Raises StgaError where the capture cannot be read, or the folder not be written.
-    """
+    """Write the head into the folder; `played`: with the meshes of the scene's frames. Raises
+    StgaError."""
     stored = _Stored(head.capture, head.flame, head.avatar, head.principal_point, head.fps)
     write_json(folder / HEAD, to_json(stored))
     selection = head.selection()

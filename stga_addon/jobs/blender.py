@@ -53,10 +53,8 @@ class RenderRecording:
 
 
 def render_recording(request: RenderRecording, report: Report, say: Say) -> Written:
-    """Render the recorded images and write them; the recording is removed.
-
-    A cancelled video is not written; images of a sequence that are finished stay. Raises StgaError.
-    """
+    """Render the recorded images and remove the recording; cancelled, no video is written, finished
+    PNGs stay."""
     output, count, to_video = request.output, request.images, is_video(request.output)
     try:
         images = recorded_images(request.recording, count, Composer(request.device))

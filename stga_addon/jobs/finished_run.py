@@ -77,10 +77,8 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
 def add_light(
     avatar_file: Path, capture: Capture, known: "Known | None" = None, report: Report = ignore
 ) -> tuple[str, ...]:
-    """Write the light of a capture into a run's avatar file; returns what there is to say.
-
-    Raises StgaError, also while another process trains or lights the run.
-    """
+    """Write the light of a capture into a run's avatar file; what there is to say. Raises
+    StgaError, also while another process works on the run."""
     from ..light.estimate import Known, estimate_light
     from ..training.evaluate.match_exposure import known_exposure
 
@@ -120,9 +118,8 @@ class Evaluate:
 
 
 def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
-    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder; of timesteps without
-    training views, also with the heads as they were before the avatar tracked them. Raises
-    StgaError."""
+    """Measure PSNR, SSIM and LPIPS; also with the heads before the avatar tracked them, where it
+    did. Raises StgaError."""
     from ..training.evaluate.metrics import evaluate_avatar, psnr_recorded
 
     folder, split = request.run, request.split

@@ -84,11 +84,8 @@ def has_request(folder: Path) -> bool:
 
 
 def remove_request(folder: Path) -> None:
-    """Remove the files of a request and its worker's status; a folder that holds no request stays
-    as it is.
-
-    Raises StgaError while its worker is working.
-    """
+    """Remove the files of a request, if the folder holds one, and its worker's status. Raises
+    StgaError while its worker is working."""
     if has_request(folder):
         remove_status_folder(folder, FILES)
 

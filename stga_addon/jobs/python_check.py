@@ -17,11 +17,8 @@ CHECK_TIMEOUT_S = 180.0  # The first import of torch from a slow disk
 
 @dataclass(frozen=True)
 class Checked:
-    """An interpreter that can track and train.
-
-    line      its versions and device
-    adapters  the GPUs that it can train on, as `--device gpu:NAME` names them
-    """
+    """An interpreter that can track and train: a line on it, and its GPUs as `--device gpu:NAME`
+    names them."""
 
     line: str
     adapters: tuple[str, ...]

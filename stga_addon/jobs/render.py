@@ -121,11 +121,8 @@ class Render:
 
 
 def render(request: Render, report: Report, say: Say) -> Written:
-    """Render the pictures or the video. A cancelled video is not written; pictures that are
-    finished stay.
-
-    Raises StgaError.
-    """
+    """Render the pictures or the video; cancelled, no video is written, and pictures that are
+    finished stay. Raises StgaError."""
     if request.turntable is not None:
         _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
     views: Sequence[View] = ()

@@ -198,10 +198,8 @@ class Prepared:
 
 
 def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Written:
-    """Train the run that is asked for; returns the path of its avatar and its summary.
-
-    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
-    """
+    """Train the run that is asked for; its avatar and summary. Raises StgaError, KeyboardInterrupt
+    after Ctrl-C."""
     from ..training.effects.plan import describe_effects
 
     prepared, folder = prepare(request, report, say), request.run

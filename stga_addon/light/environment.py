@@ -28,11 +28,8 @@ looks along z)."""
 
 
 def read_hdr(path: Path) -> np.ndarray:
-    """(H, W, 3) float32 linear radiance of a Radiance picture (.hdr, RGBE), rows from the top.
-
-    Reads flat and run-length encoded rows (Ward, "Real Pixels", Graphics Gems II). Raises
-    StgaError.
-    """
+    """(H, W, 3) float32 radiance of a .hdr picture (RGBE), flat or run-length encoded (Ward,
+    Graphics Gems II), from the top. Raises StgaError."""
     data = read_bytes(path)
     header = HEADER.match(data[:MAX_HEADER_BYTES])
     if header is None:
@@ -84,11 +81,8 @@ def _unpacked(body: np.ndarray, at: int, channel: np.ndarray) -> int:
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (H, W, 3) that the pixels of an equirectangular image show, and their solid
-    angles (H, 1).
-
-    Blender's: z up, the image's middle shows +x, its quarter to the left +y.
-    """
+    """Unit vectors (H, W, 3) of an equirectangular image's pixels, as Blender's (z up, middle +x,
+    left quarter +y), and their solid angles (H, 1)."""
     polar = np.pi * (np.arange(height) + 0.5) / height
     turn = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
     ring = np.sin(polar)[:, None]
@@ -191,9 +185,8 @@ class LightFile:
 
 
 def read_lighting(path: Path) -> Lighting:
-    """The lighting of an .hdr environment, which stands as Blender shows it around the upright
-    head, or of a .toml
-    file (`LightFile`). Raises StgaError naming the file."""
+    """The lighting of an .hdr environment, as Blender shows it around the upright head, or of a
+    .toml `LightFile`."""
     suffix = path.suffix.lower()
     if suffix == ".hdr":
         world, suns = split_environment(read_hdr(path))

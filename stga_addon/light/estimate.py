@@ -30,11 +30,8 @@ SATURATED_LEVEL, DARK_LEVEL = 252, 4
 
 @dataclass(frozen=True)
 class Observed:
-    """Triangles' colors at T timesteps.
-
-    color    (T, F, 3) linear; NaN where no camera sees the triangle
-    cameras  (T, F) how many see it
-    """
+    """Linear color (T, F, 3) of triangles, NaN where no camera sees them, and how many cameras (T,
+    F) do, at T timesteps."""
 
     color: np.ndarray
     cameras: np.ndarray
@@ -200,11 +197,8 @@ def estimate_light(
 def recorded_irradiance(
     direct: np.ndarray, cameras: np.ndarray, faces: np.ndarray, bounce: Bounce
 ) -> np.ndarray:
-    """(V, 3): mean over timesteps of what arrived at vertices, direct (T, V, 3) and by skin around.
-
-    Timesteps count as many times as cameras (T, F) see the vertex then: teeth where the mouth is
-    open, eyeballs where the lids are.
-    """
+    """(V, 3): mean of direct (T, V, 3) and of skin around; each timestep counts as many times as
+    cameras (T, F) see the vertex: teeth in an open mouth."""
     total, count = np.zeros(direct.shape[1:]), np.zeros((direct.shape[1], 1))
     for arriving, seen in zip(direct, cameras, strict=True):
         weight = (
@@ -284,11 +278,8 @@ def _solve(
 
 
 def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V,) float32: EYE_ROUGHNESS on eyeballs, 0 elsewhere (skin).
-
-    An eyeball is a part of its own that is nearly a sphere of an eye's size, as in FLAME and
-    ICT-FaceKit.
-    """
+    """(V,) float32: EYE_ROUGHNESS on eyeballs, parts of their own that are nearly spheres of an
+    eye's size, 0 elsewhere."""
     part = connected_parts(len(neutral), faces)
     found = np.zeros(len(neutral), np.float32)
     used = np.zeros(len(neutral), bool)

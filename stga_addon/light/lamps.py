@@ -28,11 +28,8 @@ cannot see them."""
 
 @dataclass(frozen=True)
 class LightView:
-    """How a light sees space: parallel for a sun, else in perspective from its position.
-
-    axes (3, 3): columns across, up and forward. origin (3,). scale: texels per meter, or per unit
-    of slope.
-    """
+    """How a light sees space, parallel or in perspective from `origin` (3,). axes (3, 3): columns
+    across, up, forward. scale: texels per meter, or per unit of slope."""
 
     axes: np.ndarray
     origin: np.ndarray
@@ -60,11 +57,8 @@ def head_bounds(vertices: np.ndarray) -> HeadBounds:
 
 
 def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
-    """The view of a light around a head.
-
-    A light inside the sphere around the head sees it under a wide angle, and loses what lies behind
-    it.
-    """
+    """The view of a light around a head: wide, and without what lies behind it, from inside the
+    head's sphere."""
     center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
     if light.kind == "sun":
         forward, distance, scale = light.direction, np.inf, size / 2 / radius
@@ -130,33 +124,25 @@ class ShadowMap:
         self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP,
         normals: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
-        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the
-        surface.
-
-        normals (N, 3): of the surface there, which make `bias` larger on slopes.
-        """
+        """(N,) float32, 0…1: how much light reaches points (N, 3) lifted off the surface, whose
+        normals (N, 3) make `bias` larger on slopes."""
         found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
         if normals is not None:
-            biases = self._slope_bias(points, normals, bias, step)
+            if self._light.kind == "sun":
+                cosine = normals @ -self._light.direction.astype(np.float32)
+            else:
+                away = self._light.position.astype(np.float32) - points
+                length = np.sqrt(np.einsum("nk,nk->n", away, away))
+                cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
+            cosine = np.clip(cosine, 0.05, 1)
+            slope = np.sqrt(1 - cosine**2) / cosine
+            biases = np.asarray(
+                np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)),
+                np.float32,
+            )
         places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
         kernels("shadow").lit_shares(self.depth, places, biases, np.float32(step), found)
         return found
-
-    def _slope_bias(
-        self, points: np.ndarray, normals: np.ndarray, bias: float, step: float
-    ) -> np.ndarray:
-        """(N,) float32 meters."""
-        if self._light.kind == "sun":
-            cosine = normals @ -self._light.direction.astype(np.float32)
-        else:
-            away = self._light.position.astype(np.float32) - points
-            length = np.sqrt(np.einsum("nk,nk->n", away, away))
-            cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
-        cosine = np.clip(cosine, 0.05, 1)
-        slope = np.sqrt(1 - cosine**2) / cosine
-        return np.asarray(
-            np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32
-        )
 
 
 def kernels(name: str) -> Any:

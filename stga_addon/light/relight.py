@@ -52,11 +52,8 @@ def recorded_light(transfer: np.ndarray, bounce: Bounce, irradiance: np.ndarray)
 
 
 def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
-    """By the light of the capture and of the scene, both (9, 3) in the same axes, lamps as if they
-    were far away.
-
-    They are compared as irradiance by direction, each channel but for a factor.
-    """
+    """By the capture's and the scene's light (9, 3), lamps far away, compared as irradiance by
+    direction, each channel but for a factor."""
     old, new = (LAMBERT[:COUNT, None] * light for light in (recorded, distant))
     gain = np.maximum((old * new).sum(0) / np.maximum((old * old).sum(0), 1e-12), 0)
     difference = float(
@@ -98,11 +95,8 @@ VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
 
 
 class Relighter:
-    """An avatar whose file holds its light (`Avatar.light`), ready to be lit by a scene; made once,
-    used every frame.
-
-    Properties are float32, by splat. Raises StgaError where the avatar has no light.
-    """
+    """An avatar with the light of its file, to be lit by a scene; made once. Properties are
+    float32, by splat. Raises StgaError where the avatar has no light."""
 
     def __init__(self, avatar: Avatar) -> None:
         if avatar.light is None:
@@ -181,11 +175,8 @@ class Relighter:
     def colors(
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
     ) -> np.ndarray:
-        """(N, 3) float32 sRGB of the splats, not clipped above 1: the `sh` of degree 0 is (color −
-        0.5) / SH_C0.
-
-        mesh: (V, 3) posed. eye: (3,) position of the camera. All in meters of the avatar's space.
-        """
+        """(N, 3) float32 sRGB of the splats, (color − 0.5) / SH_C0 their `sh`, not clipped above 1,
+        on a posed mesh (V, 3) seen from eye (3,), in meters."""
         return linear_to_srgb(self.radiance(mesh, eye, lighting, casters)).astype(np.float32)
 
     def radiance(
@@ -202,9 +193,8 @@ class Relighter:
         return lit if share == 1 else share * lit + (1 - share) * self._recorded(mesh, eye)
 
     def distant_in_head(self, mesh: np.ndarray, lighting: Lighting) -> tuple[np.ndarray, Kept]:
-        """(9, 6) float32 harmonics of the world, and of the world with lamps as if they were far
-        away, in the axes of the neutral mesh, for a head posed as `mesh` (V, 3); and how much of
-        recorded colors they keep."""
+        """(9, 6) of the world, and of it with lamps far away, in the neutral mesh's axes for a
+        posed `mesh`; and what is kept."""
         center = (mesh.max(0) + mesh.min(0)) / 2
         distant = lighting.world + sum(
             (distant_light(light, center) for light in lighting.lights), np.zeros((9, 3))
@@ -320,11 +310,8 @@ class Relighter:
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:
-    """The avatar without its light: colors are albedo in sRGB, from every side and under every
-    strain the same.
-
-    Raises StgaError where the avatar has no light.
-    """
+    """The avatar without its light: its colors are albedo in sRGB, whatever the view and strain.
+    Raises StgaError where the avatar has no light."""
     color = linear_to_srgb(np.clip(Relighter(avatar).albedo, 0, 1))
     sh = ((color[:, None] - 0.5) / SH_C0).astype(np.float32)
     splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))

@@ -162,11 +162,7 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 
 @dataclass(frozen=True)
 class Lashes:
-    """Four-cornered cards in the frames of triangles.
-
-    face (M,) of the mesh. corners (M, 4, 3) float32 in the frame of that triangle
-    (`avatar.embedding`).
-    """
+    """Four-cornered cards (M, 4, 3) in the frames (`avatar.embedding`) of triangles (M,)."""
 
     avatar: Avatar
     face: np.ndarray
@@ -186,11 +182,8 @@ def find_lashes(
     avatar: Avatar, corners: np.ndarray, weights: np.ndarray, roughness: np.ndarray,
     albedo: np.ndarray,
 ) -> Lashes:  # fmt: skip
-    """The lashes of an avatar whose light is known.
-
-    corners, weights (N, 3): `surface.surface_points`. roughness (N,) and albedo (N, 3) of the
-    splats.
-    """
+    """The lashes of an avatar with light; corners, weights (N, 3) of `surface_points`, roughness
+    (N,) and albedo (N, 3) of the splats."""
     assert avatar.light is not None
     splats, neutral = avatar.splats, avatar.neutral.astype(np.float64)
     frames = face_frames(neutral, avatar.faces, neutral, avatar.convention)

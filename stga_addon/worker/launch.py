@@ -54,10 +54,8 @@ def is_preparing() -> bool:
 
 
 def prepare_status_folder(folder: Path) -> None:
-    """Create the status folder, or remove the previous worker's status from it.
-
-    Raises StgaError while that worker is running, or where the folder cannot be written.
-    """
+    """Create the status folder, or empty it. Raises StgaError while a worker is running in it, or
+    it cannot be written."""
     refuse_running_worker(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -114,11 +112,8 @@ def start_python(
     variables: Mapping[str, str] | None = None,
     **options: Any,
 ) -> subprocess.Popen[Any]:
-    """Start `python -m ARGUMENTS…` with `worker_environment`.
-
-    variables: environment variables to add. options: those of subprocess.Popen.
-    Raises StgaError where the interpreter cannot be started.
-    """
+    """Start `python -m ARGUMENTS…` in `worker_environment` and `variables`; options are those of
+    Popen. Raises StgaError where the interpreter cannot be started."""
     environment = {**worker_environment(os.environ, python), **(variables or {})}
     try:
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
@@ -129,11 +124,8 @@ def start_python(
 
 
 def end_with_this_process() -> Callable[[], None] | None:
-    """A `preexec_fn` by which Linux kills the started process when the thread that starts it has
-    gone, killed or not.
-
-    None on other systems, where such a process goes on to its end.
-    """
+    """A `preexec_fn` by which Linux kills the started process with the thread that starts it; None
+    on other systems, where it goes on to its end."""
     if not sys.platform.startswith("linux"):
         return None
     import ctypes  # before the fork, after which nothing may be imported

@@ -192,11 +192,8 @@ def refuse_running_worker(folder: Path) -> None:
 
 
 def remove_status_folder(folder: Path, other_files: Iterable[str] = ()) -> None:
-    """Remove the files of a worker's status and `other_files`, then the folder where nothing else
-    is in it.
-
-    Raises StgaError while the worker is running, or where a file cannot be removed.
-    """
+    """Remove a worker's status and `other_files`, and the folder where nothing else is in it.
+    Raises StgaError while the worker is running, or a file stays."""
     refuse_running_worker(folder)
     try:
         for name in (STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE, *other_files):
@@ -225,11 +222,8 @@ class StatusWriter:
         self, progress: float, message: str, detail: str = "",
         figures: Callable[[], Mapping[str, float]] = dict,
     ) -> bool:  # fmt: skip
-        """Write the status, at most every STATUS_INTERVAL_S; returns whether to stop and keep what
-        there is.
-
-        figures: called when the status is written; numbers that are not finite are left out.
-        """
+        """Write the status, at most every STATUS_INTERVAL_S, with the finite `figures`; returns
+        whether to stop and keep what there is."""
         self.cancel_requested = (self.folder / CANCEL_FILE).exists()
         now = time.monotonic()
         if message != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:

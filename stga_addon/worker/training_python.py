@@ -52,11 +52,8 @@ def own_python() -> str:
 
 
 def find_training_python(preferred: str = "") -> str:
-    """The interpreter that tracks and trains: $STGA_PYTHON, else `preferred` (Blender's
-    preferences), else this one.
-
-    Raises StgaError where this one is left and lacks packages.
-    """
+    """The interpreter that tracks and trains: $STGA_PYTHON, else `preferred`, else this one. Raises
+    StgaError where this one is left and lacks packages."""
     chosen = os.environ.get(PYTHON_VARIABLE) or preferred
     if chosen:  # without a folder, a program that is found on PATH
         return os.path.abspath(chosen) if os.path.dirname(chosen) else chosen

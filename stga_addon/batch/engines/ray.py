@@ -32,10 +32,8 @@ class RayEngine:
     interval_s = 0.2
 
     def __init__(self, address: str) -> None:
-        """Use the cluster at an address; "": one that is started here and ends with the batch.
-
-        Raises StgaError where Ray is not installed, or the cluster cannot be reached.
-        """
+        """Use the cluster at an address; "": one that is started here. Raises StgaError where Ray
+        is not installed, or the cluster not reached."""
         if find_spec("ray") is None:
             problem = "the package ray is not installed (it is the extra `ray` of stga-addon)"
             raise StgaError(f"--engine ray: {problem}")
@@ -124,9 +122,8 @@ def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
     """What Ray carries out: sent as it is to machines without this package, it uses only itself."""
 
     def run_command(command: list[str], packages: str, log: str) -> int:
-        """Run a command with its output in a log; returns its exit code. On Linux it ends with
-        Ray's worker, so that a node that Ray has given up does not go on beside the one that takes
-        over."""
+        """Exit code of a command with its output in a log; on Linux it ends with Ray's worker, as
+        does a lost node."""
         import ctypes
         import os
         import signal

@@ -66,11 +66,8 @@ class SlurmEngine:
         return True
 
     def submit(self, jobs: Sequence[Job]) -> None:
-        """Submit the jobs but those that are in the queue since an earlier start.
-
-        Raises StgaError with the words of sbatch where it refuses an array, and where squeue does
-        not answer.
-        """
+        """Submit the jobs but those that are in the queue since an earlier start. Raises StgaError
+        with sbatch's words, and where squeue does not answer."""
         names = {job.name: self._name(job) for job in jobs}
         if self._states is None and any(names.values()):
             self._states = _queue()
@@ -94,7 +91,13 @@ class SlurmEngine:
         kind, needs = kind_name(type(jobs[0].request)), jobs[0].resources
         script = jobs[0].folder.parent / FOLDER / f"{kind}-{time.time_ns()}.sh"
         with replacing(script) as partial:
-            partial.write_text(_script(jobs), encoding="utf-8")
+            packages = shlex.quote(str(PACKAGES_FOLDER))
+            lines = ["#!/bin/sh", "# A batch of stga; each job continues what it began before."]
+            lines += [f"export PYTHONPATH={packages}", "case $SLURM_ARRAY_TASK_ID in"]
+            for index, job in enumerate(jobs):
+                log = shlex.quote(str(job.request_folder / LOG_FILE))
+                lines.append(f"{index}) exec {shlex.join(job_command(job))} >>{log} 2>&1 ;;")
+            partial.write_text("\n".join([*lines, "esac", ""]), encoding="utf-8")
         names = {
             self._jobs[other].name for job in jobs for other in job.after if other in self._jobs
         }
@@ -184,17 +187,6 @@ def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
             number += 1
         arrays[*key, number].append(job)
     return [arrays[key] for key in sorted(arrays, key=lambda key: key[0])]
-
-
-def _script(jobs: Sequence[Job]) -> str:
-    """What each job of an array runs: the command of its index, with its output in its own log."""
-    packages = shlex.quote(str(PACKAGES_FOLDER))
-    lines = ["#!/bin/sh", "# A batch of stga; each job continues what it began before."]
-    lines += [f"export PYTHONPATH={packages}", "case $SLURM_ARRAY_TASK_ID in"]
-    for index, job in enumerate(jobs):
-        log = shlex.quote(str(job.request_folder / LOG_FILE))
-        lines.append(f"{index}) exec {shlex.join(job_command(job))} >>{log} 2>&1 ;;")
-    return "\n".join([*lines, "esac", ""])
 
 
 def _queue() -> dict[str, tuple[str, str]]:

@@ -83,11 +83,8 @@ class Receiver:
     def __init__(
         self, source: Source, address: str = LOOPBACK, port: int = 0, phone: str = ""
     ) -> None:
-        """Listen on `address` and `port` (0: the source's usual one) of this machine.
-
-        phone  address of the phone that a source with a request asks for packets
-        Raises StgaError where that is no address, or the port cannot be opened.
-        """
+        """Listen on `address` and `port` (0: the usual one); phone: whom a source with a request
+        asks. Raises StgaError for no address, or a port that cannot be opened."""
         self.source, self.port = source, port or source.port
         self.phone = str(checked_address("phone's address", phone)) if source.request else ""
         where = checked_address("address to listen on", address)
