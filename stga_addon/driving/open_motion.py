@@ -197,7 +197,8 @@ class MotionOptions:
     mirror: bool = option("exchange left and right of a face performance", False)
     gains: Mapping[str, float] = option(
         "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may "
-        "be repeated", default_factory=dict, flag="--gain", metavar="NAME=FACTOR", parse=parsed_gain,
+        "be repeated", default_factory=dict, flag="--gain", metavar="NAME=FACTOR",
+        parse=parsed_gain,
     )  # fmt: skip
     stay_trained: float | None = option(
         "lead the motion softly back to the range that the run was trained on, and print how far "

@@ -91,21 +91,21 @@ def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray
     StgaError, with `name`, where its eyes are not where a head has them."""
     source, surface = face_shapes(), _Surface(model.v_template, model.faces)
     joints = joint_positions(model, model.v_template)
-    pupils = []
+    foremost = []  # points of right and left eyeball
     for joint in EYE_JOINTS:
         eyeball = model.v_template[model.weights[:, joint] > EYEBALL_WEIGHT]
         if len(eyeball):
-            pupils.append([*eyeball[:, :2].mean(axis=0), eyeball[:, 2].max()])
+            foremost.append([*eyeball[:, :2].mean(axis=0), eyeball[:, 2].max()])
         else:
-            pupils.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
-    apart = float(pupils[1][0] - pupils[0][0])
+            foremost.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
+    apart = float(foremost[1][0] - foremost[0][0])
     if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
         low, high = 1000 * MIN_EYE_DISTANCE_M, 1000 * MAX_EYE_DISTANCE_M
         raise StgaError(
             f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {low:.0f} to "
             f"{high:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
         )
-    pupils = np.array(pupils)
+    pupils = np.array(foremost)
     skin = source.reliable & (np.arange(len(source.points)) < SKIN_POINTS)
     points, normals = _aligned(surface, pupils, skin)
     points = _warped(surface, points, normals, pupils, skin)

@@ -287,54 +287,42 @@ def _forgotten(state: RequestState, first: Effect | None = None, error: str = ""
 
 def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     effects: list[Effect] = []
-    before, worker = state, event.snapshot.state
-    error = "" if state.stopped else state.error
+    before, error = state, "" if state.stopped else state.error
     state = replace(
         state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error,
         stopped=False,
     )  # fmt: skip
-    drawn, drawn_before = (
-        (each.folder, each.files.metrics, each.files.picture) for each in (state, before)
-    )
-    if drawn != drawn_before and state.kind in (*TRAINS, Kind.TRACKING):
+    drawn = [(each.folder, each.files.metrics, each.files.picture) for each in (before, state)]
+    if drawn[0] != drawn[1] and state.kind in (*TRAINS, Kind.TRACKING):
         effects.append(ReadCurve(state.run))
-    if (state.folder, state.files, state.snapshot) != (
-        before.folder,
-        before.files,
-        before.snapshot,
-    ):
+    seen = [(each.folder, each.files, each.snapshot) for each in (before, state)]
+    if seen[0] != seen[1]:
         effects.append(Redraw())
+    is_alive, files = state.snapshot.state.is_alive, state.files
     if state.loading is not None:
         return state, tuple(effects)
-    if state.kind in TRAINS:
-        capture, preview = state.files.capture, state.files.preview
-        if capture not in (None, state.shown_capture) and (
-            state.snapshot.state.is_alive or state.has_result
-        ):
-            return replace(
-                state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture
-            ), tuple(effects)
+    if state.kind not in TRAINS:
         if state.has_result:
-            effects.append(StoreAvatar(state.run / AVATAR))
-            if event.show_result:
-                state = replace(state, loading=state.run / AVATAR)
-            else:
-                state = replace(state, result_shown=True)
-                effects.extend(_stored(state))
-        elif (
-            state.snapshot.state.is_alive
-            and event.live_preview
-            and preview not in (None, state.shown_preview)
-        ):
-            state = replace(state, loading=event.folder / PREVIEW, shown_preview=preview)
-        if state.loading is not None:
-            effects.append(LoadAvatar(state.loading))
+            state = replace(state, loading=state.folder)
+        elif state.kind in TRANSIENT and not is_alive:
+            # The panel has no options of the command line.
+            return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
         return state, tuple(effects)
+    # the tracked capture, the trained avatar, or a preview of it, once each
+    if files.capture not in (None, state.shown_capture) and (is_alive or state.has_result):
+        tracked = state.place / CAPTURE_FOLDER
+        return replace(state, loading=tracked, shown_capture=files.capture), tuple(effects)
     if state.has_result:
-        state = replace(state, loading=state.folder)
-    elif state.kind in TRANSIENT and not worker.is_alive:
-        # The panel has no options of the command line.
-        return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
+        effects.append(StoreAvatar(state.run / AVATAR))
+        if event.show_result:
+            state = replace(state, loading=state.run / AVATAR)
+        else:
+            state = replace(state, result_shown=True)
+            effects.extend(_stored(state))
+    elif is_alive and event.live_preview and files.preview not in (None, state.shown_preview):
+        state = replace(state, loading=event.folder / PREVIEW, shown_preview=files.preview)
+    if state.loading is not None:
+        effects.append(LoadAvatar(state.loading))
     return state, tuple(effects)
 
 

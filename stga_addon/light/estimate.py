@@ -28,32 +28,22 @@ SATURATED_LEVEL, DARK_LEVEL = 252, 4
 """Levels of 255 from which on, and up to which, a channel says nothing."""
 
 
-@dataclass(frozen=True)
-class Observed:
-    """Linear color (T, F, 3) of triangles, NaN where no camera sees them, and how many cameras (T,
-    F) do, at T timesteps."""
-
-    color: np.ndarray
-    cameras: np.ndarray
-
-
 def views_by_time(capture: Capture) -> dict[int, list[View]]:
     """The training views that are looked at: up to MAX_CAMERAS of each of up to MAX_TIMESTEPS."""
     found: dict[int, list[View]] = {}
     for view in capture.views.get("train", ()):
         found.setdefault(view.timestep, []).append(view)
-    return {
-        time: evenly_spread(found[time], MAX_CAMERAS)
-        for time in evenly_spread(sorted(found), MAX_TIMESTEPS)
-    }
+    times = evenly_spread(sorted(found), MAX_TIMESTEPS)
+    return {time: evenly_spread(found[time], MAX_CAMERAS) for time in times}
 
 
-def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -> Observed:
-    """Mean color of each triangle in the darker half of the cameras that face it, which have the
-    fewest highlights.
+def observe(
+    capture: Capture, exposure: ViewExposure, report: Report = ignore
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean linear color (T, F, 3) of triangles in the darker half of the cameras that face them,
+    which have the fewest highlights, NaN where none does; and how many (T, F) do.
 
-    T are those of `views_by_time`, in its order; reads all their images. exposure: as in
-    `estimate.Known`.
+    T are the `views_by_time`, whose images are all read. exposure: as in `Known`.
     """
     by_time = views_by_time(capture)
     colors, cameras = [], []
@@ -67,7 +57,7 @@ def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -
         total = np.where(taken, np.nan_to_num(ordered), 0).sum(0)
         colors.append(np.where(count > 0, total / np.maximum((count + 1) // 2, 1), np.nan))
         cameras.append(np.isfinite(seen[..., 0]).sum(0))
-    return Observed(np.stack(colors), np.stack(cameras))
+    return np.stack(colors), np.stack(cameras)
 
 
 def _view_colors(
@@ -170,10 +160,10 @@ def estimate_light(
         problem = "has no training views, from which its light could be estimated"
         raise StgaError(f"{capture.root}: {problem}")
     transfer, occlusion = transfer_of(capture.neutral, capture.faces)
-    observed = observe(capture, known.exposure, report)
+    color, cameras = observe(capture, known.exposure, report)
     times, faces = views_by_time(capture), capture.faces
     posed = np.stack([transfer_of(capture.mesh(t), faces, POSED_DIRECTIONS)[0] for t in times])
-    radiance, residual = fit_light(observed.color, posed[:, faces].mean(2), known.radiance)
+    radiance, residual = fit_light(color, posed[:, faces].mean(2), known.radiance)
     source = "estimated"
     if known.radiance is not None:
         source = "file"
@@ -184,7 +174,7 @@ def estimate_light(
         radiance = radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving)
         source = "gray_card"
     bounce, direct = Bounce(capture.neutral, faces, occlusion), np.maximum(posed @ radiance, DARK)
-    irradiance = recorded_irradiance(direct, observed.cameras, faces, bounce)
+    irradiance = recorded_irradiance(direct, cameras, faces, bounce)
     hardness = (residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL)
     damping = MAX_DAMPING * float(np.clip(hardness, 0, 1))
     return AvatarLight(

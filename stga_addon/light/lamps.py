@@ -136,10 +136,8 @@ class ShadowMap:
                 cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
             cosine = np.clip(cosine, 0.05, 1)
             slope = np.sqrt(1 - cosine**2) / cosine
-            biases = np.asarray(
-                np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)),
-                np.float32,
-            )
+            sloped = bias + (step + 1) * self._texel_m * slope
+            biases = np.asarray(np.minimum(sloped, max(bias, MAX_BIAS_M)), np.float32)
         places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
         kernels("shadow").lit_shares(self.depth, places, biases, np.float32(step), found)
         return found

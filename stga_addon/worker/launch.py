@@ -78,7 +78,7 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
         log = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
     except OSError as error:
         raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
-    streams = {"stdin": nothing, "stdout": log, "stderr": subprocess.STDOUT}
+    streams: dict[str, Any] = {"stdin": nothing, "stdout": log, "stderr": subprocess.STDOUT}
     try:
         process = start_python(python, arguments, cwd=folder, **streams, **_DETACHED)
     except StgaError:
@@ -92,7 +92,8 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
 
 def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
     """Start `python -m ARGUMENTS…` at low priority, without status and output."""
-    nothing = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    streams = ("stdin", "stdout", "stderr")
+    nothing: dict[str, Any] = dict.fromkeys(streams, subprocess.DEVNULL)
     process = start_python(python, arguments, **nothing, **_DETACHED)
     _give_precedence(process, BACKGROUND_NICENESS)
     return process
