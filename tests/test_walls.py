@@ -245,7 +245,8 @@ BLOCKED = """
 import sys
 class Block:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "bpy", "smplx"}:
+        if name.split(".")[0] in {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm",
+            "bpy", "smplx"}:
             raise ModuleNotFoundError(f"blocked: {name}", name=name)
 sys.meta_path.insert(0, Block())
 import importlib

@@ -12,10 +12,8 @@ from ..progress import Progress, ignore
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-LAYOUT, LAYOUT_WITH_TIME_LEFT = (
-    "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}",
-    "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
-)  # Of work that says itself how much time is left, and of other work
+LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+LAYOUT_WITH_TIME_LEFT = LAYOUT.replace("{elapsed}", "{elapsed}<{remaining}")
 
 
 def carry_out(request: Request, with_bar: bool = True) -> Result:

@@ -54,9 +54,7 @@ def _safe(stream: Any, original: Any) -> Any:
         return stream
     stream.flush()
     return io.TextIOWrapper(
-        io.BufferedWriter(Output(stream.fileno(), "w", closefd=False)),
-        encoding=stream.encoding,
-        errors="backslashreplace",
-        line_buffering=stream.line_buffering,
+        io.BufferedWriter(Output(stream.fileno(), "w", closefd=False)), encoding=stream.encoding,
+        errors="backslashreplace", line_buffering=stream.line_buffering,
         write_through=stream.write_through,
-    )
+    )  # fmt: skip

@@ -43,10 +43,9 @@ class Export:
     source: Path = option("folder of a run, or avatar file", flag="RUN|AVATAR")
     output: Path = option("the file, or the folder of a format of several", flag="--out")
     file_format: str = option(
-        "file format",
-        flag="--format",
+        "file format", flag="--format",
         choices={name: format.description for name, format in FORMATS.items()},
-    )
+    )  # fmt: skip
     capture: Path | None = option("whose frames to bake (default: the run's)", None)
     flame: Path | None = like(
         Train, "flame", help="FLAME model file of that capture, or of the motion"
@@ -60,15 +59,12 @@ class Export:
     )
     fps: float | None = option(
         "frames per second of usd and web (default: the scene's or the capture's, else "
-        f"{DEFAULT_FPS:g})",
-        None,
-        above=0,
-    )
+        f"{DEFAULT_FPS:g})", None, above=0,
+    )  # fmt: skip
     motion_only: bool = option(
         "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take "
-        "stay in the page, and FLAME's licence decides who may receive it either way",
-        False,
-    )
+        "stay in the page, and FLAME's licence decides who may receive it either way", False,
+    )  # fmt: skip
     motion: Path | None = motion_field()
     motion_options: MotionOptions = motion_options_field("motion")
     albedo: bool = option(

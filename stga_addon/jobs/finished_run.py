@@ -92,11 +92,8 @@ def add_light(
 
 def describe_light(light: AvatarLight) -> tuple[str, ...]:
     """Lines about where a light is from and how well it explains the capture."""
-    source = {
-        "estimated": "estimated",
-        "gray_card": "estimated, level by a gray card",
-        "file": "from a file",
-    }
+    source = {"estimated": "estimated", "file": "from a file"}
+    source["gray_card"] = "estimated, level by a gray card"
     line = f"light: {source[light.source]}; recorded colors differ from it by {light.residual:.1%}"
     if not light.damping:
         return (line,)

@@ -82,12 +82,9 @@ class Render:
         "white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1
     )
     principal_point: str | None = like(
-        Train,
-        "principal_point",
-        default=None,
+        Train, "principal_point", default=None, needs=("cameras",),
         help="what cy means in the file of --cameras (default: as in training; of a PLY vhap)",
-        needs=("cameras",),
-    )
+    )  # fmt: skip
     device: str = like(Train, "device")
     motion_options: MotionOptions = motion_options_field("motion")
     light: Path | None = option(
@@ -208,10 +205,8 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
         if not half:
             angles = covered_angles([view.camera for view in views], start.camera, center)
         cameras = turntable(start.camera, center, count, angles)
-    path = [
-        replace(start, camera=camera, timestep=timestep)
-        for camera, timestep in zip(cameras, timesteps, strict=True)
-    ]
+    steps = zip(cameras, timesteps, strict=True)
+    path = [replace(start, camera=camera, timestep=timestep) for camera, timestep in steps]
     out = request.output
     with video_writer(out, subject.fps) if request.video else sequence_writer(out) as write:
         for n, view in enumerate(counted(path, len(path), report, "Rendering", "Image")):

@@ -30,11 +30,9 @@ background, so that workers have."""
 PR_SET_PDEATHSIG = 1  # Of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
-_DETACHED: dict[str, Any] = (
-    {"creationflags": 0x00000200 | 0x08000000 | 0x00004000}
-    if os.name == "nt"
-    else {"start_new_session": True}
-)
+_DETACHED: dict[str, Any] = {"start_new_session": True}
+if os.name == "nt":
+    _DETACHED = {"creationflags": 0x00000200 | 0x08000000 | 0x00004000}
 
 
 def cache_folder() -> Path:
@@ -168,7 +166,5 @@ def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, s
 
 def same_interpreter_environment(variables: Mapping[str, str]) -> dict[str, str]:
     """For another process of this interpreter, with the packages of this one."""
-    return {
-        **variables,
-        "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)]),
-    }
+    path = os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)])
+    return {**variables, "PYTHONPATH": path}

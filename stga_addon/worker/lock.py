@@ -80,11 +80,11 @@ def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
     )
     before = _renewed_s(path)
     try:
+        stood_still = (None, before)
         lease.acquire(
-            timeout=2 * EXPIRY_S,
-            poll_interval=LOOK_INTERVAL_S,
-            cancel_check=lambda: _renewed_s(path) not in (None, before),
-        )
+            timeout=2 * EXPIRY_S, poll_interval=LOOK_INTERVAL_S,
+            cancel_check=lambda: _renewed_s(path) not in stood_still,
+        )  # fmt: skip
     except Timeout as error:
         raise BlockingIOError(f"{path} is held by another process") from error
     try:

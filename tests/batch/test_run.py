@@ -418,7 +418,8 @@ def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
         map(float, line.split()) for line in run.stdout.splitlines()
     )
     print(
-        f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; {large_s / small_s:.2f}"
+        f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; "
+        f"{large_s / small_s:.2f}"
     )
     assert large_s < 1.8 * small_s
     assert large_kb - small_kb < 30 * (JOBS - few)

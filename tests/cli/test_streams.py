@@ -69,8 +69,10 @@ THREE = """
 import os, sys
 from stga_addon.cli.main import main
 capture, out = sys.argv[1:]
-train = ["train", capture, "--out", f"{out}/run", "--iterations", "2", "--strategy", "gaussian-avatars"]
-render = ["render", f"{out}/run", "--cameras", f"{capture}/transforms_val.json", "--out", f"{out}/pictures"]
+train = ["train", capture, "--out", f"{out}/run", "--iterations", "2", "--strategy",
+    "gaussian-avatars"]
+render = ["render", f"{out}/run", "--cameras", f"{capture}/transforms_val.json", "--out",
+    f"{out}/pictures"]
 codes = [main(arguments) for arguments in (train, render, ["info", "/none"])]
 null = os.stat(os.devnull)
 assert codes == [0, 0, 2] and all(os.path.samestat(os.fstat(number), null) for number in range(3))

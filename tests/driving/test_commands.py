@@ -44,7 +44,8 @@ def files(tmp_path_factory) -> dict[str, Path]:
     camera = look_at(np.array([0.0, 0.0, 0.8]), np.zeros(3), 64, 64, 130.0)
     world = np.linalg.inv(np.vstack([camera.world_to_camera, [0, 0, 0, 1]])[:4])
     world[:, 1:3] *= -1
-    entry = {"file_path": "x.png", "timestep_index": 0, "camera_index": 0, "transform_matrix": world.tolist(),
+    entry = {"file_path": "x.png", "timestep_index": 0, "camera_index": 0,
+        "transform_matrix": world.tolist(),
              "fl_x": 130.0, "fl_y": 130.0, "cx": 32.0, "cy": 32.0, "w": 64, "h": 64}  # fmt: skip
     (folder / "cameras.json").write_text(json.dumps({"frames": [entry]}))
     return {name: folder / name for name in ("flame.npz", "a.npz", "take.csv", "cameras.json")}

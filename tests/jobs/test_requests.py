@@ -165,7 +165,8 @@ def test_the_worker_refuses_another_run(tmp_path: Path, capture: Path) -> None:
 
 
 DAMAGES: dict[str, Any] = {
-    "format": "stga-job", "version": 0, "kind": "Paint", "run": 5, "capture": None, "device": "toaster",
+    "format": "stga-job", "version": 0, "kind": "Paint", "run": 5, "capture": None, "device":
+        "toaster",
     "settings": {}, "principal_point": "up", "selection": {"x": {"array": "selection.0"}},
     "unknown": 1,
 }  # fmt: skip

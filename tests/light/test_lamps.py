@@ -62,7 +62,8 @@ scene.world = bpy.data.worlds.new("w")
 scene.world.use_nodes = True
 scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0
 mesh = bpy.data.meshes.new("plane")
-mesh.from_pydata([(-.01, -.01, 0), (.01, -.01, 0), (.01, .01, 0), (-.01, .01, 0)], [], [(0, 1, 2, 3)])
+mesh.from_pydata([(-.01, -.01, 0), (.01, -.01, 0), (.01, .01, 0), (-.01, .01, 0)], [],
+    [(0, 1, 2, 3)])
 scene.collection.objects.link(bpy.data.objects.new("plane", mesh))
 material = bpy.data.materials.new("white")
 material.use_nodes = True

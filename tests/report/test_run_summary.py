@@ -30,7 +30,8 @@ def test_summary_of_a_run() -> None:
     """Catches the last evaluation given for the best one, and figures that were not measured."""
     lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
     assert lines[0] == (
-        "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference 0.0323, after 20 s"
+        "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference "
+        "0.0323, after 20 s"
         " (the saved avatar)"
     )
     assert (

@@ -55,7 +55,8 @@ def main():
     with status_writer(Path(sys.argv[1])) as writer:
         print("a line of the log", flush=True)
         for n in range(2000):
-            if writer.update(n / 2000, "counting", "on time", lambda: {"n": n, "nothing": float("nan")}):
+            if writer.update(n / 2000, "counting", "on time",
+                lambda: {"n": n, "nothing": float("nan")}):
                 return
             if sys.argv[2] == "sentence": raise StgaError("capture: is not a folder")
             if sys.argv[2] == "bug": raise ValueError("a bug\\nof two lines")
