@@ -242,7 +242,7 @@ class StatusWriter:
         self._status = replace(self._status, seconds=seconds, **changes)
         # A missing status stops no work, and `inspect_worker` reports a worker that is gone.
         with suppress(StgaError):
-            write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s)
+            write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=patience_s)
 
 
 @contextmanager
