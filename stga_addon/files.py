@@ -35,9 +35,7 @@ PARTIAL_NAME = re.compile(
 RENAME_PATIENCE_S, RENAME_INTERVAL_S = 5.0, 0.1
 """How long, and how often, a rename is tried again while another program has the file open, on
 Windows."""
-WINDOWS_SHARING_ERRORS = (5, 32)
-"""ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION: what Windows says of renaming over an open
-file."""
+WINDOWS_SHARING_ERRORS = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION: of an open file
 NewFile = Callable[[Path], AbstractContextManager[Path]]
 SEQUENCE_FILE = ".stga_sequence"
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"

@@ -13,9 +13,7 @@ import numpy as np
 Item = TypeVar("Item")
 
 PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
-MAX_STEP_SHARE = 0.03
-"""Of the work in a step, beyond which it was done before, by what was interrupted, and says nothing
-of the pace."""
+MAX_STEP_SHARE = 0.03  # Of a step; beyond, an interrupted call had done it before
 
 
 @dataclass(frozen=True)

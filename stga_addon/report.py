@@ -36,9 +36,7 @@ CURVE = "curve.png"
 MAX_DRAWING_SHARE = 0.01
 """Largest share of the time that drawing the curve may take while a run trains."""
 
-FIRST_DRAWING_S = 30.0
-"""Seconds until the first: loading the library takes a few, while the user waits for the first
-preview."""
+FIRST_DRAWING_S = 30.0  # Until the first: loading the library takes a few
 
 
 class CurveUpdater:

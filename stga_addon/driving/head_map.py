@@ -23,12 +23,8 @@ PRODUCT_SHAPES = tuple(name for name in ARKIT_SHAPES if name.startswith(("jaw", 
 """Shapes whose products with jawOpen are features: a jaw that turns carries what they move."""
 PRODUCTS = np.array([COLUMN[name] for name in PRODUCT_SHAPES])
 FEATURES = COUNT + len(PRODUCTS)
-GAZE_RAD = 0.61
-"""Rotation of an eye at weight 1 of an eyeLook shape: the largest in recorded takes of Live Link
-Face."""
-RIDGE_M = 5e-5
-"""Root mean square displacement of the face that a unit of an expression coefficient must be
-worth."""
+GAZE_RAD = 0.61  # Of an eye at weight 1 of an eyeLook shape, the largest in Live Link Face's takes
+RIDGE_M = 5e-5  # RMS displacement of the face that a unit of a coefficient must be worth
 JAW_STEPS = 4
 MAX_JAW_RAD = 0.8  # A jaw turns less; further, the fit has left what it is linear in
 # jawOpen, jawLeft and jawRight at which the other shapes are combined.

@@ -18,9 +18,7 @@ MAX_SWEEPS = 60
 CONVERGED = 1e-5  # Largest change of a weight in a sweep, below which the descent stops
 NEWTON_STEPS, STEP_SHARES = 12, (1.0, 0.5, 0.2, 0.05, 0.0)
 CHUNK = 256  # Rows whose matrices are held at once
-RIDGE = 1e-9
-"""Share of the mean squared displacement that keeps weights apart which this head cannot tell
-apart."""
+RIDGE = 1e-9  # Share of the mean squared displacement, for weights that a head cannot tell apart
 TIMECODE_BASE = 60
 EXTRA_COLUMNS = tuple(
     f"{part}{turn}" for part in ("Head", "LeftEye", "RightEye") for turn in ("Yaw", "Pitch", "Roll")

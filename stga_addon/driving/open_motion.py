@@ -32,9 +32,7 @@ from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_p
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
-QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000
-"""Share of the frames that count as quiet: those most alike, or of least weight; and how many are
-compared."""
+QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000  # Of frames that count as quiet; compared ones
 NEUTRALS = {
     "none": "as recorded",
     "quiet": "both recordings are at rest in the fifth of their frames that are most alike",
@@ -43,9 +41,7 @@ NEUTRALS = {
 }
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
-OUTER_QUANTILE = 0.01
-"""Of the trained frames, cut off at both ends of the range: single mistracked frames widen
-nothing."""
+OUTER_QUANTILE = 0.01  # Of trained frames, cut off at both ends: single mistracked ones
 
 
 @dataclass(frozen=True)

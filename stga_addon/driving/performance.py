@@ -90,9 +90,7 @@ def _unknown(names: list[str]) -> str:
 
 
 MIRROR = np.array([COLUMN[mirrored_name(name)] for name in ARKIT_SHAPES])
-EXCHANGEABLE = ("jaw", "mouth")
-"""Pairs of shapes, such as mouthLeft and mouthRight, which receivers report as exchanged by some
-senders."""
+EXCHANGEABLE = ("jaw", "mouth")  # Pairs, as mouthLeft and mouthRight, that some senders exchange
 GAP = 1.5  # Rows farther apart than this many frames have lost some between them
 SMOOTHING_REACH = 3.0  # Standard deviations of the smoothing kernel that are summed
 

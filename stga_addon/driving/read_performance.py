@@ -16,9 +16,7 @@ PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6
 BASES = (24, 25, 30, 48, 50, 60, 100, 120)  # Frames per second that timecodes count
 USUAL_BASE = 60  # Of a take of less than a second, whose frame numbers do not tell
 DAY_S = 86_400.0
-DROP_RATIO = 1000 / 1001
-"""Timecodes with a semicolon leave out frame numbers, because their frames come this much
-slower."""
+DROP_RATIO = 1000 / 1001  # Of drop-frame timecodes, with a semicolon, whose frames come slower
 
 
 def seconds_of(where: str, texts: list[str]) -> np.ndarray:

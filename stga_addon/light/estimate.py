@@ -104,9 +104,7 @@ def _inner(mask: np.ndarray) -> np.ndarray:
 
 
 ITERATIONS = 40
-PRIOR = 0.7
-"""Weight of alike albedos, as a multiple of the observations of a triangle that is seen at every
-timestep."""
+PRIOR = 0.7  # Weight of alike albedos, in observations of a triangle seen at every timestep
 POSED_DIRECTIONS = 96  # By which the transfer of a posed mesh is found, at each timestep
 UNSEEN_WEIGHT = 1e-3  # Of a timestep at which no camera sees a vertex, where each camera counts 1
 MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
@@ -117,18 +115,14 @@ RIDGE = 1e-4
 MIN_ARRIVING, DARK = 0.02, 1e-5
 """Least irradiance that a color is divided by, as a share of the mean; and what counts as no light
 or albedo."""
-TYPICAL_ALBEDO = 0.36
-"""Of skin (green), which sets the level of an estimated light; exposure and the eyedropper correct
-it."""
+TYPICAL_ALBEDO = 0.36  # Of skin (green): the level of an estimated light, until it is corrected
 HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
 """Residuals from which on the light is too hard to be taken away, and at which albedo is damped
 most."""
 MAX_DAMPING = 0.6
 CARD_REFLECTANCE = 0.18
 
-EYE_ROUGHNESS = 0.2
-"""Of highlights on eyes: about as sharp as splats of half a millimeter on a ball of 12 mm can
-show."""
+EYE_ROUGHNESS = 0.2  # Of highlights on eyes: as sharp as splats of half a millimeter can show
 MIN_RADIUS_M, MAX_RADIUS_M = 0.007, 0.017
 MAX_DEVIATION = 0.12
 """Share of the radius by which the vertices of an eyeball may leave the sphere, on average."""

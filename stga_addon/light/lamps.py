@@ -14,9 +14,7 @@ from .harmonics import COUNT, basis
 from .values import Caster, Light, Lighting
 
 MAP_SIZE = 512  # Texels a side of a light's shadow map, which just holds the head
-LIFT_M = 0.001
-"""Points are lifted off the surface by as much along its normal, so that it does not shade
-itself."""
+LIFT_M = 0.001  # Points are lifted off the surface by it, so that it does not shade itself
 BIAS_M, MAX_BIAS_M = 0.001, 0.006
 """A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the
 taps, at most MAX_BIAS_M."""

@@ -16,15 +16,11 @@ from .lamps import LIFT_M, Lamps, distant_light
 from .surface import Bounce, Lashes, at_splats, find_lashes, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
-UNLIKE_LIGHT = 0.2
-"""Difference between two lights from which on nothing is kept, as a share of the capture's
-light."""
+UNLIKE_LIGHT = 0.2  # Difference of two lights from which on nothing is kept, as a share
 ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
 """Difference between what arrives at a splat, now and in the capture, up to which all is kept and
 from which on nothing, as a share: other objects' shadows."""
-RIDGE = 1e-6
-"""Of the mean of a matrix's diagonal, added to it: meshes that receive no light in some
-harmonics."""
+RIDGE = 1e-6  # Of the mean of a diagonal, added to it: meshes without light in some harmonics
 
 
 @dataclass(frozen=True)
@@ -82,9 +78,7 @@ def _smooth_step(values: np.ndarray) -> np.ndarray:
 
 
 REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
-MIN_IRRADIANCE = 0.15
-"""Least irradiance of the capture that color is divided by, as a share of its mean: what was darker
-is noise."""
+MIN_IRRADIANCE = 0.15  # Least irradiance that color is divided by, as a share of its mean: noise
 HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.034, 0.14, 0.1
 """Part of what arrived in the capture that came back as highlights, from skin and from wet eyes,
 which mirror what is in front of them; it is taken from the recorded colors, of which at least

@@ -46,9 +46,7 @@ def transfer_of(
     return transfer.astype(np.float32), (open_sky / np.maximum(whole_sky, 1e-9)).astype(np.float32)
 
 
-CELL_M = 0.02
-"""Side of the cells in which irradiance is averaged; a vertex sees the mean of its own and the 26
-around it."""
+CELL_M = 0.02  # Side of the cells in which irradiance is averaged, with the 26 around a vertex's
 SKIN = np.array([0.5, 0.33, 0.25])  # Albedo of the skin that light is reflected by
 MIN_OPEN = 0.3
 """Share of the sky that a vertex must see to count as lit skin: those inside the head do not."""
@@ -154,9 +152,7 @@ REACH_M = 0.025  # From the middle of an eyeball
 MIN_HEIGHT_M = 0.002
 """Above the mesh: shadow maps have a bias, and splats of skin lie within 1.5 mm."""
 MIN_OPACITY, MAX_ALBEDO = 0.3, 0.15
-EXTENT = 2.0
-"""Distance of a lash's corners from its middle, in standard deviations of the splat: gaps between
-lashes close."""
+EXTENT = 2.0  # A lash's half length in standard deviations of the splat: gaps close
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 
 

@@ -12,12 +12,8 @@ from filelock import FileLock, SoftFileLease, Timeout
 from ..errors import StgaError
 from ..files import file_size
 
-ACQUIRE_TIMEOUT_S = 0.3
-"""How long a lock is waited for: a process that only asks whether it is held has it for a
-moment."""
-PROBE_TIMEOUT_S = 0.03
-"""The same between two processes that only ask; Blender's timer waits that long for a worker of
-another Blender."""
+ACQUIRE_TIMEOUT_S = 0.3  # For a lock, which a process that only asks has for a moment
+PROBE_TIMEOUT_S = 0.03  # The same between processes that only ask, as Blender's timer does
 RETRY_INTERVAL_S = 0.002
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without working locks answers: some NFS and parallel file systems."""
@@ -26,9 +22,7 @@ BEAT_S, EXPIRY_S = 5.0, 30.0
 holder that was killed on another machine, or stands still (a suspended machine, storage that
 hangs)."""
 LOOK_INTERVAL_S = 0.2
-OWNER_OFFSET = 1
-"""Where the owner's process number starts: on Windows, other processes cannot read the first byte,
-which is locked."""
+OWNER_OFFSET = 1  # Of the process number: Windows locks the first byte, which nobody can read
 
 
 @contextmanager

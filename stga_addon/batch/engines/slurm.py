@@ -28,9 +28,7 @@ QUEUE_FORMAT = "%i|%T|%N"  # Of squeue: job, state, machines
 ON_MACHINE = ("RUNNING", "COMPLETING", "CONFIGURING", "STAGE_OUT")
 GRACE_S = 10.0
 """Seconds after its submission in which a job that squeue does not list yet is not gone."""
-MAX_SILENCE_S = 600.0
-"""How long squeue may fail, as while the controller is started anew, before the batch ends; its
-jobs go on."""
+MAX_SILENCE_S = 600.0  # How long squeue may fail before the batch ends; its jobs go on
 FOLDER, SUBMITTED = "slurm", "submitted.json"
 
 

@@ -71,9 +71,7 @@ SOURCES = {
 
 LOOPBACK = "127.0.0.1"
 MAX_DATAGRAM_BYTES = 1 << 16
-MAX_DATAGRAMS = 256
-"""Read at once: more than a usual socket keeps, so that the newest is among them. A flood does not
-hold Blender up."""
+MAX_DATAGRAMS = 256  # Read at once, more than a socket keeps; a flood does not hold Blender up
 REQUEST_INTERVAL_S = 1.0  # At which a phone that is silent is asked again
 
 
