@@ -89,19 +89,6 @@ class WorkerSnapshot:
     log_tail: tuple[str, ...] = ()
 
 
-def derive_state(
-    status: WorkerStatus | None, alive: bool, cancel_requested: bool, started: bool
-) -> WorkerState:
-    """State of a worker by its latest status, whether its process lives, and one ever started."""
-    if status is not None and status.state != WorkerState.WORKING:
-        return WorkerState(status.state)
-    if not alive:
-        return WorkerState.LOST if started else WorkerState.NONE
-    if cancel_requested:
-        return WorkerState.CANCELLING
-    return WorkerState.STARTING if status is None else WorkerState.WORKING
-
-
 # Reading
 
 
@@ -113,7 +100,14 @@ def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None)
     alive = (process is not None and code is None) or is_locked(folder / LOCK_FILE)
     status = read_status(folder)
     cancelled, started = ((folder / name).exists() for name in (CANCEL_FILE, LOG_FILE))
-    state = derive_state(status, alive, cancelled, started)
+    if status is not None and status.state != WorkerState.WORKING:
+        state = WorkerState(status.state)
+    elif not alive:
+        state = WorkerState.LOST if started else WorkerState.NONE
+    elif cancelled:
+        state = WorkerState.CANCELLING
+    else:
+        state = WorkerState.STARTING if status is None else WorkerState.WORKING
     status = status or WorkerStatus()
     if state == WorkerState.LOST:
         error = describe_lost_worker(folder, code)

@@ -32,7 +32,6 @@ from stga_addon.worker.status import (
     WorkerSnapshot,
     WorkerState,
     WorkerStatus,
-    derive_state,
     failure_report,
     inspect_worker,
     log_lines,
@@ -96,33 +95,6 @@ def wait(condition: Callable[[], bool], seconds: float = 20.0) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)
-
-
-@pytest.mark.parametrize(
-    ("state", "alive", "cancel_requested", "started", "expected"),
-    [
-        (None, False, False, False, WorkerState.NONE),
-        (None, False, True, False, WorkerState.NONE),
-        (None, True, False, True, WorkerState.STARTING),
-        (None, True, True, True, WorkerState.CANCELLING),
-        (None, False, False, True, WorkerState.LOST),
-        (WorkerState.WORKING, True, False, True, WorkerState.WORKING),
-        (WorkerState.WORKING, True, True, True, WorkerState.CANCELLING),
-        (WorkerState.WORKING, False, False, True, WorkerState.LOST),
-        (WorkerState.WORKING, False, True, True, WorkerState.LOST),
-        *[
-            (end, alive, cancel_requested, True, end)
-            for end in (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
-            for alive in (False, True)
-            for cancel_requested in (False, True)
-        ],
-    ],
-)
-def test_state_is_derived(state, alive, cancel_requested, started, expected):
-    """Catches a living worker reported as dead, or one that wrote its final status reported as
-    alive."""
-    status = None if state is None else WorkerStatus(state)
-    assert derive_state(status, alive, cancel_requested, started) == expected
 
 
 def test_worker_is_cancelled(start):
