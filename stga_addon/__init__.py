@@ -1,4 +1,3 @@
-"""STGA: selective-training Gaussian head avatars. Importing this package needs nothing but
-Python."""
+"""STGA: selective-training Gaussian head avatars. Importing it needs nothing but Python."""
 
 __version__ = "0.2.0"

@@ -1,5 +1,4 @@
-"""`python -m stga_addon`: the command line, which says in one sentence where this Python lacks a
-package."""
+"""`python -m stga_addon`: the command line; says which package this Python lacks."""
 
 import sys
 

@@ -14,21 +14,16 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class StgaError(Exception):
-    """A failure with a cause outside the code: bad file, bad option, full disk.
-
-    The message is one sentence that names the file, the field and what was expected. The command
-    line prints it and exits with 2; Blender's operators report it; neither shows a traceback.
-    """
+    """A failure with a cause outside the code. Its sentence names file, field and what was
+    expected; the command line prints it and exits with 2, Blender reports it."""
 
     def __init__(self, message: str) -> None:
         super().__init__(one_line(message))
 
 
 class DeviceError(StgaError):
-    """A GPU that failed while it was in use: lost, or out of memory.
-
-    cause  the sentence without --device and the advice
-    """
+    """A GPU that failed in use, lost or out of memory; `cause`: the sentence without --device and
+    advice."""
 
     def __init__(self, cause: str, advice: str) -> None:
         super().__init__(f"--device gpu: {cause}; {advice}")
@@ -36,8 +31,7 @@ class DeviceError(StgaError):
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Of a program that does this work: 0, or 2 after a StgaError, whose sentence goes to
-    stderr."""
+    """Of a program that does this work: 0, or 2 after a StgaError, which goes to stderr."""
     try:
         work()
     except StgaError as error:
@@ -47,8 +41,7 @@ def exit_code(work: Callable[[], object]) -> int:
 
 
 def one_line(message: str) -> str:
-    """The message in bounded length, with control characters and lone surrogates (of a path, say)
-    as escapes."""
+    """The message in bounded length, with control characters and lone surrogates escaped."""
     return _UNPRINTABLE.sub(
         lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS)
     )

@@ -27,19 +27,15 @@ from .errors import StgaError
 MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
-MAX_UNPACKED_BYTES = 4 << 30
-"""Of an npz: a checkpoint of four million splats."""
+MAX_UNPACKED_BYTES = 4 << 30  # Of an npz: a checkpoint of four million splats
 MAX_HEADER_BYTES = 1 << 16
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
-)
-"""Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial"""
+)  # Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial
 RENAME_PATIENCE_S, RENAME_INTERVAL_S = 5.0, 0.1
 """How long, and how often, a rename is tried again while another program has the file open, on
 Windows."""
-WINDOWS_SHARING_ERRORS = (5, 32)
-"""ERROR_ACCESS_DENIED and ERROR_SHARING_VIOLATION: what Windows says of renaming over an open
-file."""
+WINDOWS_SHARING_ERRORS = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION: of an open file
 NewFile = Callable[[Path], AbstractContextManager[Path]]
 SEQUENCE_FILE = ".stga_sequence"
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
@@ -78,7 +74,17 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
             f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
         )
         with _naming(path):
-            _make_folders(path.parent, made_folders)
+            folder = path.parent
+            missing = []
+            try:
+                while not folder.is_dir() and folder != folder.parent:
+                    missing.append(folder)
+                    folder = folder.parent
+                for name in reversed(missing):
+                    name.mkdir(exist_ok=True)
+                    made_folders.append(name)
+            except ValueError as error:  # a null character or a lone surrogate
+                raise OSError(str(error)) from error
             partials[path] = partial
             _create(partial)
             yield partial
@@ -109,38 +115,29 @@ class NumberedFiles:
     """
 
     def __init__(self, folder: Path, names: re.Pattern[str]) -> None:
-        """names: of the files, matched as a whole. Raises StgaError where the folder holds one that
-        is not listed."""
+        """Raises StgaError where the folder holds one of these names that is not listed."""
         self.folder, self._names, self._written = folder, names, dict[str, str]()
         self._list = folder / SEQUENCE_FILE
-        listed = (
-            set(self._list.read_text(errors="replace").splitlines())
-            if self._list.is_file()
-            else set()
-        )
+        text = self._list.read_text(errors="replace") if self._list.is_file() else ""
+        listed = set(text.splitlines())
         with _naming(folder):
             self._earlier = [
                 path for path in self._found() if self._line(path.name, path) in listed
             ]
             other = next((path.name for path in self._found() if path not in self._earlier), None)
         if other is not None:
-            raise StgaError(
-                f"{folder}: holds {other}, which was not written here; choose another folder"
-            )
+            problem = f"holds {other}, which was not written here; choose another folder"
+            raise StgaError(f"{folder}: {problem}")
 
     def add(self, name: str, content: Path) -> None:
-        """List a file before it gets its name; `content` is the complete file under a temporary
-        one."""
+        """List a file before it gets its name; `content`: the whole file, under another one."""
         with _naming(self._list), self._list.open("a") as stream:
             self._written[name] = self._line(name, content)
             stream.write(self._written[name] + "\n")
 
     def finish(self) -> None:
-        """Remove the earlier sequence's files that none of the written ones replaced, where
-        anything was written.
-
-        Raises StgaError where one cannot be removed.
-        """
+        """Remove the earlier sequence's files that none of the written ones replaced, if any was
+        written. Raises StgaError where one stays."""
         if not self._written:
             return
         for path in self._earlier:
@@ -169,8 +166,7 @@ def _naming(path: Path, done: str = "written") -> Iterator[None]:
 
 
 def _once_free(action: Callable[[], None], patience_s: float) -> None:
-    """Call `action`, again and again for `patience_s` while Windows says that another program has
-    the file open."""
+    """Call `action`, again for `patience_s` while Windows says that another program has it open."""
     deadline = time.monotonic() + patience_s
     while True:
         try:
@@ -182,26 +178,9 @@ def _once_free(action: Callable[[], None], patience_s: float) -> None:
             time.sleep(RENAME_INTERVAL_S)
 
 
-def _make_folders(folder: Path, made: list[Path]) -> None:
-    """Make the folder and its parents; append those that were missing to `made`. Raises OSError."""
-    missing = []
-    try:
-        while not folder.is_dir() and folder != folder.parent:
-            missing.append(folder)
-            folder = folder.parent
-        for name in reversed(missing):
-            name.mkdir(exist_ok=True)
-            made.append(name)
-    except ValueError as error:  # a null character or a lone surrogate
-        raise OSError(str(error)) from error
-
-
 def check_writable(path: Path) -> None:
-    """Raise the StgaError of `replacing` where it would not let the file be written; leaves no
-    folder or file behind.
-
-    For work that ends in a file after minutes.
-    """
+    """Raise the StgaError of `replacing` before minutes of work, where the file could not be
+    written; leaves nothing behind."""
     with suppress(_Checked), replacing(path):
         raise _Checked
 
@@ -221,8 +200,7 @@ def _create(partial: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that processes of this computer, killed while writing, left in the
-    folder."""
+    """Remove the temporary files that killed processes of this computer left in the folder."""
     with suppress(OSError):
         for name in os.listdir(folder):
             match = PARTIAL_NAME.fullmatch(name)
@@ -249,22 +227,19 @@ def _is_running(process: int) -> bool:
 
 
 def file_size(path: Path) -> int:
-    """Size in bytes. Raises StgaError where there is no regular file: reading a pipe or a device
-    need never end."""
+    """Size in bytes. Raises StgaError for no regular file: a pipe or a device need never end."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        raise StgaError(
-            f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
-        ) from error
+        problem = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise StgaError(f"{path}: {problem}") from error
     if not stat.S_ISREG(found.st_mode):
         raise StgaError(f"{path}: cannot be read (is not a regular file)")
     return found.st_size
 
 
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """What a file holds. Raises StgaError where it is missing, no regular file or above the
-    limit."""
+    """What a file holds. Raises StgaError where it is no regular file or above the limit."""
     size = file_size(path)
     if size > limit:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
@@ -275,14 +250,12 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """Parse a UTF-8 JSON file. Raises StgaError naming the file where it is missing, malformed or
-    above 256 MiB."""
+    """Parse a UTF-8 JSON file of up to 256 MiB. Raises StgaError naming the file."""
     return _parsed(path, "JSON", MAX_JSON_BYTES, parse_json)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Parse a TOML file. Raises StgaError naming the file where it is missing, malformed or above
-    16 MiB."""
+    """Parse a TOML file of up to 16 MiB. Raises StgaError naming the file."""
     found: dict[str, Any] = _parsed(
         path, "TOML", MAX_TOML_BYTES, lambda data: tomllib.loads(data.decode("utf-8"))
     )
@@ -298,8 +271,7 @@ def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) ->
 
 
 def parse_json(data: bytes) -> Any:
-    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds text that nothing can
-    print."""
+    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds lone surrogates."""
     value = json.loads(data.decode("utf-8"))
     if b"\\u" in data:  # the only way to write a lone surrogate
         json.dumps(value, ensure_ascii=False).encode("utf-8")
@@ -313,19 +285,15 @@ def write_json(path: Path, value: Any, patience_s: float = RENAME_PATIENCE_S) ->
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read every array of an npz without pickle.
-
-    Raises StgaError naming the file where it is missing, truncated, unpacks to more than 4 GiB or
-    holds objects.
-    """
+    """Read every array of an npz without pickle. Raises StgaError where it is missing, truncated,
+    above 4 GiB unpacked, or holds objects."""
     file_size(path)  # refuses pipes, whose reading need never end
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(entry.file_size for entry in archive.infolist())
             if unpacked > MAX_UNPACKED_BYTES:
-                raise StgaError(
-                    f"{path}: unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
-                )
+                problem = f"unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
+                raise StgaError(f"{path}: {problem}")
             return {
                 entry.filename.removesuffix(".npy"): _read_entry(archive, entry)
                 for entry in archive.infolist()
@@ -337,14 +305,12 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:
         # A damaged archive can make its decompressor or the parser of an array header raise nearly
         # anything.
-        raise StgaError(
-            f"{path}: is not a readable npz file ({error or type(error).__name__})"
-        ) from error
+        problem = f"is not a readable npz file ({error or type(error).__name__})"
+        raise StgaError(f"{path}: {problem}") from error
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read the array of a npy file without pickle. Raises StgaError naming the file, as `read_npz`
-    does."""
+    """Read the array of a npy file without pickle. Raises StgaError as `read_npz` does."""
     size = file_size(path)
     try:
         with path.open("rb") as stream:
@@ -352,9 +318,8 @@ def read_npy(path: Path) -> np.ndarray:
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # as above
-        raise StgaError(
-            f"{path}: is not a readable npy file ({error or type(error).__name__})"
-        ) from error
+        problem = f"is not a readable npy file ({error or type(error).__name__})"
+        raise StgaError(f"{path}: {problem}") from error
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
@@ -367,8 +332,7 @@ def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
 
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
-    """The array of a npy stream of `size` bytes; numpy alone would allocate whatever the header
-    promises."""
+    """The array of a npy stream of `size` bytes, which bounds what its header promises."""
     start = stream.read(12).ljust(12, b"\0")
     length = struct.unpack("<H" if start[6] == 1 else "<L", start[8 : 10 if start[6] == 1 else 12])[
         0

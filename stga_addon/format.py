@@ -42,29 +42,20 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
     loss = ("loss", "loss {:.4f}")
     quality: tuple[tuple[tuple[str, str], ...], ...] = ((("psnr", "PSNR {:.2f} dB"), loss),)
     if "psnr_unmatched" in figures:
-        quality = (
-            (("psnr", "PSNR {:.2f} dB (exposure fitted)"), ("psnr_unmatched", "{:.2f} dB without")),
-            (loss,),
-        )
+        matched = ("psnr", "PSNR {:.2f} dB (exposure fitted)")
+        quality = ((matched, ("psnr_unmatched", "{:.2f} dB without")), (loss,))
     pairs = (
-        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
-        *quality,
-        (
-            ("error_px", "{:.1f} px off landmarks"),
-            ("unexplained", "{:.0%} of the face unexplained"),
-        ),
+        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")), *quality,
+        (("error_px", "{:.1f} px off landmarks"),
+         ("unexplained", "{:.0%} of the face unexplained")),
         (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
-    )
+    )  # fmt: skip
     lines = []
     for pair in pairs:
-        known = [
-            (text, figures[name], name)
-            for name, text in pair
-            if figures.get(name) and not math.isnan(figures[name])
-        ]
-        parts = [
-            text.format(format_duration(value) if name == "left_s" else value)
-            for text, value, name in known
-        ]
+        parts = []
+        for name, text in pair:
+            value = figures.get(name)
+            if value and not math.isnan(value):
+                parts.append(text.format(format_duration(value) if name == "left_s" else value))
         lines.append("   ".join(parts).replace(",", "\u202f"))
     return [line for line in lines if line]

@@ -1,5 +1,4 @@
-"""Fields of dataclasses as options: of the command line here, of Blender's operators in
-`operators/options.py`."""
+"""Fields of dataclasses as options: of the command line; of Blender in `operators/options.py`."""
 
 import dataclasses
 import errno
@@ -17,25 +16,16 @@ from .schema import alternatives, expectation, setting, type_hints
 
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
-MAX_DIGITS = 18
-"""Of a whole number on the command line, which fits 64 bits."""
+MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
 
 
 def option(
-    help: str,
-    default: Any = dataclasses.MISSING,
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    *,
-    flag: str = "",
-    metavar: str = "",
-    parse: Callable[[str], Any] | None = None,
-    bare: Any = None,
-    offered: Collection[str] | None = None,
-    group: str = "",
-    needs: tuple[str | tuple[str, ...], ...] = (),
-    **limits: Any,
-) -> Any:
+    help: str, default: Any = dataclasses.MISSING, minimum: float = -math.inf,
+    maximum: float = math.inf, *, flag: str = "", metavar: str = "",
+    parse: Callable[[str], Any] | None = None, bare: Any = None,
+    offered: Collection[str] | None = None, group: str = "",
+    needs: tuple[str | tuple[str, ...], ...] = (), **limits: Any,
+) -> Any:  # fmt: skip
     """A dataclass field that people choose, with its limits (`schema.setting`).
 
     help     what it is, for command line and tooltip; of a field that is a dataclass, the title of
@@ -48,15 +38,8 @@ def option(
     group    options of one group exclude each other
     needs    fields that have to be given with it, else it has no effect; of a tuple, one
     """
-    asked = {
-        "help": help,
-        "flag": flag,
-        "metavar": metavar,
-        "parse": parse,
-        "bare": bare,
-        "group": group,
-    }
-    asked |= {"needs": needs, "offered": offered or limits.get("choices")}
+    asked = {"help": help, "flag": flag, "metavar": metavar, "parse": parse, "bare": bare}
+    asked |= {"group": group, "needs": needs, "offered": offered or limits.get("choices")}
     return setting(default, minimum, maximum, **limits, **asked)
 
 
@@ -81,11 +64,8 @@ def option_fields(kind: Any) -> Iterator[Any]:
 
 
 def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] = ()) -> None:
-    """Add an argument for each field of a dataclass that is an option, those of its dataclasses in
-    groups.
-
-    names: some of the fields; none: all. may_lack: fields without a default that need not be given.
-    """
+    """Add an argument for each option of a dataclass, or those of `names`; its dataclasses are
+    groups. may_lack: fields without a default that need not be given."""
     hints, groups = type_hints(kind), {"": parser}
     for spec in option_fields(kind):
         hint, asked = hints[spec.name], spec.metadata
@@ -96,18 +76,17 @@ def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] =
             continue
         if asked["group"] not in groups:
             groups[asked["group"]] = parser.add_mutually_exclusive_group()
-        is_required = not _has_default(spec) and spec.name not in may_lack
+        has_default = {spec.default, spec.default_factory} != {dataclasses.MISSING}
+        is_required = not has_default and spec.name not in may_lack
         form = {"help": _help(spec), "default": None, **_form(spec, hint, is_required)}
         groups[asked["group"]].add_argument(*form.pop("names"), **form)
 
 
 def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
     """What `add_argument` takes for a field, by its type."""
-    (kind,), asked, flag = (
-        (k for k in alternatives(hint) if k is not NoneType),
-        spec.metadata,
-        flag_of(spec),
-    )
+    (kind,) = (k for k in alternatives(hint) if k is not NoneType)
+    asked = spec.metadata
+    flag = flag_of(spec)
     is_named = flag.startswith("-")
     form: dict[str, Any] = {"names": (flag,), "dest": spec.name, "required": is_required}
     if not is_named:
@@ -125,12 +104,6 @@ def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
         return {**form, "choices": tuple(asked["offered"])}
     form["type"] = _parser(get_args(kind)[0] if several else kind, asked)
     return {**form, "metavar": asked["metavar"]} if asked["metavar"] else form
-
-
-def _has_default(spec: Any) -> bool:
-    return (
-        spec.default is not dataclasses.MISSING or spec.default_factory is not dataclasses.MISSING
-    )
 
 
 def _help(spec: Any) -> str:
@@ -158,18 +131,14 @@ def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
         if value is None:
             continue
         if isinstance(value, list):
-            value = (
-                dict(value)
-                if any(get_origin(part) is Mapping for part in alternatives(hint))
-                else tuple(value)
-            )
+            is_mapping = any(get_origin(part) is Mapping for part in alternatives(hint))
+            value = dict(value) if is_mapping else tuple(value)
         found[spec.name] = value
     return found
 
 
 def refuse_useless(value: Any) -> None:
-    """Raise StgaError for the first option of a dataclass that has no effect without another
-    (`needs`)."""
+    """Raise StgaError for the first option without effect, by its `needs`."""
     specs = {spec.name: spec for spec in dataclasses.fields(value)}
     for spec in option_fields(type(value)):
         for needed in spec.metadata["needs"] if _is_changed(value, spec) else ():
@@ -287,5 +256,4 @@ _CONVERSIONS: dict[Any, Callable[[str], Any]] = {
     float: _number,
     tuple[int, int]: frame_span,
     tuple[float, float, float]: color,
-}
-"""Type of a field -> what reads its values; what it cannot read, `schema.expectation` refuses."""
+}  # Type of a field -> what reads its values; what it cannot read, `schema.expectation` refuses

@@ -12,11 +12,8 @@ import numpy as np
 
 Item = TypeVar("Item")
 
-PACE_SHARE = 0.1
-"""Share of the work, the last that was done, whose pace says how much time is left."""
-MAX_STEP_SHARE = 0.03
-"""Of the work in a step, beyond which it was done before, by what was interrupted, and says nothing
-of the pace."""
+PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
+MAX_STEP_SHARE = 0.03  # Of a step; beyond, an interrupted call had done it before
 
 
 @dataclass(frozen=True)
@@ -41,8 +38,7 @@ class Progress:
 
 Report = Callable[[Progress], bool]
 """Called now and then; returns True to stop and keep what there is."""
-Say = Callable[[str], None]
-"""Called with a line for people."""
+Say = Callable[[str], None]  # Called with a line for people
 
 
 class TimeLeft:
@@ -79,11 +75,8 @@ def ignore(progress: Progress) -> bool:
 def counted(
     items: Iterable[Item], total: int, report: Report, stage: str, unit: str
 ) -> Iterator[Item]:
-    """The items, of which each is reported when the next one is asked for; unit: what one of them
-    is called.
-
-    Raises Cancelled where the report says to stop.
-    """
+    """The items, each reported as `unit` when the next one is asked for. Raises Cancelled where the
+    report says to stop."""
     report(Progress(stage=stage))
     for number, item in enumerate(items, 1):
         yield item

@@ -1,5 +1,4 @@
-"""What is shown of a run: the lines of its summary, and its accuracy curve by matplotlib and, for
-Blender, by numpy."""
+"""What is shown of a run: its summary, and its curve by matplotlib and, for Blender, by numpy."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -37,9 +36,7 @@ CURVE = "curve.png"
 MAX_DRAWING_SHARE = 0.01
 """Largest share of the time that drawing the curve may take while a run trains."""
 
-FIRST_DRAWING_S = 30.0
-"""Seconds until the first: loading the library takes a few, while the user waits for the first
-preview."""
+FIRST_DRAWING_S = 30.0  # Until the first: loading the library takes a few
 
 
 class CurveUpdater:
@@ -64,8 +61,7 @@ class CurveUpdater:
 
 
 def write_curve(folder: Path) -> None:
-    """Write curve.png of the run in `folder`, if there is an evaluation to draw and matplotlib to
-    draw it."""
+    """Write curve.png of the run in `folder`, with an evaluation to draw and matplotlib."""
     metrics = read_metrics(folder)
     if curve_of(metrics) and find_spec("matplotlib") is not None:
         with replacing(folder / CURVE) as partial:
@@ -77,24 +73,19 @@ def report_run(folder: Path) -> list[str]:
     write_curve(folder)
     run, metrics = read_run(folder), read_metrics(folder)
     continued = run.continuation is not None
-    lines = (
-        summarize_continuation(metrics)
-        if continued
-        else summarize_run(metrics, run.settings.target_psnr)
-    )
+    lines = summarize_run(metrics, run.settings.target_psnr)
+    if continued:
+        lines = summarize_continuation(metrics)
     if (folder / CURVE).exists():
         return lines
-    reason = (
-        "matplotlib is not installed"
-        if curve_of(metrics)
-        else "no held-out views (split 'val') were evaluated"
-    )
+    reason = "no held-out views (split 'val') were evaluated"
+    if curve_of(metrics):
+        reason = "matplotlib is not installed"
     return [*lines, f"{CURVE} was not drawn: {reason}"]
 
 
 def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
-    """Lines on accuracy, the target (dB), checked forecasts, and the cost of evaluation and
-    memory."""
+    """Lines on accuracy, target (dB), checked forecasts, and cost of evaluation and memory."""
     if not metrics:
         return []
     lines, curve, last = [], curve_of(metrics), metrics[-1]
@@ -124,45 +115,30 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     if checked:
         lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
-    lines.append(
-        f"evaluation took {evaluation_share(metrics):.1%} of the training time, in addition to it{memory}"
-    )
-    return lines
+    share = f"{evaluation_share(metrics):.1%} of the training time"
+    return [*lines, f"evaluation took {share}, in addition to it{memory}"]
 
 
 def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Lines on the accuracy of the avatar before and after, by region and group of held-out
-    views."""
+    """Lines on the accuracy before and after, by region and group of held-out views."""
     if not metrics:
         return []
     first, last = metrics[0], metrics[-1]
     lines = [f"splats: {first['splats']} before, {last['splats']} after"]
-    for name, label in _labels(first).items():
+    fitted = " (exposure fitted)" if UNMATCHED in first else ""
+    all_views = {"psnr": f"held-out views{fitted}"}
+    all_views[UNMATCHED] = "held-out views (exposure not fitted)"
+    parts = [name for name in first if name.startswith("psnr_") and name != UNMATCHED]
+    for name in (*(name for name in all_views if name in first), *parts):
+        label = all_views.get(name, name.removeprefix("psnr_").replace("_", " ") + fitted)
         before, after = first[name], last.get(name, math.nan)
-        lines.append(
-            f"{label}: {before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})"
-        )
+        change = f"{before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})"
+        lines.append(f"{label}: {change}")
     return lines
 
 
-def _labels(line: Mapping[str, Any]) -> dict[str, str]:
-    """Each PSNR of a metrics line -> what it is called: of all held-out views, then by region and
-    group."""
-    fitted = " (exposure fitted)" if UNMATCHED in line else ""
-    labels = {name: f"held-out views{fitted}" for name in ("psnr",) if name in line}
-    if UNMATCHED in line:
-        labels[UNMATCHED] = "held-out views (exposure not fitted)"
-    parts = [
-        name.removeprefix("psnr_")
-        for name in line
-        if name.startswith("psnr_") and name != UNMATCHED
-    ]
-    return {**labels, **{f"psnr_{part}": part.replace("_", " ") + fitted for part in parts}}
-
-
 def evaluation_share(lines: Sequence[Mapping[str, Any]]) -> float:
-    """Seconds of evaluation during training over seconds of training; the final evaluation does not
-    count."""
+    """Seconds of evaluation during training, the final one left out, over those of training."""
     spent: float = sum(line["evaluation_s"] for line in lines[:-1])
     return spent / max(float(lines[-1]["seconds"]), 1e-9)
 
@@ -174,9 +150,8 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#78
 
 
 def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
-    """PSNR of one run in the whole image, the head mask and the moving region, with the latest
-    forecast; and the detail difference, by which the avatar is kept, on an axis of its own with the
-    best at the top."""
+    """PSNR of a run in image, head mask and moving region, its latest forecast, and the detail
+    difference, the best at the top."""
     fitted = " (exposure fitted)" if is_exposure_fitted(metrics) else ""
     figure, axes = psnr_axes(f"PSNR{fitted} and detail difference on held-out views")
     keys = {"whole image": "psnr", "head mask": "psnr_mask", "moving region": "psnr_moving"}
@@ -221,8 +196,7 @@ def psnr_axes(title: str) -> tuple["Figure", "Axes"]:
 
 
 def finish_axes(axes: "Axes") -> None:
-    """Add the legend and cut off the steep start: the axis begins at the lowest value after a tenth
-    of the time."""
+    """Add the legend and cut off the steep start, at the lowest value after a tenth of the time."""
     curves = [np.asarray(line.get_xydata()).T for line in axes.lines]
     curves = [curve for curve in curves if curve.size]
     if not curves:
@@ -237,14 +211,12 @@ def finish_axes(axes: "Axes") -> None:
 
 # The curve in Blender's panel: its Python need not have matplotlib or Pillow
 
-SIZE = 256
-"""Width and height in pixels: Blender's icons are square."""
+SIZE = 256  # Width and height in pixels: Blender's icons are square
 MARGIN = 6.0
 LINE_WIDTH = 3.0
 BACKGROUND_COLOR, GRID_COLOR = (0.11, 0.11, 0.11), (0.25, 0.25, 0.25)
 CURVE_COLOR, FORECAST_COLOR, DETAIL_COLOR = (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45)
-BAND_OPACITY = 0.35
-"""Of the band that shows a forecast's error."""
+BAND_OPACITY = 0.35  # Of the band that shows a forecast's error
 GRID_STEPS_DB = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """The first step is used that gives at most MAX_GRID_STEPS."""
 MAX_GRID_STEPS = 6
@@ -292,8 +264,7 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
 def _draw_detail(
     plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]
 ) -> str:
-    """Draw the detail difference, scaled to the height in dB from a tenth of the time on; returns
-    its range as text."""
+    """Draw the detail difference, scaled to the height in dB; returns its range as text."""
     seconds, detail = np.array(detail_curve(lines), np.float64).reshape(-1, 2).T
     if len(detail) < 2:
         return ""
@@ -317,8 +288,7 @@ class _Plot:
         self.pixels[self._rows(y).astype(int), :, :3] = GRID_COLOR
 
     def line(self, x: np.ndarray, y: np.ndarray, color: Color) -> None:
-        """Antialiased by the distance of each pixel's center to the line segment in the pixel's
-        column."""
+        """Antialiased by the distance of pixels' centers to the segment in their column."""
         seconds, inside = self._columns(x)
         height = np.interp(seconds, x, self._rows(y))
         slope = np.gradient(height)

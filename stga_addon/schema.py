@@ -14,30 +14,21 @@ import numpy as np
 
 from .errors import StgaError, shorten
 
-MAX_COUNT = (1 << 31) - 1
-"""Largest whole number that kernels can count to."""
-KIND = "kind"
-"""Key that names the dataclass where a field may hold one of several."""
-ARRAY = "array"
-"""Key of an array's place in JSON: its name among the arrays beside it."""
-IS_PATH = "is_path"
-"""Key of a field's metadata: of `setting`."""
+MAX_COUNT = (1 << 31) - 1  # Largest whole number that kernels can count to
+KIND = "kind"  # Key that names the dataclass where a field may hold one of several
+ARRAY = "array"  # Key of an array's place in JSON: its name among the arrays beside it
+IS_PATH = "is_path"  # Key of a field's metadata: of `setting`
 
 Arrays = dict[str, np.ndarray]
 
 
 def setting(
-    default: Any = dataclasses.MISSING,
-    minimum: float = -math.inf,
-    maximum: float = math.inf,
-    above: float = -math.inf,
-    choices: Collection[str] | None = None,
-    accepts: Callable[[Any], bool] | None = None,
-    expected: str = "",
-    is_path: Callable[[str], bool] | None = None,
-    default_factory: Any = dataclasses.MISSING,
+    default: Any = dataclasses.MISSING, minimum: float = -math.inf, maximum: float = math.inf,
+    above: float = -math.inf, choices: Collection[str] | None = None,
+    accepts: Callable[[Any], bool] | None = None, expected: str = "",
+    is_path: Callable[[str], bool] | None = None, default_factory: Any = dataclasses.MISSING,
     **option: Any,
-) -> Any:
+) -> Any:  # fmt: skip
     """A dataclass field with its allowed values; the bounds hold for each number of a tuple.
 
     minimum, maximum  inclusive; above: exclusive lower bound
@@ -47,14 +38,8 @@ def setting(
     is_path           whether a text is that of a path, where it can be a name as well
     option            what the command line and Blender ask for it with (`options.option`)
     """
-    limits = {
-        "minimum": minimum,
-        "maximum": maximum,
-        "above": above,
-        "choices": choices,
-        "accepts": accepts,
-    }
-    metadata = {**limits, "expected": expected, IS_PATH: is_path, **option}
+    limits = {"minimum": minimum, "maximum": maximum, "above": above, "choices": choices}
+    metadata = {**limits, "accepts": accepts, "expected": expected, IS_PATH: is_path, **option}
     if default_factory is not dataclasses.MISSING:
         return field(default_factory=default_factory, metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -124,11 +109,28 @@ def expectation(value: Any, hint: Any, limits: Mapping[str, Any]) -> str | None:
 def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | None:
     origin = get_origin(kind) or kind
     if origin is tuple:
-        return _expected_items(value, get_args(kind), limits)
+        hints = get_args(kind)
+        size = None if hints[-1] is Ellipsis else len(hints)
+        if not isinstance(value, tuple) or size not in (None, len(value)):
+            return "a tuple" if size is None else f"a tuple of {size}"
+        found = (expectation(item, hints[0], limits) for item in value)
+        return next((f"a tuple, each item {text}" for text in found if text is not None), None)
     if origin in (dict, Mapping):
         return _expected_mapping(value, get_args(kind), limits)
     if kind in (int, float):
-        return _expected_number(value, kind, limits)
+        low, high, above = (limits.get(name, end) for name, end in _UNBOUNDED.items())
+        if kind is int:
+            fits = isinstance(value, int)
+        else:
+            fits = isinstance(value, float) and math.isfinite(value)
+            fits = fits or (isinstance(value, int) and abs(value) <= MAX_COUNT)
+        if fits and not isinstance(value, bool) and low <= value <= high and value > above:
+            return None
+        bounds = (
+            [f"above {above}"] if above > -math.inf else [f"from {low}"] if low > -math.inf else []
+        )
+        bounds += [f"up to {high}"] if high < math.inf else []
+        return " ".join(["a whole number" if kind is int else "a finite number", *bounds])
     choices = limits.get("choices")
     if kind is str and choices is not None:
         return (
@@ -140,14 +142,6 @@ def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | No
     )
 
 
-def _expected_items(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
-    size = None if hints[-1] is Ellipsis else len(hints)
-    if not isinstance(value, tuple) or size not in (None, len(value)):
-        return "a tuple" if size is None else f"a tuple of {size}"
-    found = (expectation(item, hints[0], limits) for item in value)
-    return next((f"a tuple, each item {text}" for text in found if text is not None), None)
-
-
 def _expected_mapping(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
     if not isinstance(value, Mapping):
         return "an object of Mapping"
@@ -156,20 +150,6 @@ def _expected_mapping(value: Any, hints: tuple[Any, ...], limits: Mapping[str, A
         for key, item in value.items()
     )
     return None if fits else "texts by name" if hints == (str, str) else "values by name"
-
-
-def _expected_number(value: Any, kind: type, limits: Mapping[str, Any]) -> str | None:
-    low, high, above = (limits.get(name, end) for name, end in _UNBOUNDED.items())
-    if kind is int:
-        fits = isinstance(value, int)
-    else:
-        fits = isinstance(value, float) and math.isfinite(value)
-        fits = fits or (isinstance(value, int) and abs(value) <= MAX_COUNT)
-    if fits and not isinstance(value, bool) and low <= value <= high and value > above:
-        return None
-    bounds = [f"above {above}"] if above > -math.inf else [f"from {low}"] if low > -math.inf else []
-    bounds += [f"up to {high}"] if high < math.inf else []
-    return " ".join(["a whole number" if kind is int else "a finite number", *bounds])
 
 
 _UNBOUNDED = {"minimum": -math.inf, "maximum": math.inf, "above": -math.inf}
@@ -191,12 +171,10 @@ def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None) -> Any:
 def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
     if dataclasses.is_dataclass(value):
         hints = type_hints(type(value))  # type: ignore[arg-type]
-        fields = {
-            spec.name: _plain(
-                getattr(value, spec.name), hints[spec.name], arrays, _joined(name, spec.name)
-            )
-            for spec in dataclasses.fields(value)
-        }
+        fields = {}
+        for spec in dataclasses.fields(value):
+            found, path = getattr(value, spec.name), _joined(name, spec.name)
+            fields[spec.name] = _plain(found, hints[spec.name], arrays, path)
         several = sum(dataclasses.is_dataclass(kind) for kind in alternatives(hint)) > 1
         return {KIND: type(value).__name__, **fields} if several else fields
     if isinstance(value, np.ndarray):
@@ -239,14 +217,29 @@ def from_json(
 
 
 def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray]) -> Any:
-    """The value in the types of the hint where it has their form; else as it is, for `validate` to
-    name."""
+    """The value in the types of the hint, or as it is, for `validate` to name."""
     kinds = [kind for kind in alternatives(hint) if kind is not types.NoneType]
-    classes = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
+    classes: list[Any] = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
     if isinstance(value, dict) and ARRAY in value and np.ndarray in kinds:
         return arrays.get(value[ARRAY]) if isinstance(value[ARRAY], str) else None
     if classes and (value is not None or len(kinds) == len(alternatives(hint))):
-        return _parsed_dataclass(classes, value, where, arrays)
+        chosen: Any = classes[0]
+        if len(classes) > 1:
+            names: dict[str, Any] = {each.__name__: each for each in classes}
+            named = value.get(KIND) if isinstance(value, dict) else None
+            if not isinstance(named, str) or named not in names:
+                expected = f"one of {', '.join(names)}"
+                raise StgaError(complaint(_joined(where, KIND), expected, named))
+            chosen = names[named]
+            value = {name: item for name, item in value.items() if name != KIND}
+        hints = type_hints(chosen)
+        if not isinstance(value, dict) or value.keys() != hints.keys():
+            differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
+            fields = ", ".join(sorted(map(str, differing)))[:200]
+            prefix = f"{where}: " if where else ""
+            raise StgaError(f"{prefix}fields are missing or unknown ({fields})")
+        paths = {name: _joined(where, name) for name in hints}
+        return chosen(**{n: _parsed(hints[n], value[n], paths[n], arrays) for n in hints})
     if isinstance(value, str) and Path in kinds and str not in kinds:
         return Path(value)
     if isinstance(value, list):
@@ -257,40 +250,12 @@ def _parsed(hint: Any, value: Any, where: str, arrays: Mapping[str, np.ndarray])
         )
     mappings = [get_args(kind) for kind in kinds if get_origin(kind) in (dict, Mapping)]
     if isinstance(value, dict) and mappings:
-        return _parsed_mapping(mappings[0], value, where, arrays)
-    return value
-
-
-def _parsed_mapping(
-    hints: Any, value: dict[str, Any], where: str, arrays: Mapping[str, np.ndarray]
-) -> Any:
-    for key in value:
-        if hints[0] is int and not re.fullmatch(r"-?\d{1,15}", key, re.ASCII):
-            raise StgaError(complaint(where, "whole numbers as names", key))
-    return {
-        hints[0](key): _parsed(hints[1], item, _joined(where, key), arrays)
-        for key, item in value.items()
-    }
-
-
-def _parsed_dataclass(
-    classes: list[Any], value: Any, where: str, arrays: Mapping[str, np.ndarray]
-) -> Any:
-    kind = classes[0]
-    if len(classes) > 1:
-        names = {cls.__name__: cls for cls in classes}
-        named = value.get(KIND) if isinstance(value, dict) else None
-        if not isinstance(named, str) or named not in names:
-            raise StgaError(complaint(_joined(where, KIND), f"one of {', '.join(names)}", named))
-        kind, value = names[named], {name: item for name, item in value.items() if name != KIND}
-    hints = type_hints(kind)
-    if not isinstance(value, dict) or value.keys() != hints.keys():
-        differing = hints.keys() ^ (value.keys() if isinstance(value, dict) else {})
-        fields = ", ".join(sorted(map(str, differing)))[:200]
-        raise StgaError(f"{where}{': ' if where else ''}fields are missing or unknown ({fields})")
-    return kind(
-        **{
-            name: _parsed(hint, value[name], _joined(where, name), arrays)
-            for name, hint in hints.items()
+        key_hint, item_hint = mappings[0]
+        for key in value:
+            if key_hint is int and not re.fullmatch(r"-?\d{1,15}", key, re.ASCII):
+                raise StgaError(complaint(where, "whole numbers as names", key))
+        return {
+            key_hint(key): _parsed(item_hint, item, _joined(where, key), arrays)
+            for key, item in value.items()
         }
-    )
+    return value

@@ -1,5 +1,4 @@
-"""Selection of the triangles that move in a timestep, whose splats it trains (STGA, selective
-training)."""
+"""Selection of the triangles that move in a timestep, whose splats it trains."""
 
 import math
 from collections.abc import Mapping
@@ -37,22 +36,17 @@ class SelectionOptions:
 
     def __post_init__(self) -> None:
         if not (isinstance(self.threshold, int | float) and 0 <= self.threshold < math.inf):
-            raise StgaError(
-                f"selection threshold must be a distance in meters, got {shorten(self.threshold)}"
-            )
+            problem = f"got {shorten(self.threshold)}"
+            raise StgaError(f"selection threshold must be a distance in meters, {problem}")
         if self.zero_pose not in ZERO_POSES:
-            raise StgaError(
-                f"zero_pose is {shorten(self.zero_pose)}, expected one of {', '.join(ZERO_POSES)}"
-            )
+            expected = f"expected one of {', '.join(ZERO_POSES)}"
+            raise StgaError(f"zero_pose is {shorten(self.zero_pose)}, {expected}")
 
 
 def select_faces(
-    mesh: np.ndarray,
-    neutral: np.ndarray,
-    faces: np.ndarray,
-    regions: Mapping[str, np.ndarray],
+    mesh: np.ndarray, neutral: np.ndarray, faces: np.ndarray, regions: Mapping[str, np.ndarray],
     threshold: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """(F,) bool: the triangles whose splats this frame trains.
 
     mesh, neutral (V, 3) meters without rigid head motion; faces (F, 3); regions name -> (F,) bool.
@@ -70,8 +64,7 @@ def select_faces(
 
 
 def select_capture(capture: Capture, options: SelectionOptions) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool for every timestep; a selection that comes with the capture takes
-    precedence."""
+    """timestep -> (F,) bool of every timestep; a capture's own selection takes precedence."""
     regions = {name: capture.regions[name] for name in options.regions if name in capture.regions}
     chosen = {}
     for timestep in capture.timesteps:

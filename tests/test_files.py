@@ -191,7 +191,10 @@ with replacing(Path(sys.argv[1])) as partial:
     partial.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
-WRITE = "import sys; from pathlib import Path; from stga_addon.files import write_json; write_json(Path(sys.argv[1]), 1)"
+WRITE = """
+import sys; from pathlib import Path; from stga_addon.files import write_json
+write_json(Path(sys.argv[1]), 1)
+"""
 
 
 def run(code: str, path: Path) -> int:

@@ -55,10 +55,11 @@ def test_what_is_given_reaches_its_field() -> None:
     """Catches an option that is lost, of another type or in another field, and a default that hides
     the dataclass's."""
     assert Drawing(**parsed()) == Drawing(Path("a.png"), Path("b"))
-    line = "--count 4 --time 1m --style bold --turn --frames 2-7 --color 0,1,0.5 --tones dark --tones light"
-    more = "--shifts left=3 --shifts x=1 --shaded --again 3 --width 4"
+    line = "--count 4 --time 1m --style bold --turn --frames 2-7 --color 0,1,0.5"
+    more = "--tones dark --tones light --shifts left=3 --shifts x=1 --shaded --again 3 --width 4"
     assert Drawing(**parsed(*line.split(), *more.split())) == Drawing(
-        Path("a.png"), Path("b"), 4, 60.0, None, "bold", 0.0, (2, 7), (0.0, 1.0, 0.5), ("dark", "light"),
+        Path("a.png"), Path("b"), 4, 60.0, None, "bold", 0.0, (2, 7), (0.0, 1.0, 0.5),
+        ("dark", "light"),
         {"left": 3, "x": 1}, True, 3.0, Frame(4.0),
     )  # fmt: skip
 
@@ -78,9 +79,7 @@ def test_what_is_given_reaches_its_field() -> None:
         ("--hidden 3", "unrecognized arguments: --hidden 3"),
     ],
 )
-def test_values_without_meaning(
-    words: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_values_without_meaning(words, message, capsys):
     """Catches limits that the command line does not know, and a refusal that does not name the
     option."""
     with pytest.raises(SystemExit, match="2"):

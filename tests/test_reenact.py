@@ -31,25 +31,16 @@ def parts(tmp_path: Path) -> dict[str, Path]:
     pose, expr = rng.normal(0, 0.3, (2, 15)), rng.normal(size=(2, 2))
     np.savez(tmp_path / "other.npz", expr=expr, pose=pose, shape=np.full(4, 2.0))
     return {
-        "avatar": tmp_path / "a.npz",
-        "model": model,
-        "motion": tmp_path / "other.npz",
-        "cameras": folder / "transforms_train.json",
-        "capture": folder,
-    }
+        "avatar": tmp_path / "a.npz", "model": model, "motion": tmp_path / "other.npz",
+        "cameras": folder / "transforms_train.json", "capture": folder,
+    }  # fmt: skip
 
 
 def render(parts: dict[str, Path], out: Path, *more: object) -> int:
     arguments = [
-        "render",
-        parts["avatar"],
-        "--cameras",
-        parts["cameras"],
-        "--motion",
-        parts["motion"],
-        "--out",
-        out,
-    ]
+        "render", parts["avatar"], "--cameras", parts["cameras"], "--motion", parts["motion"],
+        "--out", out,
+    ]  # fmt: skip
     return main([str(a) for a in [*arguments, *more]])
 
 
@@ -83,9 +74,7 @@ def test_the_other_person_moves_the_avatar(parts: dict[str, Path], tmp_path: Pat
     )
 
 
-def test_mistakes(
-    parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes(parts, tmp_path, capsys):
     """Catches tracebacks for what a person gets wrong first."""
     assert render(parts, tmp_path / "out") == 2
     assert "give the FLAME model file" in capsys.readouterr().err

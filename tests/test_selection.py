@@ -92,17 +92,11 @@ def capture(given_selection: dict[int, np.ndarray], asked: list[tuple[int, str]]
         return moved({timestep: 0.03})
 
     return Capture(
-        root=Path(),
-        layout="test",
-        faces=FACES,
-        neutral=NEUTRAL,
-        views={},
-        timesteps=(1, 4, 6),
+        root=Path(), layout="test", faces=FACES, neutral=NEUTRAL, views={}, timesteps=(1, 4, 6),
         regions={"mouth": region(1, 2), "ears": region(3, 4, 5)},
         mesh=lambda timestep: pytest.fail("selection must not look at the mesh with head motion"),
-        expression_mesh=expression_mesh,
-        given_selection=given_selection,
-    )
+        expression_mesh=expression_mesh, given_selection=given_selection,
+    )  # fmt: skip
 
 
 def numbers(chosen: dict[int, np.ndarray]) -> dict[int, list[int]]:
@@ -124,11 +118,7 @@ def test_selection_that_came_with_the_capture_wins():
     asked: list[tuple[int, str]] = []
     given = {4: region(0, 7), 6: region()}
     chosen = select_capture(capture(given, asked), SelectionOptions(threshold=THRESHOLD))
-    assert numbers(chosen) == {
-        1: [1, 2],
-        4: [0, 7],
-        6: [],
-    }
+    assert numbers(chosen) == {1: [1, 2], 4: [0, 7], 6: []}
     assert asked == [(1, "head")]
 
 

@@ -27,28 +27,11 @@ HEAVY = {"torch", "numba", "wgpu"}
 TRAININGS = ("stga_addon/raster/", "stga_addon/training/")
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
-    {"errors", "__version__"},
-    {"files", "format", "schema"},
-    {"options", "progress"},
-    {"worker"},
-    {"flame"},
-    {"capture"},
-    {"avatar", "selection"},
-    {"raster"},
-    {"light"},
-    {"export"},
-    {"render"},
-    {"tracking"},
-    {"driving"},
-    {"training"},
-    {"report"},
-    {"jobs"},
-    {"batch"},
-    {"scene"},
-    {"cli"},
-    {"development"},
-    {"__main__", "__init__"},
-)
+    {"errors", "__version__"}, {"files", "format", "schema"}, {"options", "progress"}, {"worker"},
+    {"flame"}, {"capture"}, {"avatar", "selection"}, {"raster"}, {"light"}, {"export"}, {"render"},
+    {"tracking"}, {"driving"}, {"training"}, {"report"}, {"jobs"}, {"batch"}, {"scene"}, {"cli"},
+    {"development"}, {"__main__", "__init__"},
+)  # fmt: skip
 NAMED_WHERE_THERE = dict.fromkeys(
     ("stga_addon/cli/main.py", "stga_addon/jobs/perform.py", "stga_addon/jobs/table.py"),
     "development",
@@ -56,20 +39,9 @@ NAMED_WHERE_THERE = dict.fromkeys(
 """Files that name modules of a room after their own, because the extension's zip leaves that room
 out."""
 LIGHT = (
-    "errors",
-    "files",
-    "flame",
-    "capture",
-    "capture.open",
-    "avatar",
-    "avatar.file",
-    "export.ply",
-    "selection",
-    "jobs.folder",
-    "jobs.perform",
-    "jobs.monitor_state",
-    "jobs.python_check",
-)
+    "errors", "files", "flame", "capture", "capture.open", "avatar", "avatar.file", "export.ply",
+    "selection", "jobs.folder", "jobs.perform", "jobs.monitor_state", "jobs.python_check",
+)  # fmt: skip
 
 
 def name_of(path: Path) -> str:
@@ -273,7 +245,8 @@ BLOCKED = """
 import sys
 class Block:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "bpy", "smplx"}:
+        if name.split(".")[0] in {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm",
+            "bpy", "smplx"}:
             raise ModuleNotFoundError(f"blocked: {name}", name=name)
 sys.meta_path.insert(0, Block())
 import importlib

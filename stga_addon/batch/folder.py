@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator, Set
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from filelock import SoftFileLease
@@ -71,9 +72,8 @@ def _input_digest(path: Path, written: Set[str]) -> str:
         else:
             lines = [_line(path.name, path.stat())]
     except OSError as error:
-        raise StgaError(
-            f"{error.filename or path}: cannot be read ({error.strerror or error})"
-        ) from error
+        problem = f"cannot be read ({error.strerror or error})"
+        raise StgaError(f"{error.filename or path}: {problem}") from error
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
 
 
@@ -99,20 +99,16 @@ JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
 
 @contextmanager
 def hold_folder(folder: Path) -> Iterator[SoftFileLease]:
-    """Hold a batch's folder, which is made; one batch works in it, whichever machine it is started
-    on.
-
-    Raises StgaError while another batch works in it.
-    """
+    """Hold a batch's folder, which is made, on whichever machine. Raises StgaError while another
+    batch works in it."""
     path = folder / LOCK
     with ExitStack() as held:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             lease = held.enter_context(hold_lock(path, leased=True))
         except BlockingIOError as error:
-            raise StgaError(
-                f"{folder}: another batch is working in this folder (process {lock_owner(path)})"
-            ) from error
+            problem = f"another batch is working in this folder (process {lock_owner(path)})"
+            raise StgaError(f"{folder}: {problem}") from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         assert lease is not None
@@ -146,10 +142,7 @@ def read_record(job: Job) -> JobRecord | None:
     """None where the job was never prepared, or by another version."""
     try:
         values = read_json(job.request_folder / JOB_FILE)
-        named = isinstance(values, dict) and (
-            values.pop("format", None),
-            values.pop("version", None),
-        )
+        named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
         record: JobRecord | None = (
             from_json(JobRecord, values) if named == (FORMAT, VERSION) else None
         )
@@ -176,41 +169,29 @@ def is_running(job: Job, digest: str) -> bool:
 
 
 def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
-    """Make the job's folder ready for a worker, which continues what an earlier one began.
-
-    What another request wrote there is moved aside; returns where to. Raises StgaError while a
-    worker is running in the folder, or where it holds files that no job wrote.
-    """
+    """Make the job's folder ready for a worker, which continues what an earlier one began; returns
+    where another request's files were moved. Raises StgaError for a running worker, and files of
+    others."""
     record, moved = read_record(job), None
     if record is not None and record.digest != digest:
         prepare_status_folder(job.request_folder)  # raises while a worker is running
-        moved, record = _move_aside(job.folder), None
+        kept, name = job.folder.parent / REPLACED, job.folder.name
+        names = (name if n == 1 else f"{name}_{n}" for n in count(1))
+        moved, record = next(kept / name for name in names if not (kept / name).exists()), None
+        try:
+            kept.mkdir(exist_ok=True)
+            job.folder.rename(moved)
+        except OSError as error:
+            reason = f"cannot be moved to {moved} ({error.strerror or error})"
+            raise StgaError(f"{job.folder}: {reason}") from error
     if record is None:
-        if job.folder.is_dir() and any(
-            path.name != job.request_folder.name for path in job.folder.iterdir()
-        ):
-            raise StgaError(
-                f"{job.folder}: holds files that no job of a batch wrote; choose another 'out'"
-            )
+        held = job.folder.iterdir() if job.folder.is_dir() else ()
+        if any(path.name != job.request_folder.name for path in held):
+            foreign = "holds files that no job of a batch wrote; choose another 'out'"
+            raise StgaError(f"{job.folder}: {foreign}")
         write_record(job, JobRecord(digest, forecast_s))
     if record is None or not has_request(job.request_folder):
         write_request(job.request_folder, job.request)
     else:
         prepare_status_folder(job.request_folder)
     return moved
-
-
-def _move_aside(folder: Path) -> Path:
-    """Move a job's folder to the first free name in the batch's folder REPLACED."""
-    target, number = folder.parent / REPLACED / folder.name, 1
-    while target.exists():
-        number += 1
-        target = folder.parent / REPLACED / f"{folder.name}_{number}"
-    try:
-        target.parent.mkdir(exist_ok=True)
-        folder.rename(target)
-    except OSError as error:
-        raise StgaError(
-            f"{folder}: cannot be moved to {target} ({error.strerror or error})"
-        ) from error
-    return target

@@ -178,15 +178,13 @@ class Engine(Protocol):
         """Whether the job can be submitted now."""
 
     def submit(self, jobs: Sequence[Job]) -> None:
-        """Carry out jobs, which follow those that they come after. Raises StgaError where that
-        cannot be begun."""
+        """Carry out jobs, each after those it comes after. Raises StgaError if it cannot begin."""
 
     def adopt(self, job: Job) -> None:
         """Watch the worker that an earlier start of the batch left running."""
 
     def running(self) -> Mapping[str, str]:
-        """Name of each job that a machine carries out -> the machine, "" where only the worker
-        knows it."""
+        """Name of each job that a machine carries out -> the machine, "" where unknown."""
 
     def ended(self) -> Mapping[str, Ended]:
         """The jobs whose workers have ended since this was called last."""
@@ -214,10 +212,8 @@ def training_python() -> str:
 PLAN_KEYS = ("out", "resources", "job")
 TABLE_KEYS = ("request", "after", "resources", "minutes")
 """Keys of a job's table that are not fields of its request."""
-REPLACED = "replaced"
-"""Folder of the batch that keeps what changed jobs wrote before."""
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}", re.ASCII)
-"""Of a job, whose folder has it."""
+REPLACED = "replaced"  # Folder of the batch that keeps what changed jobs wrote before
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}", re.ASCII)  # Of a job, whose folder has it
 
 
 @dataclass(frozen=True)
@@ -240,20 +236,16 @@ def read_plan(path: Path) -> Plan:
 def plan_of_captures(
     captures: Sequence[Path], out: Path, settings: Mapping[str, Any], fields: Mapping[str, Any]
 ) -> Plan:
-    """A training of each capture. settings: of `make_settings`; fields: further ones of `Train`.
-    Raises StgaError."""
+    """A training of each capture; fields: of `Train`, settings: of `make_settings`."""
     folders = [path.resolve() for path in captures]
     table = {"request": "train", "settings": dict(settings), **fields}
-    jobs = {
-        f"train-{name}": {**table, "capture": str(path)}
-        for name, path in zip(_names(folders), folders, strict=True)
-    }
+    names = zip(_names(folders), folders, strict=True)
+    jobs = {f"train-{name}": {**table, "capture": str(path)} for name, path in names}
     return make_plan({"out": str(out.resolve()), "job": jobs}, Path.cwd(), "CAPTURES")
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """What the job of each folder is called: the folder's name; with that above it where several
-    have it; and numbered where these are the same in ASCII."""
+    """Job names of folders: their own, with that above where several share it, or numbered."""
     names = [_slug(path.name) for path in folders]
     shared = Counter(names)
     names = [
@@ -272,8 +264,7 @@ def _slug(text: str) -> str:
 
 
 def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
-    """The plan of a TOML file's values; paths are relative to `base`. Raises StgaError as
-    `read_plan` does."""
+    """The plan of a TOML file's values, paths relative to `base`; raises as `read_plan` does."""
     _require_keys(source, values, PLAN_KEYS)
     out, tables = values.get("out"), values.get("job")
     if not isinstance(out, str) or not out:
@@ -297,25 +288,22 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
 def _require_keys(where: str, values: Mapping[str, Any], allowed: Sequence[str]) -> None:
     unknown = next((key for key in values if key not in allowed), None)
     if unknown is not None:
-        raise StgaError(
-            f"{where}: {unknown}: is not a key of it; expected one of {', '.join(allowed)}"
-        )
+        problem = f"{unknown}: is not a key of it; expected one of {', '.join(allowed)}"
+        raise StgaError(f"{where}: {problem}")
 
 
 def _job(source: str, name: str, table: Any, base: Path, out: Path, shared: Resources) -> Job:
     """The job of a table, which waits for those that its `after` names."""
     where = f"{source}: [job.{name if NAME.fullmatch(name) else shorten(name)}]"
     if not NAME.fullmatch(name) or name == REPLACED:
-        raise StgaError(
-            f"{where}: expected a name of letters, digits, '_', '.' and '-', other than '{REPLACED}'"
-        )
+        problem = f"expected a name of letters, digits, '_', '.' and '-', other than '{REPLACED}'"
+        raise StgaError(f"{where}: {problem}")
     if not isinstance(table, dict):
         raise StgaError(f"{where}: expected a table, got {shorten(table)}")
     kind = KINDS.get(table["request"]) if isinstance(table.get("request"), str) else None
     if kind is None:
-        raise StgaError(
-            f"{where}: request: expected one of {', '.join(KINDS)}, got {shorten(table.get('request'))}"
-        )
+        problem = f"expected one of {', '.join(KINDS)}, got {shorten(table.get('request'))}"
+        raise StgaError(f"{where}: request: {problem}")
     after, minutes = table.get("after", []), table.get("minutes")
     if not isinstance(after, list) or not all(isinstance(other, str) for other in after):
         raise StgaError(f"{where}: after: expected a list of job names, got {shorten(after)}")
@@ -344,8 +332,7 @@ def _resources(where: str, values: Any, shared: Resources) -> Resources:
 def _request(
     where: str, kind: type[Any], values: Mapping[str, Any], base: Path, folder: Path
 ) -> Request:
-    """The request of a kind from the fields that are given; the others have their defaults. Raises
-    StgaError."""
+    """The request of a kind from the fields that are given; the others have their defaults."""
     specs, output = {spec.name: spec for spec in fields(kind)}, output_field(kind)
     _require_keys(where, values, list(specs))
     values = dict(values)
@@ -368,8 +355,7 @@ def _request(
 
 
 def _completed(spec: Any, value: Any) -> Any:
-    """A field's value or default as JSON has it, MISSING without either; a table is completed by
-    the defaults."""
+    """A field's value or default as JSON has it, tables completed; MISSING without either."""
     if spec.default_factory is not MISSING:
         default = to_json(spec.default_factory())
         return (
@@ -391,8 +377,7 @@ def _absolute(base: Path, text: str) -> Path:
 
 
 def _set_training(where: str, values: dict[str, Any]) -> None:
-    """Replace the changes in `settings` by whole settings, as `stga train` makes them: with the
-    effects decided from the capture."""
+    """Replace the changes in `settings` by whole settings, as `stga train` makes them."""
     changes = values.get("settings", {})
     if not isinstance(changes, dict):
         raise StgaError(f"{where}: settings: expected a table, got {shorten(changes)}")
@@ -421,8 +406,7 @@ def _tuples(value: Any) -> Any:
 
 
 def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
-    """The jobs, each also after those whose folders it reads. Raises StgaError for an input that
-    nothing makes."""
+    """The jobs, each also after those whose folders it reads. StgaError for missing inputs."""
     by_name, by_folder = {job.name: job for job in jobs}, {job.folder: job for job in jobs}
     for job in jobs:
         where, after = f"{source}: [job.{job.name}]", list(job.after)
@@ -432,9 +416,8 @@ def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
         for name, paths in input_paths(job.request).items():
             for path in paths:
                 if path == job.folder.parent:
-                    raise StgaError(
-                        f"{where}: {name}: {path} is the batch's own folder; choose another 'out'"
-                    )
+                    problem = f"{name}: {path} is the batch's own folder; choose another 'out'"
+                    raise StgaError(f"{where}: {problem}")
                 maker = next(
                     (by_folder[folder] for folder in (path, *path.parents) if folder in by_folder),
                     None,

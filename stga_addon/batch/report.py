@@ -1,5 +1,4 @@
-"""What is shown of a batch: the live table, the table of what a plan asks for, and the report, one
-HTML file."""
+"""What is shown of a batch: the live table, the table of a plan, and the report, an HTML file."""
 
 import base64
 import html
@@ -22,15 +21,13 @@ from ..training.run.metrics_log import read_metrics
 from ..worker.status import log_lines
 from .run import Batch, Entry, JobState
 
-MAX_LIVE_ROWS = 20
-"""Jobs that the live table shows: the running ones, then those that failed."""
+MAX_LIVE_ROWS = 20  # Jobs that the live table shows: the running ones, then those that failed
 BAR_WIDTH = 20
 CLEAR_LINE, UP = "\x1b[2K", "\x1b[{}A"
 
 
 class LiveTable:
-    """Shows a batch on a stream: on a terminal a table that is drawn over, else a line for each
-    event."""
+    """Shows a batch: on a terminal a table that is drawn over, else a line for each event."""
 
     def __init__(self, stream: TextIO, width: int = 100) -> None:
         self._stream, self._width = stream, width
@@ -60,18 +57,11 @@ class LiveTable:
 def table_lines(batch: Batch) -> list[str]:
     """A line on the whole batch, and one for each job that runs or has failed."""
     shown = [entry for entry in batch.entries.values() if entry.state == JobState.RUNNING]
-    shown += [
-        entry
-        for entry in batch.entries.values()
-        if entry.state in (JobState.FAILED, JobState.BLOCKED)
-    ]
+    shown += batch.failures
     width = max((len(entry.job.name) for entry in shown[:MAX_LIVE_ROWS]), default=0)
     lines = [summary_line(batch), *(_row(entry, width) for entry in shown[:MAX_LIVE_ROWS])]
-    return (
-        lines
-        if len(shown) <= MAX_LIVE_ROWS
-        else [*lines, f"… and {len(shown) - MAX_LIVE_ROWS} more"]
-    )
+    more = [f"… and {len(shown) - MAX_LIVE_ROWS} more"] if len(shown) > MAX_LIVE_ROWS else []
+    return lines + more
 
 
 def summary_line(batch: Batch) -> str:
@@ -86,8 +76,7 @@ def summary_line(batch: Batch) -> str:
 
 
 def seconds_left(entries: Iterable[Entry]) -> float | None:
-    """Seconds until the batch is done, if as many jobs run at once as now; None where that is
-    unknown."""
+    """Seconds until the batch is done, if as many jobs run at once as now; None: unknown."""
     open_ones = [entry for entry in entries if not entry.state.is_over]
     each = [entry.left_s for entry in open_ones]
     known = [seconds for seconds in each if seconds is not None]
@@ -120,10 +109,10 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     """What --dry-run prints: each job, its state, its forecast, and the sum."""
     rows = [_plan_row(entry) for entry in batch.entries.values()]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    lines = []
+    for row in rows:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        lines.append("  ".join(cells).rstrip())
     unfinished = [entry for entry in batch.entries.values() if not entry.state.is_over]
     known = [entry.forecast_s for entry in unfinished if entry.forecast_s]
     total = sum(known)
@@ -135,11 +124,8 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     )
     shared = max(on_cores / max(1, cores), *known, 0.0)
     text += f", about {format_duration(shared)} on this machine" if known else ""
-    text += (
-        f"; of {unknown} jobs the time is not known before one of their kind is finished"
-        if unknown
-        else ""
-    )
+    if unknown:
+        text += f"; of {unknown} jobs the time is not known before one of their kind is finished"
     return [*lines, text]
 
 
@@ -161,11 +147,11 @@ PICTURE_HEIGHT_PX = 240
 JPEG_QUALITY = 85
 LOG_LINES = 12
 STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 70rem; padding: 0 1rem; color: #1c1c1c;
-       background: #fff; }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 70rem; padding: 0 1rem;
+       color: #1c1c1c; background: #fff; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-table { border-collapse: collapse; width: 100%; } th, td { text-align: left; padding: .25rem .6rem .25rem 0;
-       border-bottom: 1px solid #ddd; vertical-align: top; }
+table { border-collapse: collapse; width: 100%; } th, td { text-align: left; vertical-align: top;
+       padding: .25rem .6rem .25rem 0; border-bottom: 1px solid #ddd; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 .failed { color: #a3200d; } .quiet { color: #666; }
 pre { background: #f4f4f4; padding: .6rem; overflow-x: auto; font-size: 13px; }
@@ -177,12 +163,17 @@ Run = tuple[Entry, list[dict[str, Any]]]
 
 
 def write_report(batch: Batch) -> Path:
-    """Write report.html into the batch's folder and return its path. Raises StgaError where it
-    cannot be written."""
-    runs = _runs(batch)
+    """Write report.html into the batch's folder; returns its path. Raises StgaError."""
+    found: list[Run] = []
+    for entry in batch.entries.values():
+        if entry.state.is_done and has_run(entry.job.folder):
+            with suppress(StgaError):
+                found.append((entry, read_metrics(entry.job.folder)))
+    runs = sorted(found, key=lambda run: _figures(run).get("psnr", -np.inf))
     parts = [_summary(batch), _failures(batch), _chart(runs), _pictures(runs), _table(batch, runs)]
     title = html.escape(batch.plan.out.name)
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+    head = '<!doctype html><html lang="en"><meta charset="utf-8">'
+    head += f"<title>{title}</title><style>{STYLE}</style>"
     path = batch.plan.out / REPORT
     with replacing(path) as partial:
         partial.write_text(
@@ -191,26 +182,13 @@ def write_report(batch: Batch) -> Path:
     return path
 
 
-def _runs(batch: Batch) -> list[Run]:
-    """The finished trainings, from the lowest PSNR to the highest."""
-    found: list[Run] = []
-    for entry in batch.entries.values():
-        if entry.state.is_done and has_run(entry.job.folder):
-            with suppress(StgaError):
-                found.append((entry, read_metrics(entry.job.folder)))
-    return sorted(found, key=lambda run: _figures(run).get("psnr", -np.inf))
-
-
 def _figures(run: Run) -> dict[str, Any]:
     """The evaluation of the avatar that the run keeps; empty without held-out views."""
     entry, metrics = run
     lines = [line for line in metrics if "psnr" in line]
     with suppress(StgaError):
-        return (
-            dict(saved_line(lines, read_run(entry.job.folder).settings.target_psnr))
-            if lines
-            else {}
-        )
+        target = read_run(entry.job.folder).settings.target_psnr
+        return dict(saved_line(lines, target)) if lines else {}
     return {}
 
 
@@ -231,12 +209,12 @@ def _summary(batch: Batch) -> str:
         f" Forecasts were off by {np.median(off):.0%} (median of {len(off)})." if off else ""
     )
     source = html.escape(batch.plan.source)
-    return f"<p>{source}: {len(entries)} jobs: {text}. {format_duration(seconds)} of work.{forecasts}</p>"
+    worked = f"{format_duration(seconds)} of work"
+    return f"<p>{source}: {len(entries)} jobs: {text}. {worked}.{forecasts}</p>"
 
 
 def _forecast_error(entry: Entry) -> float | None:
-    """By how much a finished job took longer than expected, as a share of that; None where nothing
-    was expected."""
+    """How much longer a finished job took than expected, as a share; None: not expected."""
     if not (entry.state.is_done and entry.forecast_s and entry.seconds):
         return None
     return entry.seconds / entry.forecast_s - 1
@@ -276,33 +254,30 @@ def _chart(runs: Sequence[Run]) -> str:
 
 
 def _pictures(runs: Sequence[Run]) -> str:
-    """A held-out image of each run beside its avatar, where its capture has one and can be opened
-    here."""
+    """A held-out image of each run beside its avatar, where its capture has one here."""
     shown = []
     for entry, metrics in _spread(runs, MAX_PICTURES):
         with suppress(StgaError, ModuleNotFoundError):
             pair, figures = held_out_pair(entry.job.folder), _figures((entry, metrics))
             if pair is not None:
+                from PIL import Image
+
                 psnr = f", {figures['psnr']:.2f} dB" if "psnr" in figures else ""
-                data, name = (
-                    base64.b64encode(_jpeg(pair)).decode("ascii"),
-                    html.escape(entry.job.name),
-                )
-                image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="data:image/jpeg;base64,{data}">'
+                picture, out = Image.fromarray(pair), io.BytesIO()
+                height = min(2 * PICTURE_HEIGHT_PX, picture.height)
+                picture = picture.resize((round(picture.width * height / picture.height), height))
+                picture.save(out, "JPEG", quality=JPEG_QUALITY)
+                source = f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
+                name = html.escape(entry.job.name)
+                image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="{source}">'
                 shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
-    return (
-        f"<h2>Held-out views: image and avatar, from the lowest PSNR</h2>{''.join(shown)}"
-        if shown
-        else ""
-    )
+    title = "<h2>Held-out views: image and avatar, from the lowest PSNR</h2>"
+    return title + "".join(shown) if shown else ""
 
 
 def held_out_pair(run: Path) -> np.ndarray | None:
-    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None where its capture has
-    no such view.
-
-    Raises StgaError where the run or its capture cannot be opened.
-    """
+    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None without one. Raises
+    StgaError where the run or its capture cannot be opened."""
     from ..avatar.file import read_avatar
     from ..capture.images import read_image
     from ..render.render import render_avatar
@@ -319,16 +294,6 @@ def held_out_pair(run: Path) -> np.ndarray | None:
     rendered = render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
     pixels = np.round(255 * np.clip(rendered, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
     return np.hstack([image, pixels])
-
-
-def _jpeg(image: np.ndarray) -> bytes:
-    from PIL import Image
-
-    picture, out = Image.fromarray(image), io.BytesIO()
-    height = min(2 * PICTURE_HEIGHT_PX, picture.height)
-    picture = picture.resize((round(picture.width * height / picture.height), height))
-    picture.save(out, "JPEG", quality=JPEG_QUALITY)
-    return out.getvalue()
 
 
 def _table(batch: Batch, runs: Iterable[Run]) -> str:

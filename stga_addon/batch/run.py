@@ -2,9 +2,10 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from graphlib import TopologicalSorter
 from importlib.util import find_spec
 from statistics import median
 
@@ -17,13 +18,10 @@ from ..worker.status import WorkerState, WorkerStatus, read_status, request_canc
 from .folder import is_done, is_running, job_digests, prepare, read_record, write_record
 from .plan import Engine, Job, Plan
 
-MAX_RETRIES = 5
-"""How often a job whose worker was killed is tried again in one start of a batch."""
+MAX_RETRIES = 5  # How often a job whose worker was killed is tried again in one start of a batch
 SHOW_INTERVAL_S = 1.0
-MAX_BEGUN = 64
-"""Jobs that are begun before the next look at what has ended."""
-MAX_MISSES = 50
-"""Jobs that are asked for in vain, in a row, before the next look at what has ended."""
+MAX_BEGUN = 64  # Jobs that are begun before the next look at what has ended
+MAX_MISSES = 50  # Jobs that are asked for in vain, in a row, before the next look at what has ended
 Say = Callable[[str], None]
 
 
@@ -68,8 +66,7 @@ class Entry:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until it is finished, from its share done, else from its forecast; None:
-        unknown."""
+        """Seconds until it is finished, by its share done, else by its forecast; None: unknown."""
         if self.state.is_over:
             return 0.0
         spent = self.status.seconds if self.state == JobState.RUNNING else 0.0
@@ -91,7 +88,11 @@ class Batch:
             kept = all(self.entries[other].state.is_done for other in entry.job.after)
             if kept and is_done(entry.job, entry.digest):
                 entry.state = JobState.KEPT
-                self._recall(entry)
+                record = read_record(entry.job)
+                entry.status = read_status(entry.job.request_folder) or entry.status
+                if record is not None:
+                    entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
+                    entry.machine = record.machine or entry.status.machine
 
     @property
     def unfinished(self) -> list[Job]:
@@ -104,14 +105,6 @@ class Batch:
     @property
     def failures(self) -> list[Entry]:
         return [e for e in self.entries.values() if e.state in (JobState.FAILED, JobState.BLOCKED)]
-
-    def _recall(self, entry: Entry) -> None:
-        """Read what earlier starts of the batch left."""
-        record = read_record(entry.job)
-        entry.status = read_status(entry.job.request_folder) or entry.status
-        if record is not None:
-            entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
-            entry.machine = record.machine or entry.status.machine
 
     def set_forecasts(self, seconds: Mapping[str, float]) -> None:
         for name, expected in seconds.items():
@@ -140,47 +133,32 @@ def run_batch(
 
 class _Loop:
     def __init__(
-        self,
-        batch: Batch,
-        engine: Engine,
-        lease: SoftFileLease,
-        show: Callable[[Batch], None],
+        self, batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None],
         say: Say,
-    ) -> None:
-        self._batch, self._engine, self._lease, self._show, self._say = (
-            batch,
-            engine,
-            lease,
-            show,
-            say,
-        )
+    ) -> None:  # fmt: skip
+        self._batch = batch
+        self._engine = engine
+        self._lease = lease
+        self._show = show
+        self._say = say
         self._entries = batch.entries
         self._shown_s = 0.0
-        self._position = {name: number for number, name in enumerate(self._entries)}
-        self._children: dict[str, list[str]] = {name: [] for name in self._entries}
-        self._waits_for: dict[str, int] = {}
-        for name, entry in self._entries.items():
-            open_ones = [
-                other for other in entry.job.after if not self._entries[other].state.is_done
-            ]
-            self._waits_for[name] = len(open_ones)
-            for other in open_ones:
-                self._children[other].append(name)
-        waiting = [name for name, entry in self._entries.items() if entry.state == JobState.WAITING]
+        waiting = {n: e for n, e in self._entries.items() if e.state == JobState.WAITING}
         self._left = len(waiting)
-        takes_all = engine.takes_all
-        # A dictionary as an ordered set: jobs leave it from anywhere.
-        self._ready = dict.fromkeys(
-            name for name in waiting if takes_all or not self._waits_for[name]
+        self._order = TopologicalSorter(
+            {name: [o for o in e.job.after if o in waiting] for name, e in waiting.items()}
         )
+        self._order.prepare()
+        # A dictionary as an ordered set: jobs leave it from anywhere.
+        free = set(self._order.get_ready())
+        self._ready = dict.fromkeys(n for n in waiting if engine.takes_all or n in free)
 
     def work(self) -> None:
         self._adopt()
         while self._left:
             if self._lease.compromise is not None:
-                raise StgaError(
-                    f"{self._batch.plan.out}: another batch has taken this folder; this one has ended"
-                )
+                problem = "another batch has taken this folder; this one has ended"
+                raise StgaError(f"{self._batch.plan.out}: {problem}")
             begun = self._begin()
             ended = self._collect()
             self._look()
@@ -261,67 +239,52 @@ class _Loop:
         """Take note of what has ended; whether something has."""
         ended = self._engine.ended()
         # a job's end before that of those after it
-        for name in sorted(ended, key=self._position.__getitem__):
-            entry, end = self._entries[name], ended[name]
+        for name, entry in self._entries.items() if ended else ():
+            if name not in ended:
+                continue
+            end, state = ended[name], ended[name].snapshot.state
             entry.status = end.snapshot.status
             entry.machine = entry.machine or entry.status.machine
-            self._add_seconds(entry)
-            missing = next(
-                (other for other in entry.job.after if not self._entries[other].state.is_done), None
-            )
-            # an engine that takes all
-            if end.snapshot.state != WorkerState.FINISHED and missing is not None:
-                self._over(
-                    entry, JobState.BLOCKED, f"it comes after {missing}, which is not finished"
-                )
-            elif (
-                retry
-                and end.is_lost
-                and end.snapshot.state in _LOST
-                and entry.retries < MAX_RETRIES
-            ):
+            record = read_record(entry.job)
+            if record is not None:
+                entry.seconds = record.seconds + entry.status.seconds
+                new = replace(record, seconds=entry.seconds, machine=entry.machine)
+                try:
+                    write_record(entry.job, new)
+                except StgaError as error:
+                    self._say(f"warning: {error}")
+            undone = (other for other in entry.job.after if not self._entries[other].state.is_done)
+            missing = next(undone, None)
+            if state != WorkerState.FINISHED and missing is not None:  # an engine that takes all
+                reason = f"it comes after {missing}, which is not finished"
+                self._over(entry, JobState.BLOCKED, reason)
+            elif retry and end.is_lost and state in _LOST and entry.retries < MAX_RETRIES:
                 entry.retries += 1
                 entry.state = JobState.WAITING
                 self._ready[name] = None
                 self._say(f"{name}: its worker was lost; it goes on from its last checkpoint")
             else:
-                self._over(
-                    entry,
-                    _OUTCOMES.get(end.snapshot.state, JobState.FAILED),
-                    end.snapshot.status.error,
-                )
+                outcome = _OUTCOMES.get(state, JobState.FAILED)
+                self._over(entry, outcome, entry.status.error)
         return bool(ended)
-
-    def _add_seconds(self, entry: Entry) -> None:
-        """Add the time that the job's worker has worked to its record."""
-        record = read_record(entry.job)
-        if record is None:
-            return
-        entry.seconds = record.seconds + entry.status.seconds
-        try:
-            write_record(entry.job, replace(record, seconds=entry.seconds, machine=entry.machine))
-        except StgaError as error:
-            self._say(f"warning: {error}")
 
     def _over(self, entry: Entry, state: JobState, error: str = "") -> None:
         """Take note of a job's end; those that come after it can start, or cannot any more."""
         self._end(entry, state, error)
-        name = entry.job.name
         if state == JobState.FINISHED:
-            for child in self._children[name]:
-                self._waits_for[child] -= 1
-                if not self._waits_for[child] and self._entries[child].state == JobState.WAITING:
-                    self._ready[child] = None
+            with suppress(ValueError):  # an engine that takes all finished it before another
+                self._order.done(entry.job.name)
+            for name in self._order.get_ready():
+                if self._entries[name].state == JobState.WAITING:
+                    self._ready[name] = None
             return
         after = JobState.CANCELLED if state == JobState.CANCELLED else JobState.BLOCKED
-        left = [(child, name) for child in self._children[name]]
-        while left:
-            child, missing = left.pop()
-            if self._entries[child].state == JobState.WAITING:
-                self._end(
-                    self._entries[child], after, f"it comes after {missing}, which is not finished"
-                )
-                left += [(other, child) for other in self._children[child]]
+        missing = {entry.job.name}
+        for child in self._entries.values():  # each after those that it comes after
+            cause = next((other for other in child.job.after if other in missing), None)
+            if cause is not None and child.state == JobState.WAITING:
+                self._end(child, after, f"it comes after {cause}, which is not finished")
+                missing.add(child.job.name)
 
     def _end(self, entry: Entry, state: JobState, error: str) -> None:
         self._ready.pop(entry.job.name, None)
@@ -330,8 +293,7 @@ class _Loop:
         self._say(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
 
     def _look(self, now: bool = False) -> None:
-        """Read the status of the running jobs, and show the batch, at most every
-        SHOW_INTERVAL_S."""
+        """Read the status of running jobs, and show the batch, at most every SHOW_INTERVAL_S."""
         if not now and time.monotonic() - self._shown_s < SHOW_INTERVAL_S:
             return
         for name, machine in self._engine.running().items():
@@ -377,11 +339,7 @@ def _corrected(stated: float | None, taken: Sequence[tuple[float, float | None]]
 
 
 def _stated(job: Job, paces: list[float]) -> float | None:
-    """Seconds by the plan: what it says, the budget of a training, or the time that its iterations
-    take.
-
-    paces: seconds of an iteration, once it is measured.
-    """
+    """Seconds by the plan, a training's budget, or its iterations and their `paces`."""
     request = job.request
     if job.minutes is not None:
         return 60 * job.minutes
@@ -400,8 +358,7 @@ def _stated(job: Job, paces: list[float]) -> float | None:
 
 
 def pace(job: Job, request: Train) -> float | None:
-    """Seconds per iteration of a training on this machine, measured; None where its capture is not
-    there yet, cannot be trained on, or training is not installed here."""
+    """Measured seconds per iteration of a training here; None where it cannot be trained yet."""
     if find_spec("torch") is None or find_spec("numba") is None or not request.capture.is_dir():
         return None
     from ..capture.open import open_capture

@@ -58,20 +58,28 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     chosen = EngineOptions(**given_options(options, EngineOptions))
     plan = batch_plan(options)
     is_here = chosen.engine == "local" and not options.commands
-    plan = with_threads(
-        plan, chosen.threads or (max(1, processors() // len(plan.jobs)) if is_here else 1)
-    )
+    share = max(1, processors() // len(plan.jobs)) if is_here else 1
+    plan = with_threads(plan, chosen.threads or share)
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:
-        _print_commands(plan)
+        from ..batch.folder import hold_folder, prepare
+        from ..batch.plan import job_command
+        from ..batch.run import Batch
+
+        with hold_folder(plan.out):
+            batch = Batch(plan)
+            for job in batch.unfinished:
+                prepare(job, batch.entries[job.name].digest, 0.0)
+                command = ["env", f"PYTHONPATH={PACKAGES_FOLDER}", *job_command(job)]
+                waits = [name for name in job.after if not batch.entries[name].state.is_over]
+                print(shlex.join(command) + (f"  # after {' '.join(waits)}" if waits else ""))
     else:
         carry_out_plan(plan, chosen.engine, chosen.address)
 
 
 def batch_plan(options: Namespace) -> Plan:
-    """Raises StgaError for a mistake in the plan, and for options that would have no effect with
-    one."""
+    """Raises StgaError for a mistake in the plan, and for options without effect on one."""
     given = given_options(options, BatchOptions)
     sources = given.pop("sources")
     given.pop("commands", None)
@@ -80,21 +88,18 @@ def batch_plan(options: Namespace) -> Plan:
             raise StgaError(f"{sources[1]}: cannot be given beside a plan")
         for spec in option_fields(BatchOptions):
             if spec.name in given:
-                raise StgaError(
-                    f"{flag_of(spec)}: has no effect with a plan, which says that itself"
-                )
+                problem = "has no effect with a plan, which says that itself"
+                raise StgaError(f"{flag_of(spec)}: {problem}")
         return read_plan(sources[0])
     out = given.pop("out", None)
     if out is None:
         raise StgaError("--out: is missing; expected the folder of the batch")
     missing = next((path for path in sources if not path.is_dir()), None)
     if missing is not None:
-        raise StgaError(
-            f"{missing}: is not a folder; expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
-        )
-    settings: dict[str, Any] = {
-        name: given[name] for name in ("preset", "seconds", "iterations", "seed") if name in given
-    }
+        expected = f"expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
+        raise StgaError(f"{missing}: is not a folder; {expected}")
+    named = ("preset", "seconds", "iterations", "seed")
+    settings: dict[str, Any] = {name: given[name] for name in named if name in given}
     if not {"preset", "seconds", "iterations"} & settings.keys():
         raise StgaError("--preset: is missing; expected it, --budget or --iterations")
     fields: dict[str, Any] = {name: given[name] for name in given if name not in settings}
@@ -105,12 +110,10 @@ def batch_plan(options: Namespace) -> Plan:
 
 def with_threads(plan: Plan, threads: int) -> Plan:
     """The plan with so many threads for the jobs that name none."""
-    jobs = [
-        job
-        if job.resources.threads
-        else replace(job, resources=replace(job.resources, threads=threads))
-        for job in plan.jobs
-    ]
+    jobs = []
+    for job in plan.jobs:
+        resources = replace(job.resources, threads=job.resources.threads or threads)
+        jobs.append(replace(job, resources=resources))
     return replace(plan, jobs=tuple(jobs))
 
 
@@ -124,28 +127,9 @@ def print_plan(plan: Plan) -> None:
     print("\n".join(plan_lines(batch, processors())))
 
 
-def _print_commands(plan: Plan) -> None:
-    """Prepare the folders of the jobs that are not finished, and print a shell command for each in
-    an order in which they can be done. Raises StgaError where a worker is running in a folder."""
-    from ..batch.folder import hold_folder, prepare
-    from ..batch.plan import job_command
-    from ..batch.run import Batch
-
-    with hold_folder(plan.out):
-        batch = Batch(plan)
-        for job in batch.unfinished:
-            prepare(job, batch.entries[job.name].digest, 0.0)
-            command = ["env", f"PYTHONPATH={PACKAGES_FOLDER}", *job_command(job)]
-            waits = [name for name in job.after if not batch.entries[name].state.is_over]
-            print(shlex.join(command) + (f"  # after {' '.join(waits)}" if waits else ""))
-
-
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
-    """Carry out what is not finished, with the live table and the report.
-
-    Raises StgaError where a job failed, KeyboardInterrupt after Ctrl-C when the running jobs have
-    stopped.
-    """
+    """Carry out what is not finished, with table and report. Raises StgaError where a job failed,
+    KeyboardInterrupt after Ctrl-C when the running jobs have stopped."""
     from ..batch.engines import make_engine
     from ..batch.folder import hold_folder
     from ..batch.report import LiveTable, summary_line, write_report
@@ -164,6 +148,5 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     failures = batch.failures
     if failures:
         first = failures[0]
-        raise StgaError(
-            f"{len(failures)} of {len(plan.jobs)} jobs failed; {first.job.name}: {first.error}"
-        )
+        problem = f"{first.job.name}: {first.error}"
+        raise StgaError(f"{len(failures)} of {len(plan.jobs)} jobs failed; {problem}")

@@ -2,30 +2,22 @@
 
 import sys
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..files import write_npz
 from ..format import describe_figures
-from ..jobs.analyze import Select
-from ..jobs.results import Result, Selected
+from ..jobs.results import Result
 from ..jobs.table import Request
-from ..jobs.train import SelectForTake
 from ..progress import Progress, ignore
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-LAYOUT, LAYOUT_WITH_TIME_LEFT = (
-    "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}",
-    "{desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}",
-)
-"""Of work that says itself how much time is left, and of other work."""
+LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+LAYOUT_WITH_TIME_LEFT = LAYOUT.replace("{elapsed}", "{elapsed}<{remaining}")
 
 
 def carry_out(request: Request, with_bar: bool = True) -> Result:
-    """Carry out the request, with a progress bar if it takes long, and print what it says. Raises
-    as `perform` does."""
+    """Carry out the request with a progress bar, and print what it says; raises as `perform`."""
     from ..jobs.perform import perform
 
     with ProgressBar() as bar:
@@ -35,19 +27,8 @@ def carry_out(request: Request, with_bar: bool = True) -> Result:
     return result
 
 
-def carry_out_selection(request: Select | SelectForTake, path: Path | None) -> None:
-    """Carry out the request, and write timestep -> triangles into an .npz file where there is a
-    path."""
-    found = carry_out(request, with_bar=False)
-    assert isinstance(found, Selected)
-    if path is not None:
-        arrays = {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}
-        write_npz(path, arrays, compressed=True)
-
-
 class ProgressBar:
-    """A bar over the share of the work on stderr, with its stage and figures; what is said or
-    logged goes above it."""
+    """A bar on stderr with stage and figures; what is said or logged goes above it."""
 
     def __enter__(self) -> "ProgressBar":
         self._bar: tqdm[Any] | None = None
@@ -63,7 +44,12 @@ class ProgressBar:
 
     def report(self, progress: Progress) -> bool:
         if self._bar is None:
-            self._bar = self._open()
+            from tqdm import tqdm
+            from tqdm.contrib.logging import logging_redirect_tqdm
+
+            bar = tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
+            self._bar = self._opened.enter_context(bar)
+            self._opened.enter_context(logging_redirect_tqdm())
         self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
         self._stage = progress.stage
         figures = progress.figures()
@@ -72,16 +58,6 @@ class ProgressBar:
         self._bar.set_postfix_str("; ".join(filter(None, told)), refresh=False)
         self._bar.update(progress.share - self._bar.n)
         return False
-
-    def _open(self) -> "tqdm[Any]":
-        from tqdm import tqdm
-        from tqdm.contrib.logging import logging_redirect_tqdm
-
-        bar = self._opened.enter_context(
-            tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
-        )
-        self._opened.enter_context(logging_redirect_tqdm())
-        return bar
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""

@@ -1,12 +1,11 @@
-"""The commands: for each the dataclasses whose fields are its options, and what it does with
-them."""
+"""The commands: the dataclasses whose fields are their options, and what they do with them."""
 
 import json
 import os
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,8 +38,7 @@ from .batch import BatchOptions, EngineOptions, run_batch_command
 from .carry_out import ProgressBar, carry_out
 
 BLEND = "avatar.blend"
-TRAIN_SECONDS, REFINE_SECONDS, EXTEND_SECONDS = 120.0, 20.0, 60.0
-"""Budgets where none is given."""
+TRAIN_SECONDS, REFINE_SECONDS, EXTEND_SECONDS = 120.0, 20.0, 60.0  # Budgets where none is given
 
 
 @dataclass(frozen=True)
@@ -101,35 +99,32 @@ def _asking(kind: Any, with_bar: bool = True, **more: Any) -> Command:
 # Training
 
 
-@dataclass(frozen=True)
-class TrainOptions:
-    resume: bool = option("continue the run in the folder", False)
+def _lone(name: str, kind: Any, spec: Any) -> Any:
+    """A dataclass of one option that no request has."""
+    return make_dataclass("Lone", [(name, kind, spec)], frozen=True)
+
+
+RESUME_RUN = _lone("resume", bool, option("continue the run in the folder", False))
 
 
 def _train(options: Namespace, head: OpenHead | None) -> None:
-    given = {
-        **given_options(options, Train),
-        "selection": None if head is None else head.selection(),
-    }
+    given = given_options(options, Train)
+    given["selection"] = None if head is None else head.selection()
     if options.resume:
         _refuse_changes(options, read_run(options.run))
         carry_out(Resume(**given))
         return
     if has_run(options.run):
-        raise StgaError(
-            f"{options.run}: already holds a run; give --resume to continue it, or another --out"
-        )
+        problem = "already holds a run; give --resume to continue it, or another --out"
+        raise StgaError(f"{options.run}: {problem}")
     carry_out(Train(settings=_settings(options), **given))
 
 
 def _settings(options: Namespace) -> TrainingSettings:
-    """The settings of a new run. Raises StgaError for options that do not go together, or would
-    have no effect."""
+    """The settings of a new run. Raises StgaError for options that do not go together."""
     given = given_options(options, TrainingSettings)
-    paper, other_method = (
-        given.get("schedule") == "paper",
-        given.get("strategy") == "gaussian-avatars",
-    )
+    paper = given.get("schedule") == "paper"
+    other_method = given.get("strategy") == "gaussian-avatars"
     for named, is_replaced, by in (
         ("--schedule paper", paper and other_method, "--strategy gaussian-avatars"),
         ("--preset", "preset" in given and paper, "--schedule paper"),
@@ -143,30 +138,24 @@ def _settings(options: Namespace) -> TrainingSettings:
         given.setdefault("effects", {})
     settings, selection = make_settings(**given), given_options(options, SelectionOptions)
     if selection and settings.strategy != "selective":
-        raise StgaError(
-            "--threshold: has no effect without --strategy selective, or --schedule paper"
-        )
+        problem = "has no effect without --strategy selective, or --schedule paper"
+        raise StgaError(f"--threshold: {problem}")
     return replace(settings, selection=replace(settings.selection, **selection))
 
 
 def _refuse_changes(options: Namespace, run: Run) -> None:
     """Raise StgaError for an option that differs from what the run to be resumed began with."""
-    for kind, began_with in (
-        (TrainingSettings, run.settings),
-        (SelectionOptions, run.settings.selection),
-    ):
-        for spec in option_fields(kind):
+    for began_with in (run.settings, run.settings.selection):
+        for spec in option_fields(type(began_with)):
             value, given = getattr(began_with, spec.name), getattr(options, spec.name, None)
             if given not in (None, value) and spec.name != "effects":
-                raise StgaError(
-                    f"{flag_of(spec)}: this run began with {value}, which cannot change; use another --out"
-                )
+                problem = f"this run began with {value}, which cannot change; use another --out"
+                raise StgaError(f"{flag_of(spec)}: {problem}")
     decided = {decision.effect: "on" if decision.on else "off" for decision in run.effect_plan}
     for name, choice in options.effects or ():
         if name not in decided or choice not in ("auto", decided[name]):
-            raise StgaError(
-                f"--effect {name}={choice}: differs from what was decided for this run; use another --out"
-            )
+            problem = "differs from what was decided for this run; use another --out"
+            raise StgaError(f"--effect {name}={choice}: {problem}")
 
 
 @dataclass(frozen=True)
@@ -185,9 +174,8 @@ def _avatar(options: Namespace, head: OpenHead | None) -> None:
     if options.no_blend:
         return
     if find_spec("bpy") is None:
-        print(
-            "warning: no .blend file: this Python has no bpy (install bpy, or run the command in Blender)"
-        )
+        hint = "(install bpy, or run the command in Blender)"
+        print(f"warning: no .blend file: this Python has no bpy {hint}")
         return
     from ..training.run.folder import with_refined_tracking
 
@@ -223,18 +211,13 @@ def write_blend(
 # Continuing a finished run
 
 
-@dataclass(frozen=True)
-class ContinueOptions:
-    resume: bool = option("RUN was stopped: continue it", False)
-
-
-@dataclass(frozen=True)
-class SelectOptions:
-    select_only: Path | None = option(
-        "only write which triangles it would train: timestep of the take -> triangles",
-        None,
-        metavar="NPZ",
-    )
+CONTINUE = _lone("resume", bool, option("RUN was stopped: continue it", False))
+SELECT_ONLY = option(
+    "only write which triangles it would train: timestep of the take -> triangles", None,
+    metavar="NPZ",
+)  # fmt: skip
+SELECT_OUT = option("also write timestep -> triangles", None, metavar="NPZ")
+INFO_JSON = option("print the effects alone, as JSON", False)
 
 
 def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
@@ -244,7 +227,21 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
         given = given_options(options, kind)
         takes, only = given.get("captures"), getattr(options, "select_only", None)
         if options.resume:
-            _resume(kind, given, only)
+            flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
+            flags += ["--select-only"] if only else []
+            useless = next(
+                (flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None
+            )
+            if useless is not None:
+                problem = (
+                    "cannot be combined with --resume, which continues the run in RUN as it began"
+                )
+                raise StgaError(f"{useless}: {problem}")
+            if read_run(given["parent"]).continuation is None:
+                problem = "does not continue another run; resume it with `stga train --resume`"
+                raise StgaError(f"{given['parent']}: {problem}")
+            same = {name: given[name] for name in ("flame", "device") if name in given}
+            carry_out(Resume(given["parent"], **same))
         elif takes and only:
             if len(takes) != 1:
                 raise StgaError(f"--select-only: expected one CAPTURE, got {len(takes)}")
@@ -252,60 +249,29 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
         else:
             folder = given.setdefault("run", next_folder(options.parent))
             if has_run(folder):
-                raise StgaError(
-                    f"{folder}: already holds a run; choose another --out, or give --resume and this folder"
-                )
+                problem = "choose another --out, or give --resume and this folder"
+                raise StgaError(f"{folder}: already holds a run; {problem}")
             if not {"seconds", "iterations"} & given.keys():
                 given["seconds"] = seconds
             carry_out(kind(**given))
 
-    return Command(_about(kind), run, (kind, ContinueOptions, *more), may_lack=("run", "captures"))
-
-
-def _resume(kind: Any, given: dict[str, Any], select_only: Path | None) -> None:
-    """Raises StgaError for an option that would have no effect, or a run that continues none."""
-    flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
-    flags += ["--select-only"] if select_only else []
-    useless = next((flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None)
-    if useless is not None:
-        raise StgaError(
-            f"{useless}: cannot be combined with --resume, which continues the run in RUN as it began"
-        )
-    if read_run(given["parent"]).continuation is None:
-        raise StgaError(
-            f"{given['parent']}: does not continue another run; resume it with `stga train --resume`"
-        )
-    carry_out(
-        Resume(
-            given["parent"], **{name: given[name] for name in ("flame", "device") if name in given}
-        )
-    )
+    return Command(_about(kind), run, (kind, CONTINUE, *more), may_lack=("run", "captures"))
 
 
 # Captures
 
 
-@dataclass(frozen=True)
-class SelectOutput:
-    out: Path | None = option("also write timestep -> triangles", None, metavar="NPZ")
+def _select(options: Namespace, head: OpenHead | None) -> None:
+    _write_selection(Select(**given_options(options, Select)), options.out)
 
 
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
-    """Carry out the request, and write timestep -> triangles into an .npz file where there is a
-    path."""
+    """Carry out the request; write timestep -> triangles into an .npz where asked to."""
     found = carry_out(request, with_bar=False)
     assert isinstance(found, Selected)
     if path is not None:
-        write_npz(
-            path,
-            {f"{timestep:05d}": faces for timestep, faces in found.selection.items()},
-            compressed=True,
-        )
-
-
-@dataclass(frozen=True)
-class InfoOptions:
-    json: bool = option("print the effects alone, as JSON", False)
+        faces = {f"{timestep:05d}": faces for timestep, faces in found.selection.items()}
+        write_npz(path, faces, compressed=True)
 
 
 def _info(options: Namespace, head: OpenHead | None) -> None:
@@ -314,11 +280,9 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         from ..jobs.finished_run import describe_light
 
         avatar = read_avatar(avatar_path(path))
-        light = (
-            describe_light(avatar.light)
-            if avatar.light
-            else ("light: unknown; `stga relight RUN` estimates it",)
-        )
+        light: tuple[str, ...] = ("light: unknown; `stga relight RUN` estimates it",)
+        if avatar.light:
+            light = describe_light(avatar.light)
         rows = [("splats", f"{len(avatar.splats)}, {len(avatar.faces)} triangles")]
         rows += [(name, text.strip()) for name, _, text in (line.partition(":") for line in light)]
         print(*format_table(rows), sep="\n")
@@ -363,9 +327,8 @@ def _export(options: Namespace, head: OpenHead | None) -> None:
     given = given_options(options, Export)
     if head is not None:
         given.setdefault("fps", head.fps)
-        if options.motion is None and (
-            FORMATS[options.file_format].source != "frame" or options.timestep is not None
-        ):
+        moves = FORMATS[options.file_format].source != "frame" or options.timestep is not None
+        if options.motion is None and moves:
             given["played"] = head.played()
     carry_out(Export(**given))
 
@@ -398,37 +361,38 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
 
 COMMANDS = {
     "avatar": Command(
-        "Make an avatar from footage: track, train, and write a report and a .blend file. Called again with the same "
-        "arguments, it continues where it was interrupted.",
-        _avatar,
-        ((Track, *(spec.name for spec in option_fields(Track) if spec.name != "out")), AvatarOptions,
-         TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
+        "Make an avatar from footage: track, train, and write a report and a .blend file. Called "
+        "again with the same arguments, it continues where it was interrupted.", _avatar,
+        ((Track, *(spec.name for spec in option_fields(Track) if spec.name not in ("out", "avatar"))),
+         AvatarOptions, TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
         may_lack=("model",),
     ),
     "track": _asking(Track, may_lack=("model",)),
     "train": Command(
-        _about(Train), _train, (Train, TrainingSettings, (SelectionOptions, "threshold"), TrainOptions), uses_head=True
+        _about(Train), _train,
+        (Train, TrainingSettings, (SelectionOptions, "threshold"), RESUME_RUN), uses_head=True,
     ),
     "refine": _continuing(Refine, REFINE_SECONDS),
-    "extend": _continuing(Extend, EXTEND_SECONDS, SelectOptions),
+    "extend": _continuing(Extend, EXTEND_SECONDS, _lone("select_only", Path | None, SELECT_ONLY)),
     "relight": _asking(Relight),
     "perform": Command(
-        "Carry out the request that a folder holds, as a worker of Blender's panel or of a render farm does. The "
-        "folder holds request.json; status, previews and result are written beside it.",
-        _perform, (PerformOptions,),
+        "Carry out the request that a folder holds, as a worker of Blender's panel or of a render "
+        "farm does. The folder holds request.json; status, previews and result are written beside "
+        "it.", _perform, (PerformOptions,),
     ),
     "batch": Command(
-        "Carry out a plan of many jobs, or train many captures, on this machine or on the engine that is there.",
-        run_batch_command, (BatchOptions, EngineOptions),
+        "Carry out a plan of many jobs, or train many captures, on this machine or on the engine "
+        "that is there.", run_batch_command, (BatchOptions, EngineOptions),
     ),
     "render": Command(_about(Render), _render, (RenderOutput, Render), uses_head=True),
     "eval": _asking(Evaluate, with_bar=False),
     "select": Command(
-        _about(Select), lambda options, head: _write_selection(Select(**given_options(options, Select)), options.out),
-        (Select, SelectOutput), uses_head=True,
+        _about(Select), _select, (Select, _lone("out", Path | None, SELECT_OUT)), uses_head=True
     ),
     "export": Command(_about(Export), _export, (Export,), uses_head=True),
     "drive": _asking(ConvertMotion),
-    "info": Command(_about(Analyze), _info, (Analyze, InfoOptions), uses_head=True),
+    "info": Command(
+        _about(Analyze), _info, (Analyze, _lone("json", bool, INFO_JSON)), uses_head=True
+    ),
     "presets": _asking(TimePresets, with_bar=False, uses_head=True),
 }  # fmt: skip

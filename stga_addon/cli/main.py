@@ -1,5 +1,4 @@
-"""Entry point of the command line: `python -m stga_addon …` and `blender --background … --command
-stga …`."""
+"""The command line: `python -m stga_addon …` and `blender --background … --command stga …`."""
 
 import argparse
 import gc
@@ -37,13 +36,10 @@ def main(arguments: list[str] | None = None, head: OpenHead | None = None) -> in
     with safe_streams() as stdout:
         code = _run(arguments, head)
         sys.stdout.flush()
-        if (
-            stdout is not None
-            and stdout.error is not None
-            and not isinstance(stdout.error, BrokenPipeError)
-        ):
-            return _fail(f"standard output cannot be written ({stdout.error.strerror})")
-        return code
+        error = None if stdout is None else stdout.error
+        if error is None or isinstance(error, BrokenPipeError):
+            return code
+        return _fail(f"standard output cannot be written ({error.strerror})")
 
 
 def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
@@ -66,19 +62,14 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
     except RecursionError:
         return _fail(f"'{command}': its input is nested too deeply")
     except KeyboardInterrupt as error:
-        _forget(error)
+        # without what destructors of objects that were half made say
+        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+        error.__traceback__ = error.__context__ = None
+        gc.collect()  # frames that refer to themselves
+        sys.unraisablehook = hook
         _fail("interrupted")
         return 130
     return 0
-
-
-def _forget(error: BaseException) -> None:
-    """Drop what an interruption left unfinished, without what destructors of objects that were half
-    made say."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    error.__traceback__ = error.__context__ = None
-    gc.collect()  # frames that refer to themselves
-    sys.unraisablehook = hook
 
 
 def _fail(message: str) -> int:
@@ -103,7 +94,5 @@ def make_parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
 def all_commands() -> dict[str, Command]:
     """The commands of this installation."""
     found = DEVELOPMENT if find_spec("..development", __package__) is not None else {}
-    return {
-        **COMMANDS,
-        **{name: import_module(module, __package__).COMMAND for name, module in found.items()},
-    }
+    own = {name: import_module(module, __package__).COMMAND for name, module in found.items()}
+    return {**COMMANDS, **own}

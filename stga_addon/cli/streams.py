@@ -1,5 +1,4 @@
-"""Standard streams that never raise: closed ones, closed pipes, full devices and ASCII-only
-encodings."""
+"""Standard streams that never raise: closed, full, broken pipes, ASCII-only encodings."""
 
 import io
 import os
@@ -10,11 +9,8 @@ from typing import Any
 
 
 class Output(io.FileIO):
-    """A descriptor whose first write error is kept in `error` instead of raised; what follows is
-    dropped.
-
-    So a training whose terminal or pipe goes away still finishes.
-    """
+    """A descriptor whose first write error is kept in `error` and what follows dropped, so that a
+    training whose terminal or pipe goes away still finishes."""
 
     error: OSError | None = None
 
@@ -35,7 +31,11 @@ def safe_streams() -> Iterator[Output | None]:
     (by tests, by Blender's console) are left alone, and None is yielded. What the process was
     started with comes back at the end.
     """
-    _reserve_descriptors()
+    for descriptor in range(3):  # closed ones: no file of ours gets them, written by C code
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gives the lowest free one
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = _safe(sys.stdout, sys.__stdout__), _safe(sys.stderr, sys.__stderr__)
     replaced = sys.stdout is not before[0]
@@ -47,16 +47,6 @@ def safe_streams() -> Iterator[Output | None]:
         sys.stdout, sys.stderr = before
 
 
-def _reserve_descriptors() -> None:
-    """Open closed descriptors 0 to 2 on the null device, so that no file of ours gets one and is
-    written by C code."""
-    for descriptor in range(3):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gives the lowest free one
-
-
 def _safe(stream: Any, original: Any) -> Any:
     if stream is None:  # Python found the descriptor closed
         return io.TextIOWrapper(io.BufferedWriter(Output(os.devnull, "w")), encoding="utf-8")
@@ -64,9 +54,7 @@ def _safe(stream: Any, original: Any) -> Any:
         return stream
     stream.flush()
     return io.TextIOWrapper(
-        io.BufferedWriter(Output(stream.fileno(), "w", closefd=False)),
-        encoding=stream.encoding,
-        errors="backslashreplace",
-        line_buffering=stream.line_buffering,
+        io.BufferedWriter(Output(stream.fileno(), "w", closefd=False)), encoding=stream.encoding,
+        errors="backslashreplace", line_buffering=stream.line_buffering,
         write_through=stream.write_through,
-    )
+    )  # fmt: skip

@@ -41,11 +41,8 @@ def watched_performance(path: Path, report: Report) -> Performance:
         if found is not None:
             times.append(timestep / video.fps)
             # The network's names have `_neutral` and lack tongueOut.
-            scores = {
-                COLUMN[known]: s
-                for name, s in found.weights.items()
-                if (known := arkit_name(name)) is not None
-            }
+            named = {arkit_name(name): score for name, score in found.weights.items()}
+            scores = {COLUMN[name]: score for name, score in named.items() if name is not None}
             rows.append([scores.get(column, 0.0) for column in range(COUNT)])
             rotations.append(head_rotation(found.points, (image.shape[0], image.shape[1])))
     if not rows:

@@ -1,5 +1,4 @@
-"""The map from ARKit's 52 weights to the parameters of one FLAME head: fitted, or exact for the
-bundled head."""
+"""ARKit's 52 weights as parameters of one FLAME head: fitted, or exact for the bundled head."""
 
 import hashlib
 from collections import OrderedDict
@@ -24,24 +23,18 @@ PRODUCT_SHAPES = tuple(name for name in ARKIT_SHAPES if name.startswith(("jaw", 
 """Shapes whose products with jawOpen are features: a jaw that turns carries what they move."""
 PRODUCTS = np.array([COLUMN[name] for name in PRODUCT_SHAPES])
 FEATURES = COUNT + len(PRODUCTS)
-GAZE_RAD = 0.61
-"""Rotation of an eye at weight 1 of an eyeLook shape: the largest in recorded takes of Live Link
-Face."""
-RIDGE_M = 5e-5
-"""Root mean square displacement of the face that a unit of an expression coefficient must be
-worth."""
+GAZE_RAD = 0.61  # Of an eye at weight 1 of an eyeLook shape, the largest in Live Link Face's takes
+RIDGE_M = 5e-5  # RMS displacement of the face that a unit of a coefficient must be worth
 JAW_STEPS = 4
-MAX_JAW_RAD = 0.8
-"""A jaw turns less; further, the fit has left what it is linear in."""
+MAX_JAW_RAD = 0.8  # A jaw turns less; further, the fit has left what it is linear in
 # jawOpen, jawLeft and jawRight at which the other shapes are combined.
 JAW_POSES = (
-    (0, 0, 0), (0.25, 0, 0), (0.5, 0, 0), (0.75, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0.5, 0), (0, 0, 0.5),
-    (0.5, 0.5, 0), (0.5, 0, 0.5), (1, 1, 0), (1, 0, 1), (0.25, 1, 0), (0.25, 0, 1),
+    (0, 0, 0), (0.25, 0, 0), (0.5, 0, 0), (0.75, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1),
+    (0, 0.5, 0), (0, 0, 0.5), (0.5, 0.5, 0), (0.5, 0, 0.5), (1, 1, 0), (1, 0, 1), (0.25, 1, 0),
+    (0.25, 0, 1),
 )  # fmt: skip
-COMBINATIONS = 60
-"""Random combinations of the other shapes at each of the poses of the jaw."""
-ACTIVE_SHARE = 0.35
-"""Of the shapes in a combination."""
+COMBINATIONS = 60  # Random combinations of the other shapes at each of the poses of the jaw
+ACTIVE_SHARE = 0.35  # Of the shapes in a combination
 CACHED_MAPS = 8
 _cache: OrderedDict[bytes, "HeadMap"] = OrderedDict()
 
@@ -70,10 +63,8 @@ class HeadMap:
     def parameters(self, weights: np.ndarray) -> np.ndarray:
         """(T, E + 9) expression coefficients, jaw and eyes of weights (T, 52)."""
         effective = effective_weights(weights)
-        return np.concatenate(
-            [features(weights) @ self.expressions, effective @ self.jaw, effective @ self.eyes],
-            axis=1,
-        )
+        expressions = features(weights) @ self.expressions
+        return np.hstack([expressions, effective @ self.jaw, effective @ self.eyes])
 
     def frames(self, performance: Performance) -> list[FlameFrame]:
         """One frame per row of the performance; the head's rotation turns the neck."""
@@ -89,8 +80,7 @@ class HeadMap:
 
 
 def features(weights: np.ndarray) -> np.ndarray:
-    """(T, FEATURES) of weights (T, 52): the `effective_weights`, then jawOpen times each of
-    PRODUCT_SHAPES."""
+    """(T, FEATURES): `effective_weights` of (T, 52), then jawOpen times PRODUCT_SHAPES."""
     effective = effective_weights(weights)
     return np.concatenate(
         [effective, effective[:, JAW_OPEN, None] * effective[:, PRODUCTS]], axis=1
@@ -98,8 +88,7 @@ def features(weights: np.ndarray) -> np.ndarray:
 
 
 def head_turns(angles: np.ndarray) -> np.ndarray:
-    """Axis-angle (T, 3) of yaw, pitch and roll (T, 3): about y, then the turned x, then the turned
-    z."""
+    """Axis-angle (T, 3) of yaw, pitch and roll: about y, the turned x, then the turned z."""
     yaw, pitch, roll = np.asarray(angles, np.float64).T
     zero = np.zeros_like(yaw)
     about = [(zero, yaw, zero), (pitch, zero, zero), (zero, zero, roll)]
@@ -108,10 +97,8 @@ def head_turns(angles: np.ndarray) -> np.ndarray:
 
 
 def head_map(sequence: FlameSequence, name: str) -> HeadMap:
-    """The map for the model and identity of a sequence; computed once, then kept in memory.
-
-    `name` is what errors call the head. Raises StgaError as `face_points` does.
-    """
+    """The map for a model and identity, kept in memory; `name` is what errors call the head. Raises
+    StgaError as `face_points` does."""
     person = with_identity(sequence).model
     digest = hashlib.blake2b()
     for field in ("v_template", "shapedirs", "posedirs", "weights", "j_regressor", "faces"):
@@ -144,10 +131,8 @@ def _fitted(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> Head
 def _named(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
     """The map of a model without identity components whose expressions are ARKit's shapes."""
     columns = [COLUMN[name] for name in person.expression_names]
-    targets, expressions = (
-        np.zeros((COUNT, used.sum(), 3)),
-        np.zeros((FEATURES, person.n_expression)),
-    )
+    targets = np.zeros((COUNT, used.sum(), 3))
+    expressions = np.zeros((FEATURES, person.n_expression))
     targets[columns] = [
         points.on(shape, person.faces) for shape in np.moveaxis(person.shapedirs, 2, 0)
     ]
@@ -177,8 +162,7 @@ class _Fit:
         return rigid
 
     def coefficients(self, jaw: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """(S, E) ridge solutions for points (S, N, 3) with the jaw (3,) turned; points are linear
-        in coefficients."""
+        """(S, E) ridge solutions for points (S, N, 3) with the jaw (3,) turned."""
         start, slopes = self.posed.linearized(np.zeros(self.count), self.rigid(jaw))
         matrix = slopes[..., : self.count].reshape(-1, self.count)
         residual = (wanted - start).reshape(len(wanted), -1)
@@ -186,8 +170,7 @@ class _Fit:
         return np.asarray(np.linalg.solve(normal, matrix.T @ residual.T).T)
 
     def expressions(self) -> np.ndarray:
-        """(FEATURES, E) that best give the coefficients of single shapes and of random
-        combinations."""
+        """(FEATURES, E) that best give single shapes and random combinations."""
         rows, solutions = [], []
         for number, pose in enumerate(JAW_POSES):
             weights = _combinations(pose, np.random.default_rng(number))
@@ -201,8 +184,7 @@ class _Fit:
         )
 
     def _jaw(self) -> np.ndarray:
-        """(52, 3) axis-angle of the shapes that turn the jaw, each fitted together with
-        expressions."""
+        """(52, 3) axis-angle of the shapes that turn the jaw, fitted together with expressions."""
         found = np.zeros((COUNT, 3))
         at = self.count + 3 * JOINTS.index("jaw")
         columns = [*range(self.count), at, at + 1, at + 2]
@@ -246,16 +228,13 @@ def _gaze() -> np.ndarray:
 
 
 def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
-    """(52,) of each shape alone, mouthClose at an open jaw; gaze is whole where the head has
-    eyeballs."""
+    """(52,) of each shape alone, mouthClose at an open jaw; gaze is whole with eyeballs."""
     weights = np.eye(COUNT)
     weights[MOUTH_CLOSE, JAW_OPEN] = 1
     values = found.parameters(weights)
+    count = fit.count
     moved = np.stack(
-        [
-            fit.posed.positions(row[: fit.count], fit.rigid(row[fit.count : fit.count + 3]))
-            for row in values
-        ]
+        [fit.posed.positions(row[:count], fit.rigid(row[count : count + 3])) for row in values]
     )
     done = moved - fit.neutral
     done[MOUTH_CLOSE] = moved[MOUTH_CLOSE] - moved[JAW_OPEN]
@@ -271,8 +250,7 @@ def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
 
 
 def page_controls(sequence: FlameSequence | None) -> ShapeControls | None:
-    """The controls of a FLAME head; None for a head without FLAME, or whose face ARKit's shapes do
-    not fit."""
+    """The controls of a FLAME head; None for a head that ARKit's shapes do not fit."""
     if sequence is None:
         return None
     try:

@@ -15,17 +15,14 @@ from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
 from .shapes import JAW_OPEN, MOUTH_CLOSE
 
 MAX_SWEEPS = 60
-CONVERGED = 1e-5
-"""Largest change of a weight in a sweep, below which the descent stops."""
+CONVERGED = 1e-5  # Largest change of a weight in a sweep, below which the descent stops
 NEWTON_STEPS, STEP_SHARES = 12, (1.0, 0.5, 0.2, 0.05, 0.0)
-CHUNK = 256
-"""Rows whose matrices are held at once."""
-RIDGE = 1e-9
-"""Share of the mean squared displacement that keeps weights apart which this head cannot tell
-apart."""
+CHUNK = 256  # Rows whose matrices are held at once
+RIDGE = 1e-9  # Share of the mean squared displacement, for weights that a head cannot tell apart
 TIMECODE_BASE = 60
-EXTRA_COLUMNS = ("HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw", "LeftEyePitch", "LeftEyeRoll", "RightEyeYaw",
-                 "RightEyePitch", "RightEyeRoll")  # fmt: skip
+EXTRA_COLUMNS = tuple(
+    f"{part}{turn}" for part in ("Head", "LeftEye", "RightEye") for turn in ("Yaw", "Pitch", "Roll")
+)
 
 
 def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Performance:
@@ -99,11 +96,7 @@ def _descended(
     powers: np.ndarray | None = None,
     limits: np.ndarray | float = 1.0,
 ) -> np.ndarray:
-    """(T, K) minimizers from 0 to `limits` of ½ wᵀGw − rᵀw by cyclic coordinate descent, all rows
-    at once.
-
-    gram (P, K, K) with G = Σ powers[:, p] gram[p], powers (T, P); right (T, K).
-    """
+    """(T, K) minimizers in 0…`limits` of ½ wᵀGw − rᵀw, G = Σ powers[:, p] gram[p], row by row."""
     powers = np.ones((len(right), 1)) if powers is None else powers
     limits, weights = np.broadcast_to(limits, right.shape), np.zeros_like(right)
     ridge = RIDGE * float(np.trace(gram[0])) / max(len(gram[0]), 1)
@@ -130,8 +123,7 @@ def _descended(
 def _polished(
     matrices: np.ndarray, right: np.ndarray, weights: np.ndarray, limits: np.ndarray
 ) -> np.ndarray:
-    """Minimizers from 0 to `limits` of ½ wᵀGw − rᵀw near weights (T, K), by projected Newton steps
-    (Bertsekas 1982)."""
+    """The minimizers near weights (T, K), by projected Newton steps (Bertsekas 1982)."""
 
     def value(w: np.ndarray) -> np.ndarray:
         return np.asarray((w * (0.5 * np.einsum("tjk,tk->tj", matrices, w) - right)).sum(axis=1))

@@ -1,5 +1,4 @@
-"""The one place where a file becomes the motion of a head: FLAME parameters, captures and ARKit
-performances."""
+"""A file as the motion of a head: FLAME parameters, captures and ARKit performances."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,9 +32,7 @@ from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_p
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
-QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000
-"""Share of the frames that count as quiet: those most alike, or of least weight; and how many are
-compared."""
+QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000  # Of frames that count as quiet; compared ones
 NEUTRALS = {
     "none": "as recorded",
     "quiet": "both recordings are at rest in the fifth of their frames that are most alike",
@@ -44,16 +41,13 @@ NEUTRALS = {
 }
 MIN_WIDTH = {"face": 0.5, "jaw": 0.02, "eyes": 0.1}
 """Least half width of a trained range, in units of coefficients and in radians."""
-OUTER_QUANTILE = 0.01
-"""Of the trained frames, cut off at both ends of the range: single mistracked frames widen
-nothing."""
+OUTER_QUANTILE = 0.01  # Of trained frames, cut off at both ends: single mistracked ones
 
 
 @dataclass(frozen=True)
 class TrainedRange:
-    """Middle and half width, per part of the face (`PART_FIELDS`), of the parameters that an avatar
-    was trained on; quiet and first: the trained person's own quiet face, and that of the first
-    frame."""
+    """Middle and half width, per part (`PART_FIELDS`), of what an avatar was trained on; the
+    person's quiet face and that of the first frame."""
 
     middle: dict[str, np.ndarray]
     width: dict[str, np.ndarray]
@@ -61,8 +55,7 @@ class TrainedRange:
     first: dict[str, np.ndarray]
 
     def neutral(self, choice: str) -> dict[str, np.ndarray]:
-        """The face on which a motion is put that is relative to another neutral, one of `NEUTRALS`
-        but "none"."""
+        """The face of one of `NEUTRALS` but "none", on which a relative motion is put."""
         return self.first if choice == "first" else self.quiet
 
 
@@ -77,11 +70,8 @@ def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
 
 
 def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
-    """Part -> the median of its parameters over the frames that are most alike: a face keeps
-    returning to rest.
-
-    Needs no order in time, which recordings of single expressions lack.
-    """
+    """Part -> the median of its parameters over the frames that are most alike, in whatever order:
+    a face keeps returning to rest."""
     frames = evenly_spread(frames, MAX_COMPARED_FRAMES)
     parts = {
         part: np.stack([getattr(frame, name) for frame in frames])
@@ -102,13 +92,6 @@ def quiet_weights(performance: Performance) -> np.ndarray:
     return np.asarray(
         np.median(performance.weights[order[: max(1, round(QUIET_SHARE * len(order)))]], axis=0)
     )
-
-
-def chosen_neutral(where: str, choice: str) -> str:
-    """The choice. Raises StgaError where it is none of `NEUTRALS`."""
-    if choice not in NEUTRALS:
-        raise StgaError(f"{where}: neutral is {choice!r}, expected one of {', '.join(NEUTRALS)}")
-    return choice
 
 
 def exchanged_neutral(
@@ -169,8 +152,7 @@ MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
 
 
 def parsed_gain(text: str) -> tuple[str, float]:
-    """Name and factor of `jawOpen=0.8`, a key and value of `MotionOptions.gains`. Raises StgaError
-    for other text."""
+    """Name and factor of `jawOpen=0.8`, for `MotionOptions.gains`. Raises StgaError."""
     name, _, number = text.partition("=")
     if name not in (*PARTS, "head", *ARKIT_SHAPES):
         raise StgaError(f"'{name}' names none of {', '.join((*PARTS, 'head'))} and ARKit's shapes")
@@ -197,12 +179,12 @@ class MotionOptions:
     """
 
     strength: float = option(
-        "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first pose",
-        1.0, 0, MAX_FACTOR,
+        "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first "
+        "pose", 1.0, 0, MAX_FACTOR,
     )  # fmt: skip
     neutral: str = option(
-        "what the motion is taken relative to, so that this head's own face is moved, not the performer's",
-        "none", choices=NEUTRALS,
+        "what the motion is taken relative to, so that this head's own face is moved, not the "
+        "performer's", "none", choices=NEUTRALS,
     )  # fmt: skip
     smoothing: float = option(
         "smooth a face performance in time, by this standard deviation",
@@ -210,13 +192,13 @@ class MotionOptions:
     )  # fmt: skip
     mirror: bool = option("exchange left and right of a face performance", False)
     gains: Mapping[str, float] = option(
-        "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may be repeated",
-        default_factory=dict, flag="--gain", metavar="NAME=FACTOR", parse=parsed_gain,
+        "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may "
+        "be repeated", default_factory=dict, flag="--gain", metavar="NAME=FACTOR",
+        parse=parsed_gain,
     )  # fmt: skip
     stay_trained: float | None = option(
-        "lead the motion softly back to the range that the run was trained on, and print how far it was outside; "
-        "0: print only, 1 (default): fully",
-        None, 0, 1, metavar="SHARE", bare=1.0,
+        "lead the motion softly back to the range that the run was trained on, and print how far "
+        "it was outside; 0: print only, 1 (default): fully", None, 0, 1, metavar="SHARE", bare=1.0,
     )  # fmt: skip
     exchange: tuple[str, ...] = option(
         "exchange left and right of one pair alone, which some senders exchange; may be repeated",
@@ -241,14 +223,10 @@ class Motion:
 
 
 def open_motion(
-    path: Path,
-    flame: Path | None,
-    neutral: np.ndarray,
-    faces: np.ndarray,
-    options: MotionOptions | None = None,
-    trained: TrainedRange | None = None,
+    path: Path, flame: Path | None, neutral: np.ndarray, faces: np.ndarray,
+    options: MotionOptions | None = None, trained: TrainedRange | None = None,
     fps: float | None = None,
-) -> Motion:
+) -> Motion:  # fmt: skip
     """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles
     `faces` (F, 3).
 
@@ -261,27 +239,21 @@ def open_motion(
     Raises StgaError where the file is no motion, or its model has other triangles.
     """
     options = options or MotionOptions()
-    chosen_neutral(str(path), options.neutral)
+    if options.neutral not in NEUTRALS:
+        known = ", ".join(NEUTRALS)
+        raise StgaError(f"{path}: neutral is {options.neutral!r}, expected one of {known}")
     if is_performance(path):
         model = flame_model(flame)
         if flame is None and len(model.faces) != len(faces):
-            raise StgaError(
-                f"{path}: needs the FLAME model file (.pkl or .npz) of the head that it moves; give it with --flame"
-            )
+            problem = "needs the FLAME model file (.pkl or .npz) of the head that it moves"
+            raise StgaError(f"{path}: {problem}; give it with --flame")
         _check_faces(path, model, faces)
-        return performed(
-            read_performance(path),
-            person_of(model, neutral),
-            str(flame or path),
-            options,
-            trained,
-            fps,
-        )
+        person, name = person_of(model, neutral), str(flame or path)
+        return performed(read_performance(path), person, name, options, trained, fps)
     capture = open_capture(path, flame)
     if capture.flame is None:
-        raise StgaError(
-            f"{path}: was not tracked with FLAME, so it has no parameters of expression and pose"
-        )
+        problem = "was not tracked with FLAME, so it has no parameters of expression and pose"
+        raise StgaError(f"{path}: {problem}")
     _check_faces(path, capture.flame.model, faces)
     sequence = transferred_motion(capture.flame, neutral)
     frames, beyond = adapted(
@@ -293,15 +265,10 @@ def open_motion(
 
 
 def performed(
-    performance: Performance,
-    person: FlameSequence,
-    name: str,
-    options: MotionOptions,
-    trained: TrainedRange | None = None,
-    fps: float | None = None,
-) -> Motion:
-    """A performance on a person's head: one timestep per 1/fps seconds, from 0 on. `name` is what
-    errors call it."""
+    performance: Performance, person: FlameSequence, name: str, options: MotionOptions,
+    trained: TrainedRange | None = None, fps: float | None = None,
+) -> Motion:  # fmt: skip
+    """A performance on a person's head, a timestep per 1/fps seconds; `name` is for errors."""
     # `frames_of` applies it
     prepared = prepared_performance(performance, replace(options, strength=1.0), fps)
     frames, beyond = frames_of(head_map(person, name), prepared, options, trained)
@@ -312,9 +279,8 @@ def performed(
 def adapted(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None = None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of another person's FLAME motion with the options' neutral, strength and range; and
-    part -> (T,) how far they were outside the trained range before they were led back
-    (`transfer.outside`)."""
+    """Frames of another's FLAME motion with the options' neutral, strength and range; and how far
+    they were `outside`."""
     theirs = {"quiet": frames, "first": frames[:1]}.get(options.neutral)
     if theirs is not None:
         frames = exchanged_neutral(frames, quiet_neutral(theirs))
@@ -324,17 +290,14 @@ def adapted(
 def prepared_performance(
     performance: Performance, options: MotionOptions, fps: float | None = None
 ) -> Performance:
-    """The performance at an even rate, relative to its neutral face, smoothed, amplified, mirrored,
-    at the strength."""
+    """Evenly sampled, relative to its neutral, smoothed, `corrected`, at the strength."""
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
-        raise StgaError(
-            f"a performance cannot be resampled to {fps:g} frames per second, expected {MIN_FPS:g} to {MAX_FPS:g}"
-        )
+        problem = f"cannot be resampled to {fps:g} frames per second"
+        raise StgaError(f"a performance {problem}, expected {MIN_FPS:g} to {MAX_FPS:g}")
     rate = fps or performance.fps
     if performance.times[-1] * rate > MAX_ROWS:
-        raise StgaError(
-            f"a performance of {performance.times[-1]:.0f} s at {rate:g} frames per second is too long"
-        )
+        length = f"{performance.times[-1]:.0f} s at {rate:g} frames per second"
+        raise StgaError(f"a performance of {length} is too long")
     rest = None
     if options.neutral in ("quiet", "first"):
         weights = (
@@ -349,8 +312,7 @@ def prepared_performance(
 def corrected(
     performance: Performance, options: MotionOptions, rest: Performance | None = None
 ) -> Performance:
-    """The performance row by row: with the sender's exchanged pairs put right, relative to the face
-    of `rest` (None: as it is), amplified and mirrored."""
+    """With exchanged pairs put right, relative to the face of `rest`, amplified and mirrored."""
     changed = exchanged_sides(performance, options.exchange)
     if rest is not None:
         changed = relative_to(changed, exchanged_sides(rest, options.exchange))
@@ -359,8 +321,7 @@ def corrected(
 
 
 def at_strength(performance: Performance, options: MotionOptions) -> Performance:
-    """Weights and head rotation times the strength, for what has no FLAME parameters, which
-    `frames_of` strengthens."""
+    """Weights and head rotation times the strength, for what has no FLAME parameters."""
     return amplified(performance, dict.fromkeys((*PARTS, "head"), options.strength))
 
 
@@ -370,17 +331,15 @@ def frames_of(
     options: MotionOptions,
     trained: TrainedRange | None = None,
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of a performance, as `corrected`, at the strength on the head of a map; and part ->
-    (T,) how far they were outside the trained range before they were led back
-    (`transfer.outside`)."""
+    """Frames of a `corrected` performance at the strength on a map's head; and how far they were
+    `outside`."""
     return _finished(found.frames(performance), options, trained)
 
 
 def _finished(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """The frames on the head's own neutral, where they are relative to the performer's; at the
-    strength, led back, and how far they were outside the trained range before that."""
+    """The frames on the head's neutral, at the strength, led back; how far they were outside."""
     if options.neutral != "none" and trained is not None:
         frames = exchanged_neutral(frames, None, trained.neutral(options.neutral))
     if options.strength != 1.0:
@@ -402,6 +361,5 @@ def _with_frames(
 
 def _check_faces(path: Path, model: FlameModel, faces: np.ndarray) -> None:
     if not np.array_equal(model.faces, faces):
-        raise StgaError(
-            f"{path}: its mesh has other triangles than the one this avatar was trained on"
-        )
+        problem = "its mesh has other triangles than the one this avatar was trained on"
+        raise StgaError(f"{path}: {problem}")

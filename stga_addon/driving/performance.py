@@ -9,35 +9,30 @@ import numpy as np
 from ..errors import StgaError, shorten
 
 ARKIT_SHAPES = (
-    "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft", "eyeSquintLeft",
-    "eyeWideLeft", "eyeBlinkRight", "eyeLookDownRight", "eyeLookInRight", "eyeLookOutRight", "eyeLookUpRight",
-    "eyeSquintRight", "eyeWideRight", "jawForward", "jawRight", "jawLeft", "jawOpen", "mouthClose", "mouthFunnel",
-    "mouthPucker", "mouthRight", "mouthLeft", "mouthSmileLeft", "mouthSmileRight", "mouthFrownLeft",
-    "mouthFrownRight", "mouthDimpleLeft", "mouthDimpleRight", "mouthStretchLeft", "mouthStretchRight",
-    "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper", "mouthPressLeft", "mouthPressRight",
-    "mouthLowerDownLeft", "mouthLowerDownRight", "mouthUpperUpLeft", "mouthUpperUpRight", "browDownLeft",
-    "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight", "cheekPuff", "cheekSquintLeft",
+    "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft",
+    "eyeSquintLeft", "eyeWideLeft", "eyeBlinkRight", "eyeLookDownRight", "eyeLookInRight",
+    "eyeLookOutRight", "eyeLookUpRight", "eyeSquintRight", "eyeWideRight", "jawForward", "jawRight",
+    "jawLeft", "jawOpen", "mouthClose", "mouthFunnel", "mouthPucker", "mouthRight", "mouthLeft",
+    "mouthSmileLeft", "mouthSmileRight", "mouthFrownLeft", "mouthFrownRight", "mouthDimpleLeft",
+    "mouthDimpleRight", "mouthStretchLeft", "mouthStretchRight", "mouthRollLower", "mouthRollUpper",
+    "mouthShrugLower", "mouthShrugUpper", "mouthPressLeft", "mouthPressRight", "mouthLowerDownLeft",
+    "mouthLowerDownRight", "mouthUpperUpLeft", "mouthUpperUpRight", "browDownLeft", "browDownRight",
+    "browInnerUp", "browOuterUpLeft", "browOuterUpRight", "cheekPuff", "cheekSquintLeft",
     "cheekSquintRight", "noseSneerLeft", "noseSneerRight", "tongueOut",
 )  # fmt: skip
 """In the order of Live Link Face's CSV files."""
 COUNT = len(ARKIT_SHAPES)
-MAX_WEIGHT = 10.0
-"""Beyond it, weights of shapes are in percent, or are no weights."""
+MAX_WEIGHT = 10.0  # Beyond it, weights of shapes are in percent, or are no weights
 COLUMN = {name: column for column, name in enumerate(ARKIT_SHAPES)}
-OPTIONAL = ("tongueOut",)
-"""Shapes that sources of 51 lack; they stay zero."""
+OPTIONAL = ("tongueOut",)  # Shapes that sources of 51 lack; they stay zero
 PARTS = ("face", "jaw", "eyes")
-MAX_NAMED = 8
-"""Names that an error lists."""
+MAX_NAMED = 8  # Names that an error lists
 _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
 
 
 def arkit_name(name: str) -> str | None:
-    """ARKit's spelling of a shape's name, or None where it is none of the 52.
-
-    Any capitals and separators, a prefix up to the last dot, and `_L` or `_R` for Left and Right
-    are accepted: `blendShapes.JawOpen`, `mouth_smile_left`, `mouthSmile_L`.
-    """
+    """ARKit's spelling of `blendShapes.JawOpen`, `mouth_smile_left`, `mouthSmile_L`: any capitals,
+    separators and prefix up to the last dot; None where it is none of the 52."""
     plain = name.rsplit(".", 1)[-1].strip()
     side = re.fullmatch(r"(.*)[_\- ]([LR])", plain, re.IGNORECASE | re.DOTALL)
     if side:
@@ -60,11 +55,8 @@ def mirrored_name(name: str) -> str:
 
 
 def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
-    """Column of the 52 -> index in `names` (the first of each).
-
-    Raises StgaError, which begins with `where`, naming the shapes that are missing; those of
-    `OPTIONAL` may be.
-    """
+    """Column of the 52 -> first index in `names`. Raises StgaError, beginning with `where`, with
+    the shapes that are missing, but for those of `OPTIONAL`."""
     listed = list(names)
     found: dict[int, int] = {}
     for index, name in enumerate(listed):
@@ -75,16 +67,14 @@ def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
     if not missing:
         return found
     if len(missing) > COUNT // 2:
-        raise StgaError(
-            f"{where}: names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut"
-        )
+        problem = f"names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut"
+        raise StgaError(f"{where}: {problem}")
     more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
     raise StgaError(f"{where}: lacks {', '.join(missing[:MAX_NAMED])}{more}{_unknown(listed)}")
 
 
 def _unknown(names: list[str]) -> str:
-    """What stands there instead of the missing names, if anything does: mistyped names, most
-    likely."""
+    """What stands there instead of the missing names: mistyped names, most likely."""
     prefixes = ("eye", "jaw", "mouth", "brow", "cheek", "nose", "tongue")
     rotations = re.compile(
         r"(left|right)?(eye|head)(yaw|pitch|roll)|(left|right)eye(yaw|pitch|roll)"
@@ -100,13 +90,9 @@ def _unknown(names: list[str]) -> str:
 
 
 MIRROR = np.array([COLUMN[mirrored_name(name)] for name in ARKIT_SHAPES])
-EXCHANGEABLE = ("jaw", "mouth")
-"""Pairs of shapes, such as mouthLeft and mouthRight, which receivers report as exchanged by some
-senders."""
-GAP = 1.5
-"""Rows farther apart than this many frames have lost some between them."""
-SMOOTHING_REACH = 3.0
-"""Standard deviations of the smoothing kernel that are summed."""
+EXCHANGEABLE = ("jaw", "mouth")  # Pairs, as mouthLeft and mouthRight, that some senders exchange
+GAP = 1.5  # Rows farther apart than this many frames have lost some between them
+SMOOTHING_REACH = 3.0  # Standard deviations of the smoothing kernel that are summed
 
 
 @dataclass(frozen=True)
@@ -162,8 +148,7 @@ def exchanged_sides(performance: Performance, pairs: tuple[str, ...]) -> Perform
 
 
 def smoothed(performance: Performance, seconds: float) -> Performance:
-    """Convolved in time by a Gaussian of standard deviation `seconds`; rows must be evenly spaced
-    (`resampled`)."""
+    """Convolved by a Gaussian of standard deviation `seconds`; rows must be even (`resampled`)."""
     deviation = seconds * performance.fps
     reach = int(np.ceil(SMOOTHING_REACH * deviation))
     if reach < 1:
@@ -180,16 +165,14 @@ def smoothed(performance: Performance, seconds: float) -> Performance:
 
 
 def amplified(performance: Performance, gains: Mapping[str, float]) -> Performance:
-    """Weights times the gain of their part (`names.PARTS`, or "head") or of their own name; 1 where
-    none is given."""
+    """Weights times the gain of their part (PARTS, "head") or of their own name, else 1."""
     factors = np.array([gains.get(name, gains.get(part_of(name), 1.0)) for name in ARKIT_SHAPES])
     head = None if performance.head is None else performance.head * gains.get("head", 1.0)
     return replace(performance, weights=performance.weights * factors, head=head)
 
 
 def relative_to(performance: Performance, rest: Performance) -> Performance:
-    """The performance without the face and head rotation of `rest` (its first row), so that these
-    are 0 and a weight of 1 stays 1."""
+    """Without the face and head rotation of `rest` (its first row); a weight of 1 stays 1."""
     neutral = rest.weights[0]
     head = performance.head
     if head is not None and rest.head is not None:

@@ -1,5 +1,4 @@
-"""Reading of face performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap and named
-weights in JSON."""
+"""Performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap, weights in JSON."""
 
 import csv
 import math
@@ -14,29 +13,21 @@ from ..files import file_size, read_json
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6}))?", re.ASCII)
-BASES = (24, 25, 30, 48, 50, 60, 100, 120)
-"""Frames per second that timecodes count."""
-USUAL_BASE = 60
-"""Of a take of less than a second, whose frame numbers do not tell."""
+BASES = (24, 25, 30, 48, 50, 60, 100, 120)  # Frames per second that timecodes count
+USUAL_BASE = 60  # Of a take of less than a second, whose frame numbers do not tell
 DAY_S = 86_400.0
-DROP_RATIO = 1000 / 1001
-"""Timecodes with a semicolon leave out frame numbers, because their frames come this much
-slower."""
+DROP_RATIO = 1000 / 1001  # Of drop-frame timecodes, with a semicolon, whose frames come slower
 
 
 def seconds_of(where: str, texts: list[str]) -> np.ndarray:
-    """(T,) seconds from the first of T timecodes `HH:MM:SS:FF.sub`, which may pass midnight.
-
-    The rate that FF counts in is found from the numbers themselves: rows may come at half of it.
-    Raises StgaError, which begins with `where` and names the row, for text that is no timecode.
-    """
+    """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
+    is found from the numbers. Raises StgaError, beginning with `where`, for other text."""
     fields = []
     for row, text in enumerate(texts):
         found = PATTERN.fullmatch(text.strip())
         if found is None:
-            raise StgaError(
-                f"{where}: row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
-            )
+            problem = f"row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
+            raise StgaError(f"{where}: {problem}")
         hours, minutes, whole = (int(found[group]) for group in (1, 2, 3))
         fields.append(
             (hours, minutes, whole, int(found[5]), float(f"0.{found[6] or 0}"), found[4] == ";")
@@ -45,13 +36,9 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     second = 3600 * hours + 60 * minutes + whole
     base = _base(second, frames + parts)
     if dropping.any():
-        total_minutes = 60 * hours + minutes
-        counted = (
-            second * base
-            + frames
-            + parts
-            - round(base / 15) * (total_minutes - np.floor(total_minutes / 10))
-        )
+        minute = 60 * hours + minutes
+        left_out = round(base / 15) * (minute - np.floor(minute / 10))
+        counted = second * base + frames + parts - left_out
         elapsed = counted / (base * DROP_RATIO)
     else:
         elapsed = second + (frames + parts) / base
@@ -80,11 +67,8 @@ _VALUE = re.compile(r"([A-Za-z_]+)[-&](-?\d+(?:\.\d+)?)", re.ASCII)
 
 
 def parse_packet(data: bytes) -> FacePacket | None:
-    """The frame of `mouthSmile_R-0|…|=head#rx,ry,rz,x,y,z|rightEye#x,y,z|leftEye#x,y,z|`, or None
-    for other bytes.
-
-    Version 2 separates names and values by `&`. Source: the protocol's description by its author.
-    """
+    """The frame of `mouthSmile_R-0|…|=head#rx,ry,rz,x,y,z|rightEye#x,y,z|leftEye#x,y,z|` (version
+    2: `&` before values) by the protocol's author, or None for other bytes."""
     if len(data) > MAX_PACKET_BYTES:
         return None
     try:
@@ -118,34 +102,25 @@ def _head(text: str) -> tuple[float, float, float] | None:
 SUFFIXES = (".csv", ".json", ".txt")
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
-DEFAULT_FPS = 60.0
-"""Of files that hold neither times nor a rate: ARKit's own."""
+DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
 MIN_FPS, MAX_FPS = 1.0, 1000.0
 HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
-COUNT_COLUMN, TIMECODE_COLUMNS, SECONDS_COLUMNS = (
-    "blendshapecount",
-    ("timecode",),
-    ("time", "timestamp", "seconds"),
-)
+COUNT_COLUMN = "blendshapecount"
+TIMECODE_COLUMNS = ("timecode",)
+SECONDS_COLUMNS = ("time", "timestamp", "seconds")
 TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
 """Endings of files that Live Link Face writes beside a take's own."""
-FRAME_KEYS, NAME_KEYS = (
-    ("frames", "weightMat", "weights"),
-    ("facsNames", "names", "blendShapeNames", "blendshapes"),
-)
+FRAME_KEYS = ("frames", "weightMat", "weights")
+NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes")
 WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
 CATEGORY_KEYS = (("categoryName", "category_name", "name"), ("score", "value", "weight"))
 
 
 def is_performance(path: Path) -> bool:
-    """Whether a path has the form of a performance: one of `SUFFIXES`, or a Live Link Face take's
-    folder."""
+    """Whether a path is one of `SUFFIXES`, or the folder of a Live Link Face take."""
     if path.is_dir():
-        return (
-            not (path / "flame_param").is_dir()
-            and bool(_take_files(path))
-            and not any(path.glob("transforms*.json"))
-        )
+        is_capture = (path / "flame_param").is_dir() or any(path.glob("transforms*.json"))
+        return not is_capture and bool(_take_files(path))
     return path.suffix.lower() in SUFFIXES
 
 
@@ -158,7 +133,12 @@ def read_performance(path: Path) -> Performance:
     file, the row, and the shapes that are missing.
     """
     if path.is_dir():
-        path = _take_file(path)
+        files = _take_files(path)
+        own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
+        if len(own) != 1:
+            names = ", ".join(path.name for path in own[:4]) or "none"
+            raise StgaError(f"{path}: a take's folder holds one CSV file, found {names}")
+        path = own[0]
     suffix = path.suffix.lower()
     if suffix == ".json":
         return _read_json(path)
@@ -166,24 +146,14 @@ def read_performance(path: Path) -> Performance:
         return _read_csv(path)
     if suffix == ".txt":
         return _read_packets(path)
-    raise StgaError(
-        f"{path}: is no performance; expected {', '.join(SUFFIXES)} or the folder of a take"
-    )
+    problem = f"is no performance; expected {', '.join(SUFFIXES)} or the folder of a take"
+    raise StgaError(f"{path}: {problem}")
 
 
 def _take_files(folder: Path) -> list[Path]:
     return sorted(
         path for path in folder.iterdir() if path.suffix.lower() == ".csv" and path.is_file()
     )
-
-
-def _take_file(folder: Path) -> Path:
-    files = _take_files(folder)
-    own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
-    if len(own) != 1:
-        names = ", ".join(path.name for path in own[:4]) or "none"
-        raise StgaError(f"{folder}: a take's folder holds one CSV file, found {names}")
-    return own[0]
 
 
 def _text(path: Path) -> str:
@@ -241,11 +211,8 @@ def _csv_times(
     codes = [] if code is None else [row[code] if code < len(row) else "" for row in body]
     if any(":" in text for text in codes):
         return seconds_of(str(path), codes)
-    at = (
-        code
-        if code is not None
-        else next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
-    )
+    at = next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
+    at = at if code is None else code
     if at is None:
         return None
     return np.array([_number(path, row, number, at, header) for number, row in enumerate(body)])
@@ -256,9 +223,8 @@ def _number(path: Path, row: list[str], number: int, index: int, header: list[st
     try:
         return float(text)
     except ValueError:
-        raise StgaError(
-            f"{path}: row {number + 1}: {shorten(header[index])} is {shorten(text)}, expected a number"
-        ) from None
+        problem = f"{shorten(header[index])} is {shorten(text)}, expected a number"
+        raise StgaError(f"{path}: row {number + 1}: {problem}") from None
 
 
 def _read_packets(path: Path) -> Performance:
@@ -266,9 +232,8 @@ def _read_packets(path: Path) -> Performance:
     packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
     if not known:
-        raise StgaError(
-            f"{path}: has no line of iFacialMocap, such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
-        )
+        problem = "such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
+        raise StgaError(f"{path}: has no line of iFacialMocap, {problem}")
     columns_of(str(path), known[0].names)
     weights = np.stack([packet.weights for packet in known if packet.weights is not None])
     heads = [packet.head for packet in known]
@@ -345,39 +310,29 @@ def _is_number(value: Any) -> bool:
 
 
 def _performance(
-    path: Path,
-    times: np.ndarray | None,
-    weights: np.ndarray,
-    head: np.ndarray | None,
+    path: Path, times: np.ndarray | None, weights: np.ndarray, head: np.ndarray | None,
     fps: float | None = None,
-) -> Performance:
+) -> Performance:  # fmt: skip
     """The checked performance in the order of its times; of rows with the same time the first."""
     if len(weights) > MAX_ROWS:
         raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")
     if not (np.abs(weights) <= MAX_WEIGHT).all():
-        raise StgaError(
-            f"{path}: holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
-        )
+        problem = f"holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
+        raise StgaError(f"{path}: {problem}")
     if head is not None and not (np.abs(head) <= 4 * math.pi).all():
-        raise StgaError(
-            f"{path}: head rotation is beyond two turns, or not finite; expected radians"
-        )
+        problem = "head rotation is beyond two turns, or not finite; expected radians"
+        raise StgaError(f"{path}: {problem}")
     if times is None:
         rate = DEFAULT_FPS if fps is None else fps
-        times = (
-            np.arange(len(weights)) / rate
-            if MIN_FPS <= rate <= MAX_FPS
-            else np.full(len(weights), np.nan)
-        )
+        rate = rate if MIN_FPS <= rate <= MAX_FPS else np.nan
+        times = np.arange(len(weights)) / rate
     if not np.isfinite(times).all():
-        raise StgaError(
-            f"{path}: its times or its rate are not usable; expected {MIN_FPS:g} to {MAX_FPS:g} a second"
-        )
+        expected = f"expected {MIN_FPS:g} to {MAX_FPS:g} a second"
+        raise StgaError(f"{path}: its times or its rate are not usable; {expected}")
     times, first = np.unique(times - times.min(), return_index=True)
     steps = np.diff(times)
     rate = fps or (1 / float(np.median(steps)) if len(steps) else DEFAULT_FPS)
     if not MIN_FPS <= rate <= MAX_FPS or times[-1] * rate > MAX_ROWS:
-        raise StgaError(
-            f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, expected {MIN_FPS:g} to {MAX_FPS:g}"
-        )
+        expected = f"expected {MIN_FPS:g} to {MAX_FPS:g}"
+        raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
     return Performance(times, weights[first], None if head is None else head[first], rate)

@@ -26,8 +26,7 @@ from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 
 SHAPES_FILE = Path(__file__).with_name("arkit_shapes.npz")
 PUPILS = (468, 473)
-SKIN_POINTS = 468
-"""The points after these are the irises', which move with the eyeballs."""
+SKIN_POINTS = 468  # The points after these are the irises', which move with the eyeballs
 MOUTH_CLOSE, JAW_OPEN = COLUMN["mouthClose"], COLUMN["jawOpen"]
 
 
@@ -62,8 +61,7 @@ def face_shapes() -> FaceShapes:
 
 
 def effective_weights(weights: np.ndarray) -> np.ndarray:
-    """Weights (..., 52) with mouthClose at most jawOpen: it closes the lips of an open jaw, and
-    does nothing else."""
+    """Weights (..., 52) with mouthClose at most jawOpen: it closes the lips of an open jaw."""
     limited = weights.copy()
     limited[..., MOUTH_CLOSE] = np.minimum(
         weights[..., MOUTH_CLOSE], np.maximum(weights[..., JAW_OPEN], 0)
@@ -78,27 +76,36 @@ EYEBALL_RADIUS_M = 0.012
 ITERATIONS = 12
 CANDIDATES = 24
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
-MIN_COSINE = 0.5
-"""Between the normals of a point and of the triangle that it may lie on."""
-FAR_M = 1.0
-"""Added to the distance of triangles that face another way."""
+MIN_COSINE = 0.5  # Between the normals of a point and of the triangle that it may lie on
+FAR_M = 1.0  # Added to the distance of triangles that face another way
 MAX_MATCH_M, MEDIANS = 0.003, 4.0
 """A nearest point counts up to this distance, or this many times the median of all."""
 TANGENTIAL_WEIGHT, PUPIL_WEIGHT, IDENTITY_DEVIATION_M, AFFINE_WEIGHT = 0.1, 30.0, 0.002, 0.09
-SMOOTHINGS = (0.3, 0.1, 0.03, 0.01)
-"""Ridge of the warp's kernel, in meters."""
+SMOOTHINGS = (0.3, 0.1, 0.03, 0.01)  # Ridge of the warp's kernel, in meters
 MAX_WARP_MATCH_M = 0.006
 MAX_SURFACE_DISTANCE_M = 0.003
 
 
 def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray]:
-    """The 478 points on the neutral head, and (478,) bool which lie reliably on its skin.
-
-    `name` is what errors call the head. Raises StgaError where its eyes are not where a head has
-    them.
-    """
+    """The 478 points on the neutral head, and (478,) bool which lie reliably on its skin. Raises
+    StgaError, with `name`, where its eyes are not where a head has them."""
     source, surface = face_shapes(), _Surface(model.v_template, model.faces)
-    pupils = _pupils(model, name)
+    joints = joint_positions(model, model.v_template)
+    foremost = []  # points of right and left eyeball
+    for joint in EYE_JOINTS:
+        eyeball = model.v_template[model.weights[:, joint] > EYEBALL_WEIGHT]
+        if len(eyeball):
+            foremost.append([*eyeball[:, :2].mean(axis=0), eyeball[:, 2].max()])
+        else:
+            foremost.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
+    apart = float(foremost[1][0] - foremost[0][0])
+    if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
+        low, high = 1000 * MIN_EYE_DISTANCE_M, 1000 * MAX_EYE_DISTANCE_M
+        raise StgaError(
+            f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {low:.0f} to "
+            f"{high:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
+        )
+    pupils = np.array(foremost)
     skin = source.reliable & (np.arange(len(source.points)) < SKIN_POINTS)
     points, normals = _aligned(surface, pupils, skin)
     points = _warped(surface, points, normals, pupils, skin)
@@ -120,8 +127,7 @@ class _Surface:
     def nearest(
         self, points: np.ndarray, normals: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Triangle (N,), barycentric and position (N, 3), and distance (N,) of the nearest points
-        that face alike."""
+        """Triangle, barycentric, position and distance of the nearest points that face alike."""
         squared = (self.centers**2).sum(1) - 2 * points @ self.centers.T
         squared += np.where(normals @ self.normals.T < MIN_COSINE, FAR_M, 0.0)
         count = min(CANDIDATES, len(self.centers))
@@ -132,17 +138,14 @@ class _Surface:
         turned = np.einsum("nkc,nc->nk", self.normals[near], normals) < MIN_COSINE
         best = (distance + FAR_M * turned).argmin(axis=1)
         rows = np.arange(len(points))
-        return (
-            near[rows, best],
-            barycentric[rows, best],
-            positions[rows, best],
-            distance[rows, best],
+        first, second, third, fourth = (
+            values[rows, best] for values in (near, barycentric, positions, distance)
         )
+        return first, second, third, fourth
 
 
 def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (N, K, 3) of the points of triangles (N, K, 3, 3) nearest to points
-    (N, 3)."""
+    """Barycentric coordinates (N, K, 3) of the points of triangles nearest to points (N, 3)."""
     a, b, c = np.moveaxis(corners, 2, 0)
     from_a, from_b = points[:, None] - a, points[:, None] - b
 
@@ -177,25 +180,6 @@ def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     )
 
 
-def _pupils(model: FlameModel, name: str) -> np.ndarray:
-    """(2, 3) foremost points of right and left eyeball."""
-    joints = joint_positions(model, model.v_template)
-    pupils = []
-    for joint in EYE_JOINTS:
-        eyeball = model.v_template[model.weights[:, joint] > EYEBALL_WEIGHT]
-        if len(eyeball):
-            pupils.append([*eyeball[:, :2].mean(axis=0), eyeball[:, 2].max()])
-        else:
-            pupils.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
-    apart = float(pupils[1][0] - pupils[0][0])
-    if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
-        raise StgaError(
-            f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {1000 * MIN_EYE_DISTANCE_M:.0f} to "
-            f"{1000 * MAX_EYE_DISTANCE_M:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
-        )
-    return np.array(pupils)
-
-
 def _aligned(
     surface: _Surface, pupils: np.ndarray, skin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -223,21 +207,12 @@ def _aligned(
         face, _, target, distance = surface.nearest(points[skin], normals[skin])
         kept = distance < max(MEDIANS * float(np.median(distance)), MAX_MATCH_M)
         moved, normal, target = basis[skin][kept], surface.normals[face[kept]], target[kept]
-        rows = np.concatenate(
-            [
-                np.einsum("na,nak->nk", normal, moved),
-                TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count),
-                anchors,
-                prior,
-            ]
-        )
+        towards = np.einsum("na,nak->nk", normal, moved)
+        along = TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count)
+        rows = np.concatenate([towards, along, anchors, prior])
         expected = AFFINE_WEIGHT * np.trace(linear) / 3 * np.eye(3).ravel()
-        wanted = [
-            (normal * target).sum(1),
-            TANGENTIAL_WEIGHT * target.ravel(),
-            PUPIL_WEIGHT * pupils.ravel(),
-            expected,
-        ]
+        wanted = [(normal * target).sum(1), TANGENTIAL_WEIGHT * target.ravel()]
+        wanted += [PUPIL_WEIGHT * pupils.ravel(), expected]
         found = np.linalg.lstsq(rows, np.concatenate([*wanted, np.zeros(count)]), rcond=None)[0]
         linear = found[entries].reshape(3, 3)
         points = basis @ found

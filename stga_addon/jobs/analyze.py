@@ -16,50 +16,46 @@ from .train import Train
 
 
 @dataclass(frozen=True)
-class Analyze:
+class _OfCapture:
+    capture: Path = like(Train, "capture")
+    flame: Path | None = like(Train, "flame")
+    principal_point: str = like(Train, "principal_point")
+
+
+@dataclass(frozen=True)
+class Analyze(_OfCapture):
     """Show what a capture holds, and which effects training on it would use; or what a run or
     avatar file holds.
 
     timed: whether presets are timed as well, which takes longer.
     """
 
-    capture: Path = like(Train, "capture")
-    flame: Path | None = like(Train, "flame")
-    principal_point: str = like(Train, "principal_point")
     effects: Mapping[str, str] | None = like(TrainingSettings, "effects")
     device: str = like(Train, "device")
     timed: bool = option("with --json: also the presets and their times", False, flag="--presets")
 
 
 @dataclass(frozen=True)
-class TimePresets:
+class TimePresets(_OfCapture):
     """Show the presets, and how long each would train on this machine."""
 
-    capture: Path = like(Train, "capture")
-    flame: Path | None = like(Train, "flame")
-    principal_point: str = like(Train, "principal_point")
     device: str = like(Train, "device")
 
 
 @dataclass(frozen=True)
-class Select:
+class Select(_OfCapture):
     """Show which triangles each frame selects for training."""
 
-    capture: Path = like(Train, "capture")
-    flame: Path | None = like(Train, "flame")
-    principal_point: str = like(Train, "principal_point")
     threshold: float = like(SelectionOptions, "threshold")
     zero_pose: str | None = like(
-        SelectionOptions,
-        "zero_pose",
-        default=None,
+        SelectionOptions, "zero_pose", default=None,
         help="motion that does not count as expression (default head)",
-    )
+    )  # fmt: skip
 
 
 def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
-    """Decide the effects of a training on the capture, and time the presets where that is asked
-    for. Raises StgaError; a capture without training views calls for nothing."""
+    """Decide the effects of a training on the capture; also times the presets if asked to. Raises
+    StgaError."""
     from ..training.effects.plan import plan_effects
 
     report(Progress(stage="Analyzing the capture"))
@@ -67,18 +63,16 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     if not capture.views.get("train"):
         return Analyzed((), {})
     device, _ = choose_device(request.device)
-    _, plan = plan_effects(
-        capture, make_settings(iterations=1, effects=dict(request.effects or {})), device
-    )
+    settings = make_settings(iterations=1, effects=dict(request.effects or {}))
+    _, plan = plan_effects(capture, settings, device)
     if not request.timed:
         return Analyzed(plan, {})
     # imports Numba, which deciding effects does without
     from ..training.preset_timing import time_presets
 
     report(Progress(0.5, "Timing the presets"))
-    return Analyzed(
-        plan, {timing.preset: timing.seconds for timing in time_presets(capture, device=device)}
-    )
+    timings = time_presets(capture, device=device)
+    return Analyzed(plan, {timing.preset: timing.seconds for timing in timings})
 
 
 def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:
@@ -96,17 +90,12 @@ def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed
 
 
 def select(request: Select, report: Report, say: Say) -> Selected:
-    """Select by the rule; says how much each timestep selects, and which regions as a whole. Raises
-    StgaError."""
+    """Say how much each timestep selects, and which regions as a whole. Raises StgaError."""
     capture = open_capture(request.capture, request.flame, request.principal_point)
     options = SelectionOptions(request.threshold, request.zero_pose or SelectionOptions.zero_pose)
     selection = select_capture(capture, options)
     say(f"threshold {1000 * request.threshold:g} mm, {len(capture.faces)} triangles")
     for timestep, faces in selection.items():
-        regions = [
-            name
-            for name, members in capture.regions.items()
-            if members.any() and faces[members].all()
-        ]
+        regions = (name for name, r in capture.regions.items() if r.any() and faces[r].all())
         say(f"{timestep:5d}  {faces.mean():6.1%}  {', '.join(regions)}")
     return Selected(selection)

@@ -1,5 +1,4 @@
-"""What an avatar is posed by: a capture, a motion, or the head of an open .blend file, also as a
-folder that another Python reads."""
+"""What poses an avatar: a capture, a motion, or the head of an open .blend file, or its folder."""
 
 import logging
 import re
@@ -14,7 +13,7 @@ from ..avatar.file import Avatar, read_avatar
 from ..capture.model import Capture
 from ..capture.open import open_capture, sequence_capture
 from ..capture.transforms import PRINCIPAL_POINTS
-from ..driving.open_motion import Motion, MotionOptions, TrainedRange, open_motion, trained_range
+from ..driving.open_motion import Motion, MotionOptions, open_motion, trained_range
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.sequence import motion_of
@@ -58,9 +57,9 @@ motion          another person's motion, which poses it instead, with `motion_op
 
 def motion_field() -> Any:
     return option(
-        "another person's motion at every timestep of it: FLAME parameters (.npz, or a capture), or a performance in "
-        "ARKit's shapes (CSV of Live Link Face or Audio2Face, its take folder, JSON, iFacialMocap's text)",
-        None, metavar="FILE",
+        "another person's motion at every timestep of it: FLAME parameters (.npz, or a capture), "
+        "or a performance in ARKit's shapes (CSV of Live Link Face or Audio2Face, its take folder, "
+        "JSON, iFacialMocap's text)", None, metavar="FILE",
     )  # fmt: skip
 
 
@@ -69,25 +68,26 @@ def motion_options_field(*needs: str) -> Any:
 
 
 def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
-    """The avatar of a run folder or file, and the capture that was given or that the run was
-    trained on, as an open .blend file's head plays it where the request says so.
-
-    Raises StgaError where the run's own capture has changed, or a given one has other triangles.
-    """
-    source = request.source
-    capture = _run_capture(source, request.capture, request.flame) if source.is_dir() else None
+    """The avatar of a run folder or file, and the capture given or trained on, or what an open head
+    plays. Raises StgaError for a capture that has changed, or of other triangles."""
+    source, given, capture = request.source, request.capture, None
+    if source.is_dir() and given is None:
+        capture = open_refined(source, flame=request.flame)
+    elif source.is_dir():  # another capture's meshes
+        run = read_run(source)
+        capture = open_capture(given, request.flame or run.flame, run.principal_point)
+        capture = with_refined_tracking(capture, source)
     avatar = read_avatar(avatar_path(source))
-    if capture is None and request.capture is not None:
-        capture = open_capture(request.capture, request.flame, avatar.principal_point)
+    if capture is None and given is not None:
+        capture = open_capture(given, request.flame, avatar.principal_point)
         if avatar.settings.get("tracking"):
             what = "was trained on refined meshes, which only its run's folder has"
             logging.getLogger(__name__).warning("warning: %s: %s", source, what)
     if capture is None:
         return avatar, None
     if not np.array_equal(capture.faces, avatar.faces):
-        raise StgaError(
-            f"{capture.root}: its mesh has other triangles than the one this avatar was trained on"
-        )
+        message = "its mesh has other triangles than the one this avatar was trained on"
+        raise StgaError(f"{capture.root}: {message}")
     return avatar, capture if request.played is None else _as_played(capture, request.played)
 
 
@@ -99,10 +99,8 @@ def required_capture(capture: Capture | None) -> Capture:
 
 
 def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) -> tuple[int, ...]:
-    """The capture's timesteps from the first to the last of `span`, inclusive; None: all of them.
-
-    Says so where the span reaches beyond them. Raises StgaError where there is none.
-    """
+    """The capture's timesteps within `span`, inclusive; says so where it reaches beyond. Raises
+    StgaError for none."""
     if span is None:
         return tuple(capture.timesteps)
     first, last = span
@@ -120,37 +118,22 @@ def avatar_path(source: Path) -> Path:
     return source / AVATAR if source.is_dir() else source
 
 
-def _run_capture(folder: Path, given: Path | None, flame: Path | None) -> Capture:
-    """The capture of a run, or another one whose meshes are to drive its avatar; with the run's
-    refined tracking."""
-    if given is None:
-        return open_refined(folder, flame=flame)
-    run = read_run(folder)
-    return with_refined_tracking(
-        open_capture(given, flame or run.flame, run.principal_point), folder
-    )
-
-
 def _as_played(capture: Capture, played: Played) -> Capture:
-    """The capture with the frames of an open .blend file. Raises StgaError for arrays of another
-    head."""
-    for name, arrays, shape, kind in (
-        ("frame", played.meshes, capture.neutral.shape, "f"),
-        ("selection of frame", played.selection or {}, capture.faces.shape[:1], "b"),
+    """With the frames of an open .blend file. Raises StgaError for arrays of another head."""
+    for name, arrays, shape, kind, expected in (
+        ("frame", played.meshes, capture.neutral.shape, "f", "finite numbers"),
+        ("selection of frame", played.selection or {}, capture.faces.shape[:1], "b", "bool"),
     ):
         for frame, array in arrays.items():
             if array.dtype.kind != kind or array.shape != shape or not np.isfinite(array).all():
-                expected = f"{'finite numbers' if kind == 'f' else 'bool'} {shape}"
-                raise StgaError(
-                    f"played: {name} {frame}: expected {expected}, got {array.dtype} {array.shape}"
-                )
-    flame = None
+                found = f"expected {expected} {shape}, got {array.dtype} {array.shape}"
+                raise StgaError(f"played: {name} {frame}: {found}")
+    flame, count = None, len(played.meshes)
     if capture.flame is not None and played.motion is not None:
         flame = motion_of(Path("played"), played.motion, capture.flame.model)
-        if len(flame.timesteps) != len(played.meshes):
-            raise StgaError(
-                f"played: motion: expected {len(played.meshes)} frames, got {len(flame.timesteps)}"
-            )
+        if len(flame.timesteps) != count:
+            got = len(flame.timesteps)
+            raise StgaError(f"played: motion: expected {count} frames, got {got}")
     meshes = dict(sorted(played.meshes.items()))
     return replace(capture, timesteps=tuple(meshes), mesh=meshes.__getitem__, flame=flame)
 
@@ -160,19 +143,23 @@ def _as_played(capture: Capture, played: Played) -> Capture:
 
 def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
     """The request's motion on its avatar; says how far it is outside the trained range, where that
-    is asked for.
-
-    Raises StgaError.
-    """
+    is asked for. Raises StgaError."""
     assert request.motion is not None
-    source, options = request.source, request.motion_options
+    source, options, trained = request.source, request.motion_options, None
     run = read_run(source) if source.is_dir() else None
     flame = request.flame or (run.flame if run is not None else None)
-    trained = None if run is None else _trained(source, request, say)
+    if run is not None and (options.neutral != "none" or options.stay_trained is not None):
+        try:
+            own = open_run(source, flame=request.flame).capture.flame
+            if own is not None:
+                trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
+        except StgaError as error:
+            if options.stay_trained is not None:
+                raise
+            say(f"{error}; the motion is put on the head without expression, not its quiet face")
     if options.stay_trained is not None and trained is None:
-        raise StgaError(
-            f"--stay-trained: {source} is no run with a FLAME capture, whose motion would be the range"
-        )
+        what = "is no run with a FLAME capture, whose motion would be the range"
+        raise StgaError(f"--stay-trained: {source} {what}")
     motion = open_motion(
         request.motion, flame, avatar.neutral, avatar.faces, options, trained, request.fps
     )
@@ -191,42 +178,22 @@ def motion_capture(request: Posed, motion: Motion, own: Capture | None) -> Captu
 
 
 def findings(motion: Motion) -> list[str]:
-    """What to say about a motion: rows that were lost, and how far it goes beyond what was
-    trained."""
+    """What to say about a motion: lost rows, and how far it goes beyond what was trained."""
     lines = [f"{motion.lost} rows are missing and were interpolated"] if motion.lost else []
     for part, beyond in motion.outside.items():
         if beyond.any():
-            share_outside = 100 * float(np.mean(beyond > 0))
+            share, frame = float(np.mean(beyond > 0)), int(beyond.argmax())
             lines.append(
-                f"{part}: {share_outside:.0f} % of the frames are outside the trained range, by up to "
-                f"{beyond.max():.1f} of its half width (frame {int(beyond.argmax())})"
+                f"{part}: {100 * share:.0f} % of the frames are outside the trained range, "
+                f"by up to {beyond.max():.1f} of its half width (frame {frame})"
             )
     return lines
-
-
-def _trained(folder: Path, request: Posed, say: Say) -> TrainedRange | None:
-    """What the run's capture holds, where the options ask for it; None where it was not tracked
-    with FLAME."""
-    options = request.motion_options
-    if options.neutral == "none" and options.stay_trained is None:
-        return None
-    try:
-        own = open_run(folder, flame=request.flame).capture.flame
-    except StgaError as error:
-        if options.stay_trained is not None:
-            raise
-        say(f"{error}; the motion is put on the head without expression, not on its quiet face")
-        return None
-    return (
-        None if own is None else trained_range([own.frame(timestep) for timestep in own.timesteps])
-    )
 
 
 # The head of an open .blend file
 
 
-FOLDER = "STGA_HEAD"
-"""The environment variable that names the folder."""
+FOLDER = "STGA_HEAD"  # The environment variable that names the folder
 HEAD, SELECTION, PLAYED = "head.json", "selection.npz", "played.npz"
 
 
@@ -261,54 +228,40 @@ class _Stored:
 
 
 def write_head(folder: Path, head: OpenHead, played: bool) -> None:
-    """Write the head into the folder; `played`: with the meshes that it plays in the scene's
-    frames.
-
-    Raises StgaError where the capture cannot be read, or the folder not be written.
-    """
-    write_json(
-        folder / HEAD,
-        to_json(_Stored(head.capture, head.flame, head.avatar, head.principal_point, head.fps)),
-    )
+    """Write the head into the folder; `played`: with the meshes of the scene's frames. Raises
+    StgaError."""
+    stored = _Stored(head.capture, head.flame, head.avatar, head.principal_point, head.fps)
+    write_json(folder / HEAD, to_json(stored))
     selection = head.selection()
     if selection is not None:
-        write_npz(
-            folder / SELECTION, {str(timestep): faces for timestep, faces in selection.items()}
-        )
+        write_npz(folder / SELECTION, {str(frame): faces for frame, faces in selection.items()})
     if played:
-        write_npz(
-            folder / PLAYED, {str(frame): mesh for frame, mesh in head.played().meshes.items()}
-        )
+        meshes = head.played().meshes
+        write_npz(folder / PLAYED, {str(frame): mesh for frame, mesh in meshes.items()})
 
 
 def read_head(folder: Path) -> OpenHead:
     """The head that `write_head` wrote. Raises StgaError where there is none or it is damaged."""
-    path = folder / HEAD
+    path, chosen = folder / HEAD, folder / SELECTION
     try:
         stored: _Stored = from_json(_Stored, read_json(path))
     except StgaError as error:
         raise StgaError(f"{path}: is not the head of an open .blend file ({error})") from error
 
     def selection() -> dict[int, np.ndarray] | None:
-        return _read_selection(folder / SELECTION) if (folder / SELECTION).exists() else None
-
-    def played() -> Played:
-        return Played(_by_frame(folder / PLAYED), selection=selection())
+        if not chosen.exists():
+            return None
+        found = _by_frame(chosen)
+        for frame, faces in found.items():
+            if faces.dtype != bool or faces.ndim != 1:
+                got = f"got {faces.dtype} {faces.shape}"
+                raise StgaError(f"{chosen}: frame {frame}: expected bool (F,), {got}")
+        return found
 
     return OpenHead(
-        stored.capture, stored.flame, stored.principal_point, stored.avatar, stored.fps, selection, played
+        **vars(stored), selection=selection,
+        played=lambda: Played(_by_frame(folder / PLAYED), selection=selection()),
     )  # fmt: skip
-
-
-def _read_selection(path: Path) -> dict[int, np.ndarray]:
-    """frame -> (F,) bool. Raises StgaError for arrays of another form."""
-    selection = _by_frame(path)
-    for frame, faces in selection.items():
-        if faces.dtype != bool or faces.ndim != 1:
-            raise StgaError(
-                f"{path}: frame {frame}: expected bool (F,), got {faces.dtype} {faces.shape}"
-            )
-    return selection
 
 
 def _by_frame(path: Path) -> dict[int, np.ndarray]:

@@ -1,5 +1,4 @@
-"""Rendering for Blender: images that it has recorded, and frames of a .blend file by the Blender of
-this machine."""
+"""Rendering for Blender: images that it recorded, and frames of a .blend file by Blender itself."""
 
 import os
 import re
@@ -28,15 +27,11 @@ from .train import Train
 PARTIAL = ".rendering-"
 """Start of the name of the folder that Blender writes into; a picture leaves it when it is
 whole."""
-SAVED = re.compile(r"Saved: '(?P<path>.+)'")
-"""What Blender prints when it has written a picture."""
-LAST_LINES = 30
-"""Lines of Blender's output that are searched for why it failed."""
+SAVED = re.compile(r"Saved: '(?P<path>.+)'")  # What Blender prints when it has written a picture
+LAST_LINES = 30  # Lines of Blender's output that are searched for why it failed
 STOP_TIMEOUT_S = 10.0
-MAX_FRAME = 1_048_574
-"""Blender's last frame."""
-FRAME_DIGITS = 6
-"""Of the name of a frame's picture, as many as this at least."""
+MAX_FRAME = 1_048_574  # Blender's last frame
+FRAME_DIGITS = 6  # Of the name of a frame's picture, as many as this at least
 
 
 @dataclass(frozen=True)
@@ -58,24 +53,18 @@ class RenderRecording:
 
 
 def render_recording(request: RenderRecording, report: Report, say: Say) -> Written:
-    """Render the recorded images and write them; the recording is removed.
-
-    A cancelled video is not written; images of a sequence that are finished stay. Raises StgaError.
-    """
+    """Render the recorded images and remove the recording; cancelled, no video is written, finished
+    PNGs stay."""
+    output, count, to_video = request.output, request.images, is_video(request.output)
     try:
-        composer = Composer(request.device)
-        output = request.output
-        with (
-            video_writer(output, request.fps)
-            if is_video(output)
-            else sequence_writer(output) as write
-        ):
-            images = recorded_images(request.recording, request.images, composer)
-            for image in counted(images, request.images, report, "Rendering", "Image"):
-                write(finished(image, request.background, is_video(request.output)))
+        images = recorded_images(request.recording, count, Composer(request.device))
+        writer = video_writer(output, request.fps) if to_video else sequence_writer(output)
+        with writer as write:
+            for image in counted(images, count, report, "Rendering", "Image"):
+                write(finished(image, request.background, to_video))
     finally:
         request.recording.unlink(missing_ok=True)
-    return Written(request.output)
+    return Written(output)
 
 
 @dataclass(frozen=True)
@@ -95,20 +84,17 @@ class RenderBlend:
 
     def check(self) -> None:
         """Raise StgaError for a file of another name, and frames in the wrong order."""
+        first, last = self.frames
         if self.blend.suffix.lower() != ".blend":
             raise StgaError(f"{self.blend}: expected a name that ends in .blend")
-        if self.frames[0] > self.frames[1]:
-            raise StgaError(
-                f"frames: expected the first and then the last, got {self.frames[0]}, {self.frames[1]}"
-            )
+        if first > last:
+            raise StgaError(f"frames: expected the first and then the last, got {first}, {last}")
 
     @property
     def pictures(self) -> dict[int, Path]:
         """Frame -> its file."""
-        first, last = self.frames
-        return {
-            frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in range(first, last + 1)
-        }
+        frames = range(self.frames[0], self.frames[1] + 1)
+        return {frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in frames}
 
 
 def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
@@ -144,8 +130,8 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
         process = _start(request, first, last, Path(partial))
         printed: deque[str] = deque(maxlen=LAST_LINES)
         pictures, expected = request.pictures, first
+        assert process.stdout is not None
         try:
-            assert process.stdout is not None
             for line in process.stdout:
                 printed.append(line.strip())
                 say(line.rstrip())
@@ -156,7 +142,14 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
                     yield picture
             code = process.wait()
         finally:
-            _stop(process)
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.wait(STOP_TIMEOUT_S)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+            process.stdout.close()
     if expected <= last:
         lines = [line for line in printed if line] or ["it printed nothing"]
         said = ([line for line in lines if "error" in line.lower()] or lines)[-1]
@@ -165,8 +158,7 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
 
 
 def blender_command() -> list[str]:
-    """What starts this machine's Blender: the program or command in STGA_BLENDER, else the program
-    `blender`."""
+    """What starts this machine's Blender: the command in STGA_BLENDER, else `blender`."""
     text = os.environ.get(BLENDER_VARIABLE, "")
     if os.path.isfile(text):  # whose path may hold spaces
         return [text]
@@ -184,24 +176,11 @@ def _start(request: RenderBlend, first: int, last: int, folder: Path) -> subproc
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     try:
         return subprocess.Popen(
-            command, env={PYTHON_VARIABLE: sys.executable, **kept}, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace", preexec_fn=end_with_this_process(),
+            command, env={PYTHON_VARIABLE: sys.executable, **kept}, stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8",
+            errors="replace", preexec_fn=end_with_this_process(),
         )  # fmt: skip
     except OSError as error:
         expected = f"expected it on PATH, or the command that starts it in {BLENDER_VARIABLE}"
-        raise StgaError(
-            f"{command[0]}: Blender cannot be started ({error.strerror or error}); {expected}"
-        ) from error
-
-
-def _stop(process: subprocess.Popen[str]) -> None:
-    """End Blender, if it is still running."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+        message = f"Blender cannot be started ({error.strerror or error}); {expected}"
+        raise StgaError(f"{command[0]}: {message}") from error

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..driving.head_map import person_of
 from ..driving.inverse import captured_performance, write_performance
 from ..driving.open_motion import MotionOptions, adapted, performed, prepared_performance
+from ..driving.performance import Performance
 from ..driving.read_performance import is_performance, read_performance
 from ..errors import StgaError
 from ..export.playback import playback_fps
@@ -28,25 +30,20 @@ SHAPES_SUFFIX = ".csv"
 
 @dataclass(frozen=True)
 class ConvertMotion:
-    """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or a motion to a CSV of
-    shapes."""
+    """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or the other way."""
 
     source: Path = option(
-        "a performance (CSV, JSON, text, take folder), a video of a face, FLAME parameters (.npz), or a capture "
-        "tracked with FLAME", flag="MOTION",
+        "a performance (CSV, JSON, text, take folder), a video of a face, FLAME parameters (.npz), "
+        "or a capture tracked with FLAME", flag="MOTION",
     )  # fmt: skip
     output: Path = option(
         "ARKit's shapes (.csv) or FLAME parameters (.npz)", flag="--out", metavar="FILE"
     )
-    flame: Path | None = like(
-        Train, "flame", help="FLAME model file of the head (default: the bundled head)"
-    )
+    flame: Path | None = like(Train, "flame", help="FLAME model file (default: the bundled head)")
     head: Path | None = option(
         "capture whose identity a performance moves (default: average)", None, metavar="CAPTURE"
     )
-    fps: float | None = option(
-        "frames per second of the result (default: as recorded)", None, above=0
-    )
+    fps: float | None = option("of the result (default: as recorded)", None, above=0)
     options: MotionOptions = motion_options_field()
 
     @property
@@ -64,6 +61,7 @@ class ConvertMotion:
 def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     """Write the motion or the performance. Raises StgaError."""
     report(Progress(stage="Converting"))
+    options = request.options
     if is_video(request.source):
         from ..driving.face_video import watched_performance
 
@@ -71,59 +69,46 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     elif is_performance(request.source):
         performance = read_performance(request.source)
     else:
-        _write_shapes(request)
-        return Written(request.output)
+        performance = _shapes_of_motion(request)
+        options = replace(options, neutral="none")  # which the parameters were put on already
     if request.writes_shapes:
-        write_performance(
-            request.output, prepared_performance(performance, request.options, request.fps)
-        )
+        write_performance(request.output, prepared_performance(performance, options, request.fps))
         return Written(request.output)
-    motion = performed(
-        performance, _person(request), str(request.flame), request.options, fps=request.fps
-    )
+    if request.head is None:
+        model = flame_model(request.flame)
+        person = person_of(model, model.v_template)
+    else:
+        person = _flame_motion(open_capture(request.head, request.flame), "identity")
+    motion = performed(performance, person, str(request.flame), options, fps=request.fps)
     write_motion(request.output, motion.sequence)
-    written = f"{request.output}: {len(motion.sequence.timesteps)} timesteps at {motion.fps:g} frames per second"
+    count = len(motion.sequence.timesteps)
+    written = f"{request.output}: {count} timesteps at {motion.fps:g} frames per second"
     return Written(request.output, (*findings(motion), written))
 
 
-def _write_shapes(request: ConvertMotion) -> None:
-    """The CSV of a FLAME motion or capture."""
+def _shapes_of_motion(request: ConvertMotion) -> Performance:
+    """ARKit's shapes of a FLAME motion or capture."""
+    source, neutral = request.source, request.options.neutral
     if not request.writes_shapes:
-        raise StgaError(
-            f"{request.source}: holds FLAME parameters already; --out takes a {SHAPES_SUFFIX} of ARKit's shapes"
-        )
+        instead = f"--out takes a {SHAPES_SUFFIX} of ARKit's shapes"
+        raise StgaError(f"{source}: holds FLAME parameters already; {instead}")
     if request.head is not None:
-        raise StgaError(f"--head: has no effect on {request.source}, which has its own identity")
-    capture = open_capture(request.source, request.flame)
-    if capture.flame is None:
-        raise StgaError(
-            f"{request.source}: was not tracked with FLAME, so it has no parameters of expression and pose"
-        )
-    sequence = capture.flame
+        raise StgaError(f"--head: has no effect on {source}, which has its own identity")
+    capture = open_capture(source, request.flame)
+    sequence = _flame_motion(capture, "parameters of expression and pose")
     # of the parameters: what leaks into them are no weights from 0 to 1
-    if request.options.neutral != "none":
-        frames, _ = adapted(
-            [sequence.frame(timestep) for timestep in sequence.timesteps],
-            MotionOptions(neutral=request.options.neutral),
-        )
+    if neutral != "none":
+        frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
+        frames, _ = adapted(frames, MotionOptions(neutral=neutral))
         known = dict(zip(sequence.timesteps, frames, strict=True))
         sequence = replace(sequence, frame=known.__getitem__)
-    performance = captured_performance(
-        sequence, str(request.source), playback_fps(capture, numbered=True)
-    )
-    options = replace(request.options, neutral="none")
-    write_performance(request.output, prepared_performance(performance, options, request.fps))
+    return captured_performance(sequence, str(source), playback_fps(capture, numbered=True))
 
 
-def _person(request: ConvertMotion) -> FlameSequence:
-    """The head of --head, or the model's average one."""
-    if request.head is not None:
-        capture = open_capture(request.head, request.flame)
-        if capture.flame is None:
-            raise StgaError(f"{request.head}: was not tracked with FLAME, so it has no identity")
-        return capture.flame
-    model = flame_model(request.flame)
-    return person_of(model, model.v_template)
+def _flame_motion(capture: Capture, lacking: str) -> FlameSequence:
+    if capture.flame is None:
+        raise StgaError(f"{capture.root}: was not tracked with FLAME, so it has no {lacking}")
+    return capture.flame
 
 
 def write_motion(path: Path, sequence: FlameSequence) -> None:

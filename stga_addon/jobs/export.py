@@ -1,5 +1,4 @@
-"""Export of an avatar in another format: one frame, a range of frames, or splats with their FLAME
-motion."""
+"""Export of an avatar: one frame, a range of frames, or splats with their FLAME motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -39,16 +38,14 @@ from .train import Train
 
 @dataclass(frozen=True)
 class Export:
-    """Write an avatar in another format, for other viewers and tools; other fields as of
-    `avatar_source.Posed`."""
+    """Write an avatar in another format, for other viewers (`avatar_source.Posed`)."""
 
     source: Path = option("folder of a run, or avatar file", flag="RUN|AVATAR")
     output: Path = option("the file, or the folder of a format of several", flag="--out")
     file_format: str = option(
-        "file format",
-        flag="--format",
+        "file format", flag="--format",
         choices={name: format.description for name, format in FORMATS.items()},
-    )
+    )  # fmt: skip
     capture: Path | None = option("whose frames to bake (default: the run's)", None)
     flame: Path | None = like(
         Train, "flame", help="FLAME model file of that capture, or of the motion"
@@ -61,15 +58,13 @@ class Export:
         "of a format that holds several (default: all)", None, metavar="FIRST:LAST"
     )
     fps: float | None = option(
-        f"frames per second of usd and web (default: the scene's or the capture's, else {DEFAULT_FPS:g})",
-        None,
-        above=0,
-    )
+        "frames per second of usd and web (default: the scene's or the capture's, else "
+        f"{DEFAULT_FPS:g})", None, above=0,
+    )  # fmt: skip
     motion_only: bool = option(
-        "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take stay in the page, and "
-        "FLAME's licence decides who may receive it either way",
-        False,
-    )
+        "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take "
+        "stay in the page, and FLAME's licence decides who may receive it either way", False,
+    )  # fmt: skip
     motion: Path | None = motion_field()
     motion_options: MotionOptions = motion_options_field("motion")
     albedo: bool = option(
@@ -77,27 +72,21 @@ class Export:
     )
 
     def check(self) -> None:
-        """Raise StgaError for a file name of another format, and for what the format would leave
-        out."""
+        """Raise StgaError for another format's file name, and for what the format leaves out."""
         held = {
             "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
             "frames": [name for name, format in FORMATS.items() if format.source == "range"],
             "motion_only": [name for name, format in FORMATS.items() if format.is_page],
         }
+        chosen = f"--format {self.file_format}"
         for name, formats in held.items():
             if getattr(self, name) not in (None, False) and self.file_format not in formats:
                 flag = flag_of(type(self).__dataclass_fields__[name])
-                raise StgaError(
-                    f"{flag} cannot be combined with --format {self.file_format}, only with {', '.join(formats)}"
-                )
-        if (
-            self.motion is not None
-            and self.file_format in held["timestep"]
-            and self.timestep is None
-        ):
-            raise StgaError(
-                f"--motion: has no effect with --format {self.file_format} without --timestep"
-            )
+                only = f"only with {', '.join(formats)}"
+                raise StgaError(f"{flag} cannot be combined with {chosen}, {only}")
+        is_frame = self.file_format in held["timestep"]
+        if self.motion is not None and is_frame and self.timestep is None:
+            raise StgaError(f"--motion: has no effect with {chosen} without --timestep")
         check_suffix(self.output, self.file_format)
 
 
@@ -117,7 +106,8 @@ def export(request: Export, report: Report, say: Say) -> Written:
     meshes: Meshes = ()
     if format.is_page and capture is None and request.frames is None:
         _say_size(request, avatar, 1, say)
-        playback = still_playback(request, avatar, fps, say)
+        _say_licence(flame_notice(avatar, None, motion_only=True), say)
+        playback = Playback(title=_title(request), fps=fps, motion_only=True)
         meshes = [(0, avatar.neutral)]
     elif format.source == "range":
         capture = required_capture(capture)
@@ -147,8 +137,8 @@ def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
     """Say how large the file will be. Raises StgaError where the disk has too little free space."""
     size = FORMATS[request.file_format].size(avatar, frames)
     check_free_space(request.output, size)
-    plural = "" if frames == 1 else "s"
-    say(f"{frames} frame{plural} of {len(avatar.splats)} splats: about {format_bytes(size)}")
+    count = f"{frames} frame{'' if frames == 1 else 's'}"
+    say(f"{count} of {len(avatar.splats)} splats: about {format_bytes(size)}")
 
 
 # Web pages
@@ -156,44 +146,36 @@ def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
 SPLITS = ("val", "train", "test")
 
 
-def still_playback(request: Export, avatar: Avatar, fps: float, say: Say) -> Playback:
-    """What a page of the neutral mesh alone shows. Says what it holds of a FLAME model."""
-    _say_licence(flame_notice(avatar, None, motion_only=True), say)
-    return Playback(title=_title(request), fps=fps, motion_only=True)
-
-
 def capture_playback(
-    request: Export,
-    avatar: Avatar,
-    capture: Capture,
-    timesteps: tuple[int, ...],
-    fps: float,
+    request: Export, avatar: Avatar, capture: Capture, timesteps: tuple[int, ...], fps: float,
     say: Say,
-) -> tuple[Playback, FlameSequence | None]:
-    """What a page of the capture's timesteps shows, and its FLAME motion. Says what it holds of a
-    FLAME model."""
+) -> tuple[Playback, FlameSequence | None]:  # fmt: skip
+    """What a page shows of timesteps, and its FLAME motion. Says what of FLAME it holds."""
+    # what each timestep trains: the open file's or the run's selection, else by the rule
+    chosen: Mapping[int, np.ndarray] | None = None
+    if request.played is not None:
+        chosen = request.played.selection
+    elif (request.source / SELECTION).exists():
+        # imports torch, which Blender may lack
+        from ..training.run.checkpoint import read_selection
+
+        chosen = read_selection(request.source, len(capture.faces))
+    if not chosen and request.played is None:
+        chosen = select_capture(capture, SelectionOptions())
+    everything, motion_only = np.ones(len(capture.faces), bool), request.motion_only
     playback = Playback(
-        title=_title(request),
-        fps=fps,
-        views=capture_views(capture),
-        up=_up(capture),
-        selection=_selection(request, capture, timesteps),
-        motion_only=request.motion_only,
-        controls=None if request.motion_only else page_controls(capture.flame),
-    )
-    sequence = (
-        None
-        if capture.flame is None
-        else replace(capture.flame, timesteps=_flame_timesteps(capture, timesteps))
-    )
-    notice = flame_notice(avatar, sequence, request.motion_only)
-    has_rig = sequence is not None and not request.motion_only
-    _say_licence(
-        f"{notice} --motion-only leaves them out, but not the meshes of the take."
-        if has_rig
-        else notice,
-        say,
-    )
+        title=_title(request), fps=fps, views=capture_views(capture), up=_up(capture),
+        selection=[chosen.get(t, everything) for t in timesteps] if chosen else None,
+        motion_only=motion_only, controls=None if motion_only else page_controls(capture.flame),
+    )  # fmt: skip
+    sequence = capture.flame
+    if sequence is not None:  # an open head numbers the capture's timesteps by the scene's frames
+        numbered = dict(zip(capture.timesteps, sequence.timesteps, strict=True))
+        sequence = replace(sequence, timesteps=tuple(numbered[t] for t in timesteps))
+    notice = flame_notice(avatar, sequence, motion_only)
+    if sequence is not None and not motion_only:
+        notice += " --motion-only leaves them out, but not the meshes of the take."
+    _say_licence(notice, say)
     return playback, sequence
 
 
@@ -227,29 +209,3 @@ def _up(capture: Capture) -> tuple[float, float, float]:
     axis = np.zeros(3)
     axis[np.abs(mean).argmax()] = np.sign(mean[np.abs(mean).argmax()])
     return (float(axis[0]), float(axis[1]), float(axis[2]))
-
-
-def _selection(
-    request: Export, capture: Capture, timesteps: tuple[int, ...]
-) -> list[np.ndarray] | None:
-    """What each timestep trains: the open file's or the run's selection, else by the rule."""
-    chosen: Mapping[int, np.ndarray] | None = None
-    if request.played is not None:
-        chosen = request.played.selection
-    elif (request.source / SELECTION).exists():
-        # imports torch, which Blender may lack
-        from ..training.run.checkpoint import read_selection
-
-        chosen = read_selection(request.source, len(capture.faces))
-    if not chosen and request.played is None:
-        chosen = select_capture(capture, SelectionOptions())
-    everything = np.ones(len(capture.faces), bool)
-    return [chosen.get(timestep, everything) for timestep in timesteps] if chosen else None
-
-
-def _flame_timesteps(capture: Capture, timesteps: tuple[int, ...]) -> tuple[int, ...]:
-    """The timesteps of `capture.flame` for those of the capture, which an open head numbers by the
-    scene's frames."""
-    assert capture.flame is not None
-    numbered = dict(zip(capture.timesteps, capture.flame.timesteps, strict=True))
-    return tuple(numbered[timestep] for timestep in timesteps)

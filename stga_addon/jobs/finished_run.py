@@ -1,5 +1,4 @@
-"""What is found out about a finished run: the light of its capture, kept in its avatar, and its
-quality on a split."""
+"""The light of a finished run's capture, kept in its avatar, and its quality on a split."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,8 +40,8 @@ class Relight:
         "environment of the studio, instead of an estimate", None, metavar="FILE.hdr"
     )
     card: tuple[float, float, float] | None = option(
-        "sRGB in 0…1 of an 18 % gray card at the face that faces the central camera: level and white balance",
-        None, 0, 1, flag="--gray-card", metavar="R,G,B",
+        "sRGB in 0…1 of an 18 % gray card at the face that faces the central camera: level and "
+        "white balance", None, 0, 1, flag="--gray-card", metavar="R,G,B",
     )  # fmt: skip
     flame: Path | None = option("FLAME model file, if it has moved", None, metavar="FILE")
     capture: Path | None = option("the run's capture, if it has moved", None)
@@ -54,8 +53,7 @@ class Relight:
 
 
 def relight(request: Relight, report: Report, say: Say) -> Written:
-    """Estimate the light, or take the known one, and write it into the run's avatar file. Raises
-    StgaError."""
+    """Write the light, estimated or known, into the run's avatar file. Raises StgaError."""
     from ..light.estimate import Known
 
     folder = request.run
@@ -67,17 +65,20 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
         card = srgb_to_linear(np.array(request.card))
         if not card.min() > 0:
             raise StgaError(f"--gray-card: expected three numbers above 0, got {request.card}")
-        known = Known(card=card[None], toward=_toward_central_camera(capture)[None])
+        views = [view for split in capture.views.values() for view in split]
+        cameras = list({view.camera_index: view.camera for view in views}.values())
+        if not cameras:
+            raise StgaError(f"{capture.root}: has no camera that a gray card could face")
+        toward = cameras[central_camera(cameras)].position - capture.neutral.mean(0)
+        known = Known(card=card[None], toward=(toward / np.linalg.norm(toward))[None])
     return Written(folder / AVATAR, add_light(folder / AVATAR, capture, known, report))
 
 
 def add_light(
     avatar_file: Path, capture: Capture, known: "Known | None" = None, report: Report = ignore
 ) -> tuple[str, ...]:
-    """Write the light of a capture into a run's avatar file; returns what there is to say.
-
-    Raises StgaError, also while another process trains or lights the run.
-    """
+    """Write the light of a capture into a run's avatar file; what there is to say. Raises
+    StgaError, also while another process works on the run."""
     from ..light.estimate import Known, estimate_light
     from ..training.evaluate.match_exposure import known_exposure
 
@@ -91,11 +92,8 @@ def add_light(
 
 def describe_light(light: AvatarLight) -> tuple[str, ...]:
     """Lines about where a light is from and how well it explains the capture."""
-    source = {
-        "estimated": "estimated",
-        "gray_card": "estimated, level by a gray card",
-        "file": "from a file",
-    }
+    source = {"estimated": "estimated", "file": "from a file"}
+    source["gray_card"] = "estimated, level by a gray card"
     line = f"light: {source[light.source]}; recorded colors differ from it by {light.residual:.1%}"
     if not light.damping:
         return (line,)
@@ -103,23 +101,12 @@ def describe_light(light: AvatarLight) -> tuple[str, ...]:
     return line, f"warning: the capture's light is too hard to be taken away; {damped}"
 
 
-def _toward_central_camera(capture: Capture) -> np.ndarray:
-    """(3,) from the face to the camera that sees it from the front."""
-    first = {view.camera_index: view.camera for views in capture.views.values() for view in views}
-    if not first:
-        raise StgaError(f"{capture.root}: has no camera that a gray card could face")
-    cameras = list(first.values())
-    offset = cameras[central_camera(cameras)].position - capture.neutral.mean(0)
-    return np.asarray(offset / np.linalg.norm(offset))
-
-
 # Quality
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure PSNR, SSIM and LPIPS of a run's avatar on held-out views; they are written into the
-    run's folder, too."""
+    """Measure PSNR, SSIM and LPIPS of a run's avatar on held-out views; its folder keeps them."""
 
     run: Path = like(Relight, "run")
     split: str = option("views to measure on", "val", choices=("train", "val", "test"))
@@ -128,9 +115,8 @@ class Evaluate:
 
 
 def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
-    """Measure PSNR, SSIM and LPIPS, and write them into the run's folder; of timesteps without
-    training views, also with the heads as they were before the avatar tracked them. Raises
-    StgaError."""
+    """Measure PSNR, SSIM and LPIPS; also with the heads before the avatar tracked them, where it
+    did. Raises StgaError."""
     from ..training.evaluate.metrics import evaluate_avatar, psnr_recorded
 
     folder, split = request.run, request.split
@@ -147,39 +133,23 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
         quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})
-    lines = [f"{split}: {len(views)} views, {_describe(quality)}", *_details(quality)]
-    unseen = {view.timestep for view in views} - {
-        view.timestep for view in capture.views.get("train", ())
-    }
-    if (
-        tracked.flame is not None
-        and capture.flame is not None
-        and any(
-            not np.array_equal(capture.flame.frame(t).parameters, tracked.flame.frame(t).parameters)
-            for t in unseen
-        )
+    lines = [f"{split}: {len(views)} views, {_describe(quality)}"]
+    trained = {view.timestep for view in capture.views.get("train", ())}
+    if tracked.flame is not None and capture.flame is not None:
+        before, after = tracked.flame.frame, capture.flame.frame
+        unseen = {view.timestep for view in views} - trained
+        if any(not np.array_equal(after(t).parameters, before(t).parameters) for t in unseen):
+            how = "with heads tracked by the avatar, its splats fixed; as tracked before"
+            lines.append(f"  {how}: {_describe(evaluate_avatar(avatar, tracked, split))}")
+    for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region")):
+        if region in quality.regions:
+            lines.append(f"  {name}: {_describe(quality.regions[region])}")
+    for psnr, how in (
+        (quality.psnr_recorded, "in front of its world, against whole images as recorded"),
+        (quality.psnr_unmatched, "exposure of each view fitted inside the mask; without"),
     ):
-        before = _describe(evaluate_avatar(avatar, tracked, split))
-        lines.insert(
-            1, f"  with heads tracked by the avatar, its splats fixed; as tracked before: {before}"
-        )
-    return Written(path, tuple(lines))
-
-
-def _details(quality: "Quality") -> list[str]:
-    lines = [
-        f"  {name}: {_describe(quality.regions[region])}"
-        for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region"))
-        if region in quality.regions
-    ]
-    if quality.psnr_recorded is not None:
-        lines.append(
-            f"  in front of its world, against whole images as recorded: PSNR {quality.psnr_recorded:.3f} dB"
-        )
-    if quality.psnr_unmatched is not None:
-        lines.append(
-            f"  exposure of each view fitted inside the mask; without: PSNR {quality.psnr_unmatched:.3f} dB"
-        )
+        if psnr is not None:
+            lines.append(f"  {how}: PSNR {psnr:.3f} dB")
     if quality.lpips is None:
         from ..training.evaluate.lpips import MIN_SIDE_PX
 
@@ -188,7 +158,7 @@ def _details(quality: "Quality") -> list[str]:
             f"LPIPS was not measured: it needs {weights}",
             f"and images of at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels",
         ]
-    return lines
+    return Written(path, tuple(lines))
 
 
 def _describe(quality: "Quality") -> str:

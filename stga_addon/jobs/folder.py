@@ -43,9 +43,8 @@ def check_request(request: Request) -> None:
     """Raise StgaError for what can be known to fail before a worker is started."""
     match request:
         case Train() | Refine() | Extend() if has_run(request.run):
-            raise StgaError(
-                f"{request.run}: already holds a run; resume it, or choose another folder"
-            )
+            problem = "already holds a run; resume it, or choose another folder"
+            raise StgaError(f"{request.run}: {problem}")
         case Resume():
             read_run(request.run)
         case Track() if is_written(request.out):
@@ -59,21 +58,13 @@ def check_request(request: Request) -> None:
 
 
 def worker_arguments(folder: Path, threads: int | None = None, resume: bool = False) -> list[str]:
-    """What a worker's interpreter runs after `-m` for the request in the folder (`stga
-    perform`)."""
+    """What a worker's interpreter runs after `-m` for the request in the folder."""
     limit = [] if threads is None else ["--threads", str(threads)]
-    return [
-        "stga_addon",
-        "perform",
-        str(folder.resolve()),
-        *limit,
-        *(["--resume"] if resume else []),
-    ]
+    return ["stga_addon", "perform", str(folder.resolve()), *limit, *["--resume"] * resume]
 
 
 def write_request(folder: Path, request: Request) -> None:
-    """Prepare the folder for a worker. Raises StgaError while one is working in it, or on a full
-    disk."""
+    """Prepare the folder for a worker. Raises StgaError while one works in it."""
     prepare_status_folder(folder)
     for stale in FILES:
         (folder / stale).unlink(missing_ok=True)
@@ -93,11 +84,8 @@ def has_request(folder: Path) -> bool:
 
 
 def remove_request(folder: Path) -> None:
-    """Remove the files of a request and its worker's status; a folder that holds no request stays
-    as it is.
-
-    Raises StgaError while its worker is working.
-    """
+    """Remove the files of a request, if the folder holds one, and its worker's status. Raises
+    StgaError while its worker is working."""
     if has_request(folder):
         remove_status_folder(folder, FILES)
 
@@ -123,16 +111,12 @@ def _write(path: Path, arrays_path: Path, value: Any, kinds: Any) -> None:
 
 def _read(path: Path, arrays_path: Path, kinds: Any) -> Any:
     values = read_json(path)
-    if not isinstance(values, dict) or (
-        values.pop("format", None),
-        values.pop("version", None),
-    ) != (FORMAT, VERSION):
-        raise StgaError(
-            f"{path}: is not a request that this version reads (format '{FORMAT}', version {VERSION})"
-        )
+    named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
+    if named != (FORMAT, VERSION):
+        known = f"(format '{FORMAT}', version {VERSION})"
+        raise StgaError(f"{path}: is not a request that this version reads {known}")
+    arrays = read_npz(arrays_path) if os.path.exists(arrays_path) else {}
     try:
-        return from_json(
-            kinds, values, arrays=read_npz(arrays_path) if os.path.exists(arrays_path) else {}
-        )
+        return from_json(kinds, values, arrays=arrays)
     except StgaError as error:
         raise StgaError(f"{path}: {error}") from error

@@ -10,17 +10,14 @@ from .table import DISMISSIBLE, STORED, TRAINS, TRANSIENT, Kind
 from .track import CAPTURE_FOLDER, RUN_FOLDER
 
 CHECK_INTERVAL_S = 0.5
-SLICE_INTERVAL_S = 0.02
-"""While splats are built in slices, so that Blender never blocks for long."""
+SLICE_INTERVAL_S = 0.02  # While splats are built in slices, so that Blender never blocks for long
 
-Stamp = tuple[int, int]
-"""Modification time in nanoseconds and size in bytes of a file."""
+Stamp = tuple[int, int]  # Modification time in nanoseconds and size in bytes of a file
 
 
 @dataclass(frozen=True)
 class RunFiles:
-    """Stamps of a run's files, and of the capture that is tracked for it; None: there is no such
-    file."""
+    """Stamps of a run's files, and of the capture that is tracked for it; None: no such file."""
 
     capture: Stamp | None = None
     picture: Stamp | None = None
@@ -147,8 +144,7 @@ class StatusRead:
 
 @dataclass(frozen=True)
 class SceneFree:
-    """What the result changes can be changed now: Blender does not render, and nothing of it is in
-    Edit Mode."""
+    """What the result changes can be changed: no rendering, nothing of it in Edit Mode."""
 
 
 @dataclass(frozen=True)
@@ -172,16 +168,9 @@ class Failed:
 
 
 Event = (
-    Started
-    | CancelAsked
-    | Dismissed
-    | SceneRead
-    | StatusRead
-    | SceneFree
-    | SliceBuilt
-    | Shown
+    Started | CancelAsked | Dismissed | SceneRead | StatusRead | SceneFree | SliceBuilt | Shown
     | Failed
-)
+)  # fmt: skip
 
 
 # Effects
@@ -211,13 +200,11 @@ class LoadAvatar(_OnPath):
 
 
 class Show(_OnPath):
-    """Put what was loaded into the scene, as far as it was read; answered by SliceBuilt, Shown or
-    Failed."""
+    """Put what was loaded and read into the scene; answered by SliceBuilt, Shown or Failed."""
 
 
 class ReadCurve(_OnPath):
-    """Read the evaluations in the run for the panel's curve, or before the first ones the picture
-    of the tracking."""
+    """Read the run's evaluations for the panel's curve, before them the tracking's picture."""
 
 
 class StopWorker(_OnPath):
@@ -243,17 +230,9 @@ class Redraw:
 
 
 Effect = (
-    Store
-    | StoreAvatar
-    | LoadAvatar
-    | Show
-    | ReadCurve
-    | StopWorker
-    | KillWorker
-    | RemoveFiles
-    | PushUndo
-    | Redraw
-)
+    Store | StoreAvatar | LoadAvatar | Show | ReadCurve | StopWorker | KillWorker | RemoveFiles
+    | PushUndo | Redraw
+)  # fmt: skip
 Outcome = tuple[RequestState, tuple[Effect, ...]]
 
 
@@ -308,48 +287,31 @@ def _forgotten(state: RequestState, first: Effect | None = None, error: str = ""
 
 def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     effects: list[Effect] = []
-    before, worker = state, event.snapshot.state
-    error = "" if state.stopped else state.error
+    before, error = state, "" if state.stopped else state.error
     state = replace(
-        state,
-        folder=event.folder,
-        files=event.files,
-        snapshot=event.snapshot,
-        error=error,
+        state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error,
         stopped=False,
-    )
-    drawn, drawn_before = (
-        (each.folder, each.files.metrics, each.files.picture) for each in (state, before)
-    )
-    if drawn != drawn_before and state.kind in (*TRAINS, Kind.TRACKING):
+    )  # fmt: skip
+    drawn = [(each.folder, each.files.metrics, each.files.picture) for each in (before, state)]
+    if drawn[0] != drawn[1] and state.kind in (*TRAINS, Kind.TRACKING):
         effects.append(ReadCurve(state.run))
-    if (state.folder, state.files, state.snapshot) != (
-        before.folder,
-        before.files,
-        before.snapshot,
-    ):
+    seen = [(each.folder, each.files, each.snapshot) for each in (before, state)]
+    if seen[0] != seen[1]:
         effects.append(Redraw())
+    is_alive, files = state.snapshot.state.is_alive, state.files
     if state.loading is not None:
         return state, tuple(effects)
-    if state.kind in TRAINS:
-        return _load_avatar(state, event, effects)
-    if state.has_result:
-        state = replace(state, loading=state.folder)
-    elif state.kind in TRANSIENT and not worker.is_alive:
-        # The panel has no options of the command line.
-        return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
-    return state, tuple(effects)
-
-
-def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) -> Outcome:
-    """Load the tracked capture, the trained avatar, or a preview of it, once each."""
-    capture, preview = state.files.capture, state.files.preview
-    if capture not in (None, state.shown_capture) and (
-        state.snapshot.state.is_alive or state.has_result
-    ):
-        return replace(state, loading=state.place / CAPTURE_FOLDER, shown_capture=capture), tuple(
-            effects
-        )
+    if state.kind not in TRAINS:
+        if state.has_result:
+            state = replace(state, loading=state.folder)
+        elif state.kind in TRANSIENT and not is_alive:
+            # The panel has no options of the command line.
+            return _forgotten(state, error=state.snapshot.status.error.removeprefix("--effect "))
+        return state, tuple(effects)
+    # the tracked capture, the trained avatar, or a preview of it, once each
+    if files.capture not in (None, state.shown_capture) and (is_alive or state.has_result):
+        tracked = state.place / CAPTURE_FOLDER
+        return replace(state, loading=tracked, shown_capture=files.capture), tuple(effects)
     if state.has_result:
         effects.append(StoreAvatar(state.run / AVATAR))
         if event.show_result:
@@ -357,12 +319,8 @@ def _load_avatar(state: RequestState, event: StatusRead, effects: list[Effect]) 
         else:
             state = replace(state, result_shown=True)
             effects.extend(_stored(state))
-    elif (
-        state.snapshot.state.is_alive
-        and event.live_preview
-        and preview not in (None, state.shown_preview)
-    ):
-        state = replace(state, loading=event.folder / PREVIEW, shown_preview=preview)
+    elif is_alive and event.live_preview and files.preview not in (None, state.shown_preview):
+        state = replace(state, loading=event.folder / PREVIEW, shown_preview=files.preview)
     if state.loading is not None:
         effects.append(LoadAvatar(state.loading))
     return state, tuple(effects)
@@ -378,10 +336,7 @@ def _loading_ended(state: RequestState, undoable: bool = False, error: str = "")
         forgotten, removed = _forgotten(state, error=error)
         return forgotten, (*undo, *removed)
     state = replace(
-        state,
-        loading=None,
-        building=False,
-        error=error,
+        state, loading=None, building=False, error=error,
         result_shown=state.result_shown or was_result,
-    )
+    )  # fmt: skip
     return state, (*(_stored(state) if was_result else ()), *undo, Redraw())

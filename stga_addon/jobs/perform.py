@@ -23,10 +23,8 @@ from .train import Extend, Refine, Resume, Train, resumed
 
 LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
 """Rooms that a worker which trains loads before it begins."""
-TORCH_MODULES = ("raster.cpu.autograd",)
-"""Modules in them that import torch, which takes seconds."""
-PREVIEW_INTERVAL_S = 4.0
-"""Seconds between two previews of a training."""
+TORCH_MODULES = ("raster.cpu.autograd",)  # Modules in them that import torch, which takes seconds
+PREVIEW_INTERVAL_S = 4.0  # Seconds between two previews of a training
 
 
 def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:
@@ -70,9 +68,8 @@ def perform_in_folder(
             if resume and isinstance(request, Track) and is_written(request.out):
                 result: Result = Written(request.out)
             else:
-                result = perform(
-                    remaining(request) if resume else request, _StatusReport(writer, also), say
-                )
+                left = remaining(request) if resume else request
+                result = perform(left, _StatusReport(writer, also), say)
         except Cancelled:
             return None
         write_result(folder, result)
@@ -80,8 +77,7 @@ def perform_in_folder(
 
 
 def load_ahead() -> None:
-    """Load what a training loads later, at its end too: an update of the add-on may exchange the
-    files meanwhile."""
+    """Load what a training needs later: an add-on's update may exchange the files meanwhile."""
     for room in LOADED_AHEAD:
         package = import_module(f"..{room}", __package__)
         for module in walk_packages(getattr(package, "__path__", ()), f"{package.__name__}."):
@@ -92,8 +88,7 @@ def load_ahead() -> None:
 
 
 def remaining(request: Request) -> Request:
-    """What is left of a request that was interrupted: trainings are resumed, others write their
-    files anew."""
+    """What is left of an interrupted request: trainings are resumed, others write anew."""
     return (
         resumed(request)
         if isinstance(request, Train | Refine | Extend) and has_run(request.run)

@@ -16,8 +16,7 @@ from .perform import load_ahead
 
 
 def prepare() -> None:
-    """Compile what a training runs; without an effect while another process does, or where nothing
-    can be written."""
+    """Compile what a training runs; no effect while another process does, or without room."""
     os.environ[OWN_KERNELS] = "1"
     folder = cache_folder()
     with suppress(OSError):  # BlockingIOError among them

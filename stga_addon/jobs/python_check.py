@@ -12,25 +12,20 @@ from ..worker.launch import start_python
 from ..worker.training_python import REQUIREMENTS, package_name
 
 MIN_PYTHON = 3, 11
-CHECK_TIMEOUT_S = 180.0
-"""The first import of torch from a slow disk."""
+CHECK_TIMEOUT_S = 180.0  # The first import of torch from a slow disk
 
 
 @dataclass(frozen=True)
 class Checked:
-    """An interpreter that can track and train.
-
-    line      its versions and device
-    adapters  the GPUs that it can train on, as `--device gpu:NAME` names them
-    """
+    """An interpreter that can track and train: a line on it, and its GPUs as `--device gpu:NAME`
+    names them."""
 
     line: str
     adapters: tuple[str, ...]
 
 
 def start_check(python: str) -> "subprocess.Popen[str]":
-    """The process whose output `finish_check` judges. Raises StgaError where the interpreter cannot
-    be started."""
+    """The process that `finish_check` judges. Raises StgaError where it cannot start."""
     return start_python(
         python, ["stga_addon.jobs.python_report"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, errors="replace",
@@ -40,8 +35,7 @@ def start_check(python: str) -> "subprocess.Popen[str]":
 def finish_check(
     python: str, process: "subprocess.Popen[str]", timeout_s: float = CHECK_TIMEOUT_S
 ) -> Checked:
-    """Wait for a check that was started. Raises StgaError where the interpreter lacks something,
-    which the sentence names, or does not answer; it is ended then."""
+    """Wait for a check; StgaError, and its end, where it lacks something or does not answer."""
     with process:
         try:
             output, errors = process.communicate(timeout=timeout_s)
@@ -54,14 +48,12 @@ def finish_check(
     except (ValueError, IndexError, KeyError, TypeError) as error:
         with suppress(OSError):  # the stream may be closed
             print(output + errors, file=sys.stderr, flush=True)
-        raise StgaError(
-            f"{python}: is not a Python that runs this add-on (exit status {process.returncode})"
-        ) from error
+        problem = f"is not a Python that runs this add-on (exit status {process.returncode})"
+        raise StgaError(f"{python}: {problem}") from error
 
 
 def describe_check(python: str, report: dict[str, Any]) -> str:
-    """The line of a check from what python_report.py prints. Raises StgaError where something is
-    missing."""
+    """The line of a check by python_report's JSON. Raises StgaError for what is missing."""
     version, versions, failures = report["python"], report["versions"], report["failures"]
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_PYTHON:
         raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
@@ -71,7 +63,7 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
             (text for text in failures.values() if not text.startswith("ModuleNotFoundError")), ""
         )
         failed = f" ({why})" if why else ""
-        raise StgaError(
-            f"{python}: Python {version} lacks {', '.join(missing)}{failed}; install that there"
-        )
-    return f"Python {version}, torch {versions['torch']}, numba {versions['numba']}, {report['device']}"
+        problem = f"Python {version} lacks {', '.join(missing)}{failed}; install that there"
+        raise StgaError(f"{python}: {problem}")
+    known = f"torch {versions['torch']}, numba {versions['numba']}"
+    return f"Python {version}, {known}, {report['device']}"

@@ -1,5 +1,4 @@
-"""Reports as JSON which packages and device an interpreter has: `python -m
-stga_addon.jobs.python_report`."""
+"""Packages and device of an interpreter as JSON: `python -m stga_addon.jobs.python_report`."""
 
 import importlib
 import json
@@ -18,22 +17,14 @@ def main() -> None:
             failures[name] = f"{type(error).__name__}: {error}".splitlines()[0]
     names, device = _adapters()
     report = {
-        "python": platform.python_version(),
-        "versions": versions,
-        "failures": failures,
-        "device": device,
-        "adapters": names,
-    }
+        "python": platform.python_version(), "versions": versions, "failures": failures,
+        "device": device, "adapters": names,
+    }  # fmt: skip
     print(json.dumps(report))
 
 
 def _adapters() -> tuple[list[str], str]:
-    """The GPUs that can train, as `--device gpu:NAME` names them, and the device to report: the
-    first GPU, or the CPU.
-
-    Whether that GPU is right and faster than the CPU is tried before each training
-    (`choose_device`), not here.
-    """
+    """GPUs for `--device gpu:NAME`, and the device to report; `choose_device` tries it later."""
     cpu = f"CPU with {os.cpu_count()} threads"
     try:
         from ..raster.gpu.adapters import adapters, is_software

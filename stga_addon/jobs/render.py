@@ -1,5 +1,4 @@
-"""Rendering of an avatar or a PLY: one PNG per camera entry, a video of its motion, or a
-turntable."""
+"""Rendering of an avatar or a PLY: a PNG per camera entry, a video of its motion, a turntable."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -9,7 +8,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ..avatar.file import Avatar, read_avatar
-from ..avatar.splats import Splats
 from ..capture.camera import TURNTABLE_S, central_camera, covered_angles, to_and_fro, turntable
 from ..capture.model import View
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
@@ -57,22 +55,19 @@ class Render:
         None, metavar="TRANSFORMS.json",
     )  # fmt: skip
     turntable: float | None = option(
-        "move one camera around the head: 360 for a full turn, less to both sides (default: what cameras saw)",
-        None, 0, 360, metavar="DEGREES", bare=0.0,
+        "move one camera around the head: 360 for a full turn, less to both sides (default: what "
+        "cameras saw)", None, 0, 360, metavar="DEGREES", bare=0.0,
     )  # fmt: skip
     camera: int | None = option(
-        "camera of the video (default: the central one)",
-        None,
-        0,
-        metavar="INDEX",
+        "camera of the video (default: the central one)", None, 0, metavar="INDEX",
         needs=(("video", "turntable"),),
-    )
+    )  # fmt: skip
     fps: float | None = option(
         f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})", None, 0
     )
     seconds: float = option(
-        f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to and fro",
-        TURNTABLE_S, 0, metavar="S",
+        f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to "
+        "and fro", TURNTABLE_S, 0, metavar="S",
     )  # fmt: skip
     frames: tuple[int, int] | None = option(
         "timesteps to render (default: all), not of a turntable", None, 0, metavar="FIRST:LAST"
@@ -87,12 +82,9 @@ class Render:
         "white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1
     )
     principal_point: str | None = like(
-        Train,
-        "principal_point",
-        default=None,
+        Train, "principal_point", default=None, needs=("cameras",),
         help="what cy means in the file of --cameras (default: as in training; of a PLY vhap)",
-        needs=("cameras",),
-    )
+    )  # fmt: skip
     device: str = like(Train, "device")
     motion_options: MotionOptions = motion_options_field("motion")
     light: Path | None = option(
@@ -118,23 +110,19 @@ class Render:
         if self.cameras is None and not self.is_film:
             raise StgaError("--out needs --cameras, which says what to render, or --turntable")
         if self.frames is not None and self.turntable is not None:
-            raise StgaError(
-                "--frames: has no effect with --turntable, which plays all of the motion"
-            )
+            problem = "has no effect with --turntable, which plays all of the motion"
+            raise StgaError(f"--frames: {problem}")
 
 
 # Work
 
 
 def render(request: Render, report: Report, say: Say) -> Written:
-    """Render the pictures or the video. A cancelled video is not written; pictures that are
-    finished stay.
-
-    Raises StgaError.
-    """
+    """Render the pictures or the video; cancelled, no video is written, and pictures that are
+    finished stay. Raises StgaError."""
     if request.turntable is not None:
         _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
-    views = None
+    views: Sequence[View] = ()
     if request.cameras is not None:
         principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # a PLY has none
         if request.principal_point is None and not is_ply(request.source):
@@ -142,26 +130,20 @@ def render(request: Render, report: Report, say: Say) -> Written:
         views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
     composer = Composer(request.device)
     composer.choose()
-    subject = (
-        _subject(request, composer)
-        if request.motion is None
-        else _reenacted(request, composer, say)
-    )
+    subject = _subject(request, composer, say)
     if request.is_film:
-        _film(request, subject, subject.views if views is None else views, report)
-    else:
-        assert views is not None
-        if request.motion is not None:  # each timestep as the first pose of each camera sees it
-            cameras = {view.camera_index: view for view in reversed(views)}
-            views = [
-                replace(cameras[index], timestep=timestep, name=f"{timestep:05d}_{index:02d}")
-                for timestep in subject.timesteps
-                for index in sorted(cameras)
-            ]
-        timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
-        _write_pictures(
-            request.output, subject, [view for view in views if view.timestep in timesteps], report
-        )
+        _film(request, subject, subject.views if request.cameras is None else views, report)
+        return Written(request.output)
+    if request.motion is not None:  # each timestep as the first pose of each camera sees it
+        cameras = sorted({view.camera_index: view for view in reversed(views)}.items())
+        views = [
+            replace(view, timestep=timestep, name=f"{timestep:05d}_{index:02d}")
+            for timestep in subject.timesteps
+            for index, view in cameras
+        ]
+    timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
+    shown = [view for view in views if view.timestep in timesteps]
+    _write_pictures(request.output, subject, shown, report)
     return Written(request.output)
 
 
@@ -204,31 +186,29 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
     """Write the subject's motion as one camera sees it, which stands still or orbits."""
     from ..render.render import to_uint8
 
-    start = _chosen_camera(request, views)
+    first = {view.camera_index: view for view in reversed(views)}
+    indices, index = sorted(first), request.camera
+    if not first:
+        raise StgaError(f"{request.source}: there is no camera to render from; give --cameras")
+    if index is None:
+        index = indices[central_camera([first[each].camera for each in indices])]
+    if index not in first:
+        raise StgaError(f"--camera {index}: there are only {', '.join(map(str, indices))}")
+    start = first[index]
     timesteps: Sequence[int] = _timesteps(request, subject.timesteps) or (0,)
-    path = [start] * len(timesteps)
+    cameras = [start.camera] * len(timesteps)
     if request.turntable is not None:
         count = max(len(timesteps), _turntable_images(request, subject.fps), 1)
         timesteps = to_and_fro(timesteps, count)
         center, half = subject.center(), np.radians(request.turntable) / 2
-        angles = (
-            (-half, half)
-            if half
-            else covered_angles([view.camera for view in views], start.camera, center)
-        )
-        path = [
-            replace(start, camera=camera)
-            for camera in turntable(start.camera, center, count, angles)
-        ]
-    path = [
-        replace(view, timestep=timestep) for view, timestep in zip(path, timesteps, strict=True)
-    ]
-    writer = (
-        video_writer(request.output, subject.fps)
-        if request.video
-        else sequence_writer(request.output)
-    )
-    with writer as write:
+        angles = (-half, half)
+        if not half:
+            angles = covered_angles([view.camera for view in views], start.camera, center)
+        cameras = turntable(start.camera, center, count, angles)
+    steps = zip(cameras, timesteps, strict=True)
+    path = [replace(start, camera=camera, timestep=timestep) for camera, timestep in steps]
+    out = request.output
+    with video_writer(out, subject.fps) if request.video else sequence_writer(out) as write:
         for n, view in enumerate(counted(path, len(path), report, "Rendering", "Image")):
             write(to_uint8(subject.image(view, n / len(path))))
 
@@ -248,126 +228,85 @@ def _turntable_images(request: Render, fps: float) -> int:
     """Images of --seconds. Raises StgaError for more than MAX_TURNTABLE_IMAGES."""
     images = request.seconds * fps
     if images > MAX_TURNTABLE_IMAGES:
-        asked = (
-            f"--seconds {request.seconds:g}: is {images:.0f} images at {fps:g} frames per second"
-        )
-        raise StgaError(f"{asked}; expected up to {MAX_TURNTABLE_IMAGES}")
+        asked = f"is {images:.0f} images at {fps:g} frames per second"
+        limit = f"expected up to {MAX_TURNTABLE_IMAGES}"
+        raise StgaError(f"--seconds {request.seconds:g}: {asked}; {limit}")
     return round(images)
 
 
-def _chosen_camera(request: Render, views: Sequence[View]) -> View:
-    """The first view of the camera to film with."""
-    first = {view.camera_index: view for view in reversed(views)}
-    if not first:
-        raise StgaError(f"{request.source}: there is no camera to render from; give --cameras")
-    if request.camera is None:
-        indices = sorted(first)
-        return first[indices[central_camera([first[index].camera for index in indices])]]
-    if request.camera not in first:
-        raise StgaError(
-            f"--camera {request.camera}: there are only {', '.join(map(str, sorted(first)))}"
+def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
+    """An avatar with its capture or moved by another person's motion, or a world-space PLY."""
+    source = request.source
+    if is_ply(source):
+        refused = (
+            (request.motion, "splats are bound to no mesh that a motion could move"),
+            (request.light, "light is not known; --light needs an avatar"),
+            (request.world, "folder is not that of a run, which --world needs"),
         )
-    return first[request.camera]
-
-
-def _subject(request: Render, composer: Composer) -> _Subject:
-    """An avatar with its capture, or a plain world-space PLY."""
-    if is_ply(request.source):
-        if request.light is not None:
-            raise StgaError(
-                f"{request.source}: is a PLY, whose light is not known; --light needs an avatar"
-            )
-        if request.world:
-            raise StgaError(f"{request.source}: is a PLY; --world needs the folder of a run")
+        for given, why in refused:
+            if given:
+                raise StgaError(f"{source}: is a PLY, whose {why}")
         from ..render.render import render
 
-        splats = read_ply(request.source)
+        splats = read_ply(source)
         return _Subject(
-            lambda view, _: render(splats, view.camera, request.background, composer=composer),
-            (),
-            lambda: np.median(splats.xyz, axis=0),
-            playback_fps(None, request.fps),
-        )
+            lambda view, _: render(splats, view.camera, request.background, composer=composer), (),
+            lambda: np.median(splats.xyz, axis=0), playback_fps(None, request.fps),
+        )  # fmt: skip
+    if request.motion is not None:
+        avatar = read_avatar(avatar_path(source))
+        motion = open_avatar_motion(request, avatar, say)
+        sequence, fps = motion.sequence, request.fps or motion.fps or DEFAULT_FPS
+        return _Subject(
+            _pictured(request, avatar, lambda v: sequence_mesh(sequence, v.timestep), composer),
+            tuple(sequence.timesteps),
+            lambda: _middle(sequence_mesh(sequence, sequence.timesteps[0])), fps,
+        )  # fmt: skip
     avatar, capture = open_avatar(request)
     if capture is None:
-        raise StgaError(
-            f"{request.source}: an avatar needs the meshes of a capture to follow; give --capture"
-        )
+        problem = "an avatar needs the meshes of a capture to follow; give --capture"
+        raise StgaError(f"{source}: {problem}")
 
     def mesh(view: View) -> np.ndarray:
         if view.timestep not in capture.timesteps:
-            raise StgaError(
-                f"{capture.root}: has no mesh for timestep {view.timestep}, which {view.name} asks for"
-            )
+            problem = f"has no mesh for timestep {view.timestep}, which {view.name} asks for"
+            raise StgaError(f"{capture.root}: {problem}")
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
-        _pictured(request, avatar, mesh, composer),
-        capture.timesteps,
-        lambda: _middle(capture.mesh(capture.timesteps[0])),
-        playback_fps(capture, request.fps),
+        _pictured(request, avatar, mesh, composer), capture.timesteps,
+        lambda: _middle(capture.mesh(capture.timesteps[0])), playback_fps(capture, request.fps),
         [view for views in capture.views.values() for view in views],
-    )
-
-
-def _reenacted(request: Render, composer: Composer, say: Say) -> _Subject:
-    """An avatar moved by another person's motion."""
-    if is_ply(request.source):
-        raise StgaError(
-            f"{request.source}: is a PLY, whose splats are bound to no mesh that a motion could move"
-        )
-    avatar = read_avatar(avatar_path(request.source))
-    motion = open_avatar_motion(request, avatar, say)
-    sequence = motion.sequence
-
-    def mesh(timestep: int) -> np.ndarray:
-        return sequence_mesh(sequence, timestep)
-
-    return _Subject(
-        _pictured(request, avatar, lambda view: mesh(view.timestep), composer),
-        tuple(sequence.timesteps),
-        lambda: _middle(mesh(sequence.timesteps[0])),
-        request.fps or motion.fps or DEFAULT_FPS,
-    )
+    )  # fmt: skip
 
 
 def _pictured(
     request: Render, avatar: Avatar, mesh: Callable[[View], np.ndarray], composer: Composer
 ) -> Callable[[View, float], np.ndarray]:
-    """The picture of an avatar on the mesh of a view, as it was recorded or under the light that is
-    asked for."""
+    """The picture of an avatar on the mesh of a view, as recorded or under the asked light."""
     from ..render.render import render_avatar, render_colors
 
-    behind = _world(request.source) if request.world else None
+    background, behind = request.background, None
+    if request.world:
+        path = avatar_path(request.source).with_name(WORLD_FILE)
+        if not path.is_file():
+            shown = "--world shows what a training with --effect world=on has written"
+            raise StgaError(f"{path}: is missing; {shown}")
+        behind = read_ply(path)
     if request.light is None:
         return lambda view, _: render_avatar(
-            avatar, mesh(view), view.camera, request.background, composer, behind
+            avatar, mesh(view), view.camera, background, composer, behind
         )
     relighter, lighting = Relighter(avatar), read_lighting(request.light)
 
     def picture(view: View, share: float) -> np.ndarray:
-        posed = mesh(view)
-        light = (
-            turned(lighting, _middle(posed), request.light_turn * share)
-            if request.light_turn
-            else lighting
-        )
+        posed, light = mesh(view), lighting
+        if request.light_turn:
+            light = turned(lighting, _middle(posed), request.light_turn * share)
         colors = relighter.colors(posed, view.camera.position, light)
-        return render_colors(
-            avatar, posed, view.camera, colors, request.background, composer, behind
-        )
+        return render_colors(avatar, posed, view.camera, colors, background, composer, behind)
 
     return picture
-
-
-def _world(source: Path) -> Splats:
-    """Raises StgaError where the run of an avatar has no world."""
-    path = avatar_path(source).with_name(WORLD_FILE)
-    if not path.is_file():
-        raise StgaError(
-            f"{path}: is missing; --world shows what a training with --effect world=on has written"
-        )
-    return read_ply(path)
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:
@@ -376,8 +315,7 @@ def _middle(vertices: np.ndarray) -> np.ndarray:
 
 
 def unique_names(paths: list[str]) -> list[str]:
-    """File names with the suffix .png; where entries share one, their folders become part of it,
-    then a number."""
+    """Names ending in .png; where entries share one, with their folders, then numbered."""
     pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
     names = [png.name for png in pngs]
     if len(set(names)) < len(names):

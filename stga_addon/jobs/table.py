@@ -38,8 +38,9 @@ class Benchmark:
 
 
 Request = (
-    Train | Resume | Refine | Extend | Select | SelectForTake | Track | MakeAvatar | SolveAgain | Render
-    | RenderBlend | RenderRecording | Export | ConvertMotion | Analyze | TimePresets | Evaluate | Benchmark | Relight
+    Train | Resume | Refine | Extend | Select | SelectForTake | Track | MakeAvatar | SolveAgain
+    | Render | RenderBlend | RenderRecording | Export | ConvertMotion | Analyze | TimePresets
+    | Evaluate | Benchmark | Relight
 )  # fmt: skip
 
 
@@ -80,17 +81,14 @@ JOBS: dict[type[Request], Job] = {
     SolveAgain: Job(".track.solve_again", Kind.TRACKING, "capture"),
     MakeAvatar: Job(".track.make_avatar", Kind.AVATAR, "out"),
     Analyze: Job(".analyze.analyze", Kind.ANALYSIS, "capture"),
-    TimePresets: Job(".analyze.time_each_preset"),
-    Select: Job(".analyze.select"),
+    TimePresets: Job(".analyze.time_each_preset"), Select: Job(".analyze.select"),
     Evaluate: Job(".finished_run.evaluate"),
-    Relight: Job(".finished_run.relight", Kind.LIGHT, "run"),
-    Render: Job(".render.render"),
+    Relight: Job(".finished_run.relight", Kind.LIGHT, "run"), Render: Job(".render.render"),
     RenderRecording: Job(".blender.render_recording", Kind.VIDEO, "output"),
-    RenderBlend: Job(".blender.render_blend"),
-    Export: Job(".export.export"),
+    RenderBlend: Job(".blender.render_blend"), Export: Job(".export.export"),
     ConvertMotion: Job(".convert_motion.convert_motion", Kind.PERFORMANCE, "output"),
     Benchmark: Job("..development.benchmark.slice.train_slice"),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -117,26 +115,37 @@ class RequestKind:
 KINDS = {
     Kind.TRAINING: RequestKind(
         "Training", "Stop training and keep the avatar trained so far; Resume continues from there",
-        ("Trained", "Cancelled, avatar kept", "Training failed", "Run not found"), is_stored=True, trains=True,
+        ("Trained", "Cancelled, avatar kept", "Training failed", "Run not found"),
+        is_stored=True, trains=True,
     ),
     Kind.TRACKING: RequestKind(
-        "Tracking", "Stop tracking; the landmarks of whole cameras are kept, and Track continues with the others",
-        ("Tracked", "Cancelled; Track continues", "Tracking failed", "Capture not found"), is_stored=True,
+        "Tracking", "Stop tracking; the landmarks of whole cameras are kept, and Track continues "
+        "with the others",
+        ("Tracked", "Cancelled; Track continues", "Tracking failed", "Capture not found"),
+        is_stored=True,
     ),
     Kind.AVATAR: RequestKind(
-        "Making an avatar", "Stop, and keep what there is so far; Avatar from Video with the same video continues",
+        "Making an avatar", "Stop, and keep what there is so far; Avatar from Video with the same "
+        "video continues",
         ("Avatar made", "Cancelled; Avatar from Video continues", "Making the avatar failed",
          "Its folder was not found"), is_stored=True, trains=True,
     ),
-    Kind.ANALYSIS: RequestKind("The analysis", "Stop the analysis; earlier results stay", is_transient=True),
-    Kind.SELECTION: RequestKind("The selection", "Stop selecting; the groups stay as they are", is_transient=True),
-    Kind.PERFORMANCE: RequestKind(
-        "The performance of the video", "Stop watching the video; nothing is written", is_transient=True
+    Kind.ANALYSIS: RequestKind(
+        "The analysis", "Stop the analysis; earlier results stay", is_transient=True
     ),
-    Kind.LIGHT: RequestKind("The estimate of light", "Stop; the avatar stays as it is", is_transient=True),
+    Kind.SELECTION: RequestKind(
+        "The selection", "Stop selecting; the groups stay as they are", is_transient=True
+    ),
+    Kind.PERFORMANCE: RequestKind(
+        "The performance of the video", "Stop watching the video; nothing is written",
+        is_transient=True,
+    ),
+    Kind.LIGHT: RequestKind(
+        "The estimate of light", "Stop; the avatar stays as it is", is_transient=True
+    ),
     Kind.VIDEO: RequestKind(
-        "The video", "Stop making the video; nothing is written, or the PNGs that are finished stay",
-        ("Video rendered", "Video cancelled", "Video failed", ""),
+        "The video", "Stop making the video; nothing is written, or the PNGs that are finished "
+        "stay", ("Video rendered", "Video cancelled", "Video failed", ""),
     ),
 }  # fmt: skip
 STORED, TRAINS, TRANSIENT = (

@@ -1,10 +1,9 @@
-"""Tracking: footage to a capture, solving one again around poses made by hand, and from footage to
-an avatar."""
+"""Footage to a capture, solving one again around poses made by hand, and footage to an avatar."""
 
 import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -49,9 +48,8 @@ def _parsed_mattes(text: str) -> str:
 def _parsed_offset(text: str) -> tuple[str, int]:
     name, _, frames = text.rpartition("=")
     if not name or not frames.removeprefix("-").isdecimal() or len(frames) > 9:
-        raise StgaError(
-            f"expected a camera and a number of frames, as in left=-3, not {shorten(text)}"
-        )
+        problem = f"expected a camera and a number of frames, as in left=-3, not {shorten(text)}"
+        raise StgaError(problem)
     return name, int(frames)
 
 
@@ -63,22 +61,22 @@ class Track:
         "folder with a folder of images or a video for each camera, or one video", flag="FOOTAGE"
     )
     model: Path | None = option(
-        "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb) (default: the bundled head)",
-        flag="--model", metavar="HEAD",
+        "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb) (default: the bundled "
+        "head)", flag="--model", metavar="HEAD",
     )  # fmt: skip
     out: Path = option("folder of the capture", flag="--out", metavar="CAPTURE")
     cameras: Path | None = option(
-        "calibration: COLMAP, Metashape, RealityCapture or transforms.json (default: that in the footage's folder)",
-        None, metavar="FILE",
+        "calibration: COLMAP, Metashape, RealityCapture or transforms.json (default: that in the "
+        "footage's folder)", None, metavar="FILE",
     )  # fmt: skip
     avatar: Path | None = option(
-        "run of the same person's avatar: its head is fitted, in place of --model, and pose and expression are such "
-        "that it looks like the images", None, metavar="RUN",
+        "run of the same person's avatar: its head is tracked, in place of --model's, and posed "
+        "such that the avatar looks like the images", None, metavar="RUN",
     )  # fmt: skip
     landmarks: Path | None = option("landmark files of another detector", None, metavar="FOLDER")
     focal: float | None = option(
-        "focal length of a single camera without calibration, in pixels (default: as its file says, or from the head's "
-        "turns)", None, above=0, metavar="PIXELS",
+        "focal length of a single camera without calibration, in pixels (default: as its file "
+        "says, or from the head's turns)", None, above=0, metavar="PIXELS",
     )  # fmt: skip
     start: int = option("first timestep of the footage, counted from 0", 0, 0)
     stop: int | None = option("timestep to stop before (default: all)", None, 1)
@@ -89,16 +87,17 @@ class Track:
     )  # fmt: skip
     meshes: bool = option("write an OBJ per timestep as well", False)
     world: str = option(
-        "the capture's: in meters with the head near the origin, or the cameras' own (default: the cameras' where "
-        "they were exported from a Blender scene)", "auto", choices=WORLDS,
+        "the capture's: in meters with the head near the origin, or the cameras' own (default: the "
+        "cameras' where they were exported from a Blender scene)", "auto", choices=WORLDS,
     )  # fmt: skip
     sync: str = option(
-        "find offsets that are not given by the videos' sound, or by what moves; auto: sound where all have it",
-        "none", choices=SYNC,
+        "find offsets that are not given by the videos' sound, or by what moves; auto: sound where "
+        "all have it", "none", choices=SYNC,
     )  # fmt: skip
     mattes: str = option(
-        "masks of the person: made where the footage has none (default), only the footage's, or a folder's",
-        "auto", is_path=lambda text: text not in MATTES, metavar="auto|none|FOLDER", parse=_parsed_mattes,
+        "masks of the person: made where the footage has none (default), only the footage's, or a "
+        "folder's", "auto", is_path=lambda text: text not in MATTES, metavar="auto|none|FOLDER",
+        parse=_parsed_mattes,
     )  # fmt: skip
 
     def check(self) -> None:
@@ -141,53 +140,44 @@ class MakeAvatar:
         """Raise StgaError where the two do not belong together."""
         wanted = self.out / CAPTURE_FOLDER, self.out / CAPTURE_FOLDER, self.out / RUN_FOLDER
         if (self.track.out, self.train.capture, self.train.run) != wanted:
-            raise StgaError(
-                f"{self.out}: expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
-            )
+            problem = f"expected a capture in {CAPTURE_FOLDER}, and its run in {RUN_FOLDER}"
+            raise StgaError(f"{self.out}: {problem}")
 
 
 # Work
 
 
 STAGES = {
-    "Opening the footage": (0.0, 0.0),
-    "Head model": (0.0, 0.01),
-    "Landmarks": (0.01, 0.06),
-    "Focal length": (0.06, 0.07),
-    "Fit": (0.07, 0.12),
-    "Dense tracking": (0.12, 0.3),
-    "Surface": (0.3, 0.34),
-    "Refinement": (0.34, 0.51),
-    "Mattes": (0.51, 0.64),
-    "Torso": (0.64, 0.97),
-    "Contact sheet": (0.97, 0.985),
-    "Images": (0.985, 0.99),
+    "Opening the footage": (0.0, 0.0), "Head model": (0.0, 0.01), "Landmarks": (0.01, 0.06),
+    "Focal length": (0.06, 0.07), "Fit": (0.07, 0.12), "Dense tracking": (0.12, 0.3),
+    "Surface": (0.3, 0.34), "Refinement": (0.34, 0.51), "Mattes": (0.51, 0.64),
+    "Torso": (0.64, 0.97), "Contact sheet": (0.97, 0.985), "Images": (0.985, 0.99),
     "Heads": (0.99, 1.0),
-    "Avatar": (0.99, 1.0),
-}
+}  # fmt: skip
 """Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its
 share of the time on two processors where one camera recorded a video of 1080p."""
+AVATAR_STAGE = "Avatar"
 MAX_MISFIT = 0.5
 """Median share of the head's pixels, beyond which the avatar is another person's."""
+TRACKING_SHARE = 0.5
+"""Of the progress, before an avatar tracks or is trained."""
 FOCAL_SOURCES = {
     "given": "as given",
     "file": "as the file says",
     "solved": "solved from the turns of the head",
     "usual": "a guess, that of a phone",
-}
-"""What a person reads of where a focal length is from (`Footage.focal`)."""
+}  # What a person reads of where a focal length is from (`Footage.focal`)
 
 
 def track(request: Track, report: Report, say: Say) -> Written:
-    """Track the head into a capture. Raises StgaError; cancelled, it leaves what was found so far,
-    from which the same request continues."""
+    """Track the head into a capture; cancelled, the same request continues. Raises StgaError."""
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
     from ..tracking.track import end_tracking
     from ..tracking.track import track as track_footage
     from ..training.run.recording import avatar_person, track_recording
 
-    steps = _Steps(report)
+    steps, out = _Steps(report, 1.0 if request.avatar is None else TRACKING_SHARE), request.out
     steps.report("Opening the footage", 0, 1)
     frames = FrameRange(
         request.start, request.stop, request.step, dict(request.offset or {}), request.sync
@@ -198,35 +188,28 @@ def track(request: Track, report: Report, say: Say) -> Written:
     if request.avatar is not None:
         person, model = avatar_person(request.avatar)
     found = track_footage(
-        footage, model, request.out, request.landmarks, request.meshes, request.world,
+        footage, model, out, request.landmarks, request.meshes, request.world,
         request.mattes == "auto", steps.report, steps.show, person,
     )  # fmt: skip
-    missed = []
+    lines = [f"warning: {warning}" for warning in found.warnings]
+    where = "by camera and timestep in tracking.json"
+    lines.append(f"reprojection error: {found.median_px:.2f} px (median); {where}")
+    if found.focal_px is not None:
+        lines.append(f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}")
+    if found.torso is not None:
+        lines.append(f"torso: {found.torso.description}")
     if request.avatar is not None:
-        with Helpers(folder=request.out / KEPT_FOLDER) as helpers:
+        with Helpers(folder=out / KEPT_FOLDER) as helpers:
             tracked = track_recording(
-                request.avatar, request.out, helpers, partial(steps.report, "Avatar")
+                request.avatar, out, helpers, partial(steps.report, AVATAR_STAGE)
             )
-        end_tracking(request.out)
+        end_tracking(out)
         share = float(np.median(tracked.misfit))
-        missed = [f"avatar: {share:.0%} of the head's pixels are not as it has them (median)"]
+        lines.append(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
         if share > MAX_MISFIT:
-            missed.append("warning: the avatar does not look like the person of this footage")
-    error = f"Reprojection error {found.median_px:.1f} px (median)"
-    report(Progress(1.0, "Tracked", error))
-    lines = [
-        *(f"warning: {warning}" for warning in found.warnings),
-        f"reprojection error: {found.median_px:.2f} px (median); by camera and timestep in tracking.json",
-        *(
-            []
-            if found.focal_px is None
-            else [f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}"]
-        ),
-        *([] if found.torso is None else [f"torso: {found.torso.description}"]),
-        *missed,
-        f"capture: {request.out}",
-    ]
-    return Written(request.out, tuple(lines))
+            lines.append("warning: the avatar does not look like the person of this footage")
+    report(Progress(1.0, "Tracked", f"Reprojection error {found.median_px:.1f} px (median)"))
+    return Written(out, (*lines, f"capture: {out}"))
 
 
 def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
@@ -240,18 +223,19 @@ def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
 class _Steps:
     """A tracking's steps as progress, with the time that is left and how well the head fits."""
 
-    def __init__(self, report: Report) -> None:
-        self._report, self._time_left = report, TimeLeft()
+    def __init__(self, report: Report, tracking_share: float = 1.0) -> None:
+        self._report, self._time_left, self._share = report, TimeLeft(), tracking_share
         self._now, self._quality = Progress(), dict[str, float]()
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Raises Cancelled where the report says to stop."""
-        begin, end = STAGES.get(stage, (0.0, 0.9))
+        begin, end = (self._share * share for share in STAGES.get(stage, (0.0, 0.9)))
+        if stage == AVATAR_STAGE:
+            begin, end = self._share, 1.0
         share = begin + (end - begin) * done / max(total, 1)
         figures = {"left_s": self._time_left.after(share), **self._quality}
-        self._now = Progress(
-            share, stage, f"{done} of {total}" if total > 1 else "", lambda: figures
-        )
+        detail = f"{done} of {total}" if total > 1 else ""
+        self._now = Progress(share, stage, detail, lambda: figures)
         if self._report(self._now):
             raise Cancelled
 
@@ -263,44 +247,46 @@ class _Steps:
 # From footage to an avatar
 
 
-TRACKING_SHARE = 0.5
-"""Of the progress."""
-
-
 def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
-    """Track unless that was done, and train or continue the run. Raises StgaError where the folder
-    began with other inputs, and as both do."""
+    """Track unless that is done, then train or continue. Raises StgaError for other inputs."""
+    capture, run = request.track.out, request.train.run
 
     def report_tracking(progress: Progress) -> bool:
         share, stage = TRACKING_SHARE * progress.share, f"Tracking: {progress.stage}"
-        figures = dict(progress.figures())
-        figures["left_s"] = figures.get("left_s", math.nan) + (
-            request.train.settings.seconds or 0.0
-        )
+        figures = {"left_s": math.nan, **progress.figures()}
+        figures["left_s"] += request.train.settings.seconds or 0.0
         return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
-        return report(
-            replace(progress, share=TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share)
-        )
+        share = TRACKING_SHARE + (1 - TRACKING_SHARE) * progress.share
+        return report(replace(progress, share=share))
 
     begin = perf_counter()
     _track(request.track, report_tracking, say)
     tracked = perf_counter()
-    flame = request.track.model if is_flame(request.track.out) else None
-    new = replace(request.train, flame=flame)
-    trained = train(resumed(new) if has_run(new.run) else new, report_training, say)
-    end = perf_counter()
-    times = (
-        f"tracking {format_duration(tracked - begin)}, training {format_duration(end - tracked)}"
-    )
-    lines = [
-        "",
-        *_tracking_lines(request),
+    new = replace(request.train, flame=request.track.model if is_flame(capture) else None)
+    trained = train(resumed(new) if has_run(run) else new, report_training, say)
+    tracking, training = tracked - begin, perf_counter() - tracked
+    values = read_json(capture / REPORT_FILE)
+    try:
+        errors = values["reprojection_px"]
+        timesteps = {timestep for by_timestep in errors.values() for timestep in by_timestep}
+        timesteps |= set(map(str, values["interpolated"]))
+        lines = ["", *(f"warning: {warning}" for warning in values["warnings"])]
+        lines.append(f"footage: cameras {len(errors)}, timesteps {len(timesteps)}")
+        median = f"{values['median_reprojection_px']:.2f} px (median)"
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        problem = f"is not the report of a tracking ({error!s:.100})"
+        raise StgaError(f"{capture / REPORT_FILE}: {problem}") from error
+    files = [capture / SHEET_FILE, capture / REPORT_FILE, run / CURVE]
+    lines += [
+        f"tracking: reprojection error {median}",
+        f"report: {', '.join(str(path) for path in files if path.exists())}",
         *trained.lines,
-        f"time: {times}, in all {format_duration(end - begin)}",
+        f"time: tracking {format_duration(tracking)}, training {format_duration(training)}, "
+        f"in all {format_duration(tracking + training)}",
     ]
-    return Written(request.train.run / AVATAR, tuple(lines))
+    return Written(run / AVATAR, tuple(lines))
 
 
 def _track(request: Track, report: Report, say: Say) -> None:
@@ -321,40 +307,16 @@ def _track(request: Track, report: Report, say: Say) -> None:
         raise
 
 
-def _tracking_lines(request: MakeAvatar) -> list[str]:
-    """What the capture's report says. Raises StgaError where it is another file."""
-    capture = request.track.out
-    report = read_json(capture / REPORT_FILE)
-    try:
-        errors = report["reprojection_px"]
-        timesteps = {timestep for by_timestep in errors.values() for timestep in by_timestep} | set(
-            map(str, report["interpolated"])
-        )
-        lines = [f"warning: {warning}" for warning in report["warnings"]]
-        lines += [f"footage: cameras {len(errors)}, timesteps {len(timesteps)}"]
-        lines += [
-            f"tracking: reprojection error {report['median_reprojection_px']:.2f} px (median)"
-        ]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise StgaError(
-            f"{capture / REPORT_FILE}: is not the report of a tracking ({error!s:.100})"
-        ) from error
-    files = [capture / SHEET_FILE, capture / REPORT_FILE, request.train.run / CURVE]
-    return [*lines, f"report: {', '.join(str(path) for path in files if path.exists())}"]
-
-
 def check_inputs(track: Track) -> None:
     """Raise StgaError where the folder began with other inputs, or holds something else."""
     out, inputs = track.out.parent, _inputs(track)
     if (out / INPUTS).exists():
         stored = read_inputs(out)
-        # an older version noted less
-        before = {name: stored.get(name, getattr(Track, name, None)) for name in inputs}
-        changed = next((name for name in inputs if before[name] != inputs[name]), None)
-        if changed is not None:
-            raise StgaError(
-                f"{changed}: {out} began with {shorten(before[changed])}; give another --out"
-            )
+        for name, value in inputs.items():
+            before = stored.get(name, getattr(Track, name, None))  # an older version noted less
+            if before != value:
+                began = f"{out} began with {shorten(before)}"
+                raise StgaError(f"{name}: {began}; give another --out")
     elif is_written(track.out) or (out / RUN_FOLDER).exists():
         raise StgaError(f"{out}: holds something else ({INPUTS} is missing); give another --out")
 
@@ -368,11 +330,7 @@ def read_inputs(out: Path) -> dict[str, Any]:
 
 
 def _inputs(track: Track) -> dict[str, Any]:
-    """What decides how it is tracked, as JSON: the fields of `Track` but its folder; paths are
-    absolute."""
-    values = {spec.name: getattr(track, spec.name) for spec in fields(Track) if spec.name != "out"}
-    values["offset"] = dict(sorted((track.offset or {}).items()))
-    return {
-        name: os.path.abspath(value) if isinstance(value, Path) else value
-        for name, value in values.items()
-    }
+    """What decides how it is tracked, as JSON: `Track` without its folder, absolute paths."""
+    values = {**vars(track), "offset": dict(sorted((track.offset or {}).items()))}
+    del values["out"]
+    return {n: os.path.abspath(v) if isinstance(v, Path) else v for n, v in values.items()}

@@ -44,10 +44,8 @@ from ..training.run.identity import file_digest, identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 from .results import Selected, Written
 
-MAX_NAMED_VIEWS = 6
-"""Views that a warning names."""
-Selection = Mapping[int, np.ndarray]
-"""timestep -> (F,) bool: triangles to train."""
+MAX_NAMED_VIEWS = 6  # Views that a warning names
+Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
 
 @dataclass(frozen=True)
@@ -65,9 +63,10 @@ class Train:
         "what cy means in the capture", DEFAULT_PRINCIPAL_POINT, choices=PRINCIPAL_POINTS
     )
     device: str = option(
-        "gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto (default): that of the run, "
-        "else a GPU if it is right and faster than the CPU in a trial of a second, else the CPU",
-        "auto", accepts=is_device, expected=EXPECTED_DEVICE, metavar="{auto,cpu,gpu,gpu:NAME}",
+        "gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto "
+        "(default): that of the run, else a GPU if it is right and faster than the CPU in a trial "
+        "of a second, else the CPU", "auto", accepts=is_device,
+        expected=EXPECTED_DEVICE, metavar="{auto,cpu,gpu,gpu:NAME}",
     )  # fmt: skip
     selection: Selection | None = None
 
@@ -90,16 +89,11 @@ class Resume:
 
 def resumed(request: "Train | Refine | Extend") -> Resume:
     """What continues the run of a request that was interrupted."""
-    if isinstance(request, Train):
-        return Resume(
-            request.run,
-            request.capture,
-            request.flame,
-            request.principal_point,
-            request.device,
-            request.selection,
-        )
-    return Resume(request.run, flame=request.flame, device=request.device)
+    resume = Resume(request.run, flame=request.flame, device=request.device)
+    if not isinstance(request, Train):
+        return resume
+    point, selection = request.principal_point, request.selection
+    return replace(resume, capture=request.capture, principal_point=point, selection=selection)
 
 
 @dataclass(frozen=True)
@@ -114,12 +108,9 @@ class _Continue:
     parent: Path = option("folder of a run", flag="RUN")
     _: KW_ONLY
     growth: float = option(
-        "splats to add, as a share of those on the triangles that are trained",
-        0.0,
-        0,
-        MAX_GROWTH,
+        "splats to add, as a share of those on the triangles that are trained", 0.0, 0, MAX_GROWTH,
         metavar="SHARE",
-    )
+    )  # fmt: skip
     seconds: float | None = like(
         TrainingSettings, "seconds", help="training time (default 20s to refine, 1m to extend)"
     )
@@ -143,8 +134,8 @@ class Refine(_Continue):
     """
 
     region: str = option(
-        "region of the capture, vertex mask of FLAME, or file of triangle weights (docs/formats.md)",
-        "", metavar="NAME|FILE", is_path=is_region_file,
+        "region of the capture, vertex mask of FLAME, or file of triangle weights "
+        "(docs/formats.md)", "", metavar="NAME|FILE", is_path=is_region_file,
     )  # fmt: skip
     weights: np.ndarray | None = None
     frames: tuple[int, int] | None = option(
@@ -154,9 +145,8 @@ class Refine(_Continue):
     def check(self) -> None:
         """Raise StgaError unless there is one region and one budget."""
         if not self.region and self.weights is None:
-            raise StgaError(
-                "--region: is missing; expected the name of a region or a file of triangle weights"
-            )
+            problem = "is missing; expected the name of a region or a file of triangle weights"
+            raise StgaError(f"--region: {problem}")
         if self.region and self.weights is not None:
             raise StgaError("region: expected its name, its file or painted weights")
         super().check()
@@ -189,8 +179,7 @@ class SelectForTake:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run that can be trained: its capture, of all its takes, and what each timestep trains,
-    where that is given."""
+    """A run that can be trained: the capture of all its takes, and what each timestep trains."""
 
     request: Train | Resume | Refine | Extend
     run: Run
@@ -201,19 +190,16 @@ class Prepared:
         """The path of the avatar. Raises as `training.run.session.train`."""
         from ..training.run.session import train
 
-        folder, resumes, falls_back = (
-            self.request.run,
-            isinstance(self.request, Resume),
-            self.request.device == "auto",
+        request = self.request
+        resumes, falls_back = isinstance(request, Resume), request.device == "auto"
+        return train(
+            self.capture, request.run, self.run, self.selection, resumes, report, falls_back
         )
-        return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
 
 
 def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Written:
-    """Train the run that is asked for; returns the path of its avatar and its summary.
-
-    Raises StgaError, and KeyboardInterrupt after Ctrl-C when the run can be resumed.
-    """
+    """Train the run that is asked for; its avatar and summary. Raises StgaError, KeyboardInterrupt
+    after Ctrl-C."""
     from ..training.effects.plan import describe_effects
 
     prepared, folder = prepare(request, report, say), request.run
@@ -237,10 +223,8 @@ def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -
     lines = report_run(folder)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
-        lines += [
-            *_light_of(prepared, avatar, report_afterwards),
-            *_world_of(prepared, report_afterwards),
-        ]
+        lines += _light_of(prepared, avatar, report_afterwards)
+        lines += _world_of(prepared, report_afterwards)
     lines.append(f"avatar: {avatar}")
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
@@ -248,25 +232,21 @@ def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -
 
 
 def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ...]:
-    """Write the light of the capture into the avatar; what there is to say about it, or why there
-    is none."""
+    """Write the light of the capture into the avatar; what there is to say, or why it has none."""
     if any(decision.effect == RELIGHT and not decision.on for decision in prepared.run.effect_plan):
-        return (
-            "light: not estimated (the effect relight is off); `stga relight RUN` estimates it",
-        )
+        why = "the effect relight is off"
+        return (f"light: not estimated ({why}); `stga relight RUN` estimates it",)
     from .finished_run import add_light
 
+    capture = with_refined_tracking(prepared.capture, prepared.request.run)
     try:
-        return add_light(
-            avatar, with_refined_tracking(prepared.capture, prepared.request.run), report=report
-        )
+        return add_light(avatar, capture, report=report)
     except StgaError as error:  # an avatar without it is whole
         return (f"light: not estimated ({error})",)
 
 
 def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
-    """Write what stands still behind the person into the run's folder, where its effect is on; what
-    there is to say."""
+    """Write what stands still behind the person, where its effect is on; what there is to say."""
     if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
         return ()
     from ..training.world.world_splats import world_of
@@ -283,27 +263,29 @@ def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
 def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
     if not isinstance(request, Resume) and has_run(request.run):
-        raise StgaError(
-            f"{request.run}: already holds a run; resume it (--resume), or choose another folder (--out)"
-        )
+        problem = "already holds a run; resume it (--resume), or choose another folder (--out)"
+        raise StgaError(f"{request.run}: {problem}")
     match request:
         case Train():
             return _new_run(request, report, say)
-        case Resume():
-            return _resumed_run(request, say)
         case Refine():
             return _refinement(request, report, say)
         case Extend():
             return _extension(request, report, say)
+        case Resume():
+            flame, principal_point = request.flame, request.principal_point
+            opened = open_run(request.run, request.capture, flame, principal_point)
+            device, why = device_of(opened.run, request.device)
+            say(why)
+            run = replace(opened.run, device=device)
+            return Prepared(request, run, opened.capture, request.selection)
 
 
 def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
-    """timestep of the take -> (F,) bool: what extending the run by it would train. Raises
-    StgaError."""
+    """timestep -> (F,) bool: what extending the run by the take would train. Raises StgaError."""
     report(Progress(stage="Comparing the avatar with the images"))
-    wanted = Extend(
-        request.parent, request.parent, (request.capture,), iterations=1, flame=request.flame
-    )
+    parent, takes = request.parent, (request.capture,)
+    wanted = Extend(parent, parent, takes, iterations=1, flame=request.flame)
     _, _, selection, run = _joined_takes(wanted, say)
     start = run.takes[-1].start
     selection = {timestep - start: faces for timestep, faces in selection.items()}
@@ -332,49 +314,38 @@ def _new_run(request: Train, report: Report, say: Say) -> Prepared:
     return Prepared(request, run, capture, request.selection)
 
 
-def _resumed_run(request: Resume, say: Say) -> Prepared:
-    opened = open_run(request.run, request.capture, request.flame, request.principal_point)
-    device, why = device_of(opened.run, request.device)
-    say(why)
-    return Prepared(request, replace(opened.run, device=device), opened.capture, request.selection)
-
-
 def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
-    """Raises StgaError where the run, the region or the frames do not exist, or no camera sees the
-    region."""
+    """Raises StgaError without run, region or frames, or where no camera sees the region."""
     from ..training.run.continuation import continued_settings, is_faced
 
+    parent, weights = request.parent, request.weights
     device = _continuing_device(request, say)
     report(Progress(stage="Opening the run"))
-    opened = open_run(request.parent, flame=request.flame)
-    capture = with_refined_tracking(opened.capture, request.parent)
-    if request.weights is None:
+    opened = open_run(parent, flame=request.flame)
+    capture = with_refined_tracking(opened.capture, parent)
+    count = len(capture.faces)
+    if weights is None:
         region, name = find_region(capture, request.region), request.region
-    elif request.weights.shape == (len(capture.faces),):
-        region, name = request.weights >= SELECTED_WEIGHT, "painted"
+    elif weights.shape == (count,):
+        region, name = weights >= SELECTED_WEIGHT, "painted"
     else:
-        found = request.weights.shape
-        raise StgaError(
-            f"weights: expected one for each triangle ({len(capture.faces)},), got {found}"
-        )
-    face = read_avatar(request.parent / AVATAR).splats.face
-    count = int(region[face].sum())
-    if not count:
+        expected = f"one for each triangle ({count},)"
+        raise StgaError(f"weights: expected {expected}, got {weights.shape}")
+    face = read_avatar(parent / AVATAR).splats.face
+    if not region[face].any():
         raise StgaError(f"region '{name}': the avatar has no splats there")
+    growth = request.growth * float(region[face].mean())
     settings = continued_settings(
-        opened.run.settings, "refine", request.growth * count / len(face), request.seconds, request.iterations,
-        request.seed,
-    )  # fmt: skip
-    frames = request.frames or (min(capture.timesteps), max(capture.timesteps))
-    views = [
-        view for view in capture.views.get("train", ()) if frames[0] <= view.timestep <= frames[1]
-    ]
-    between = f"from timestep {frames[0]} to {frames[1]}"
+        opened.run.settings, "refine", growth, request.seconds, request.iterations, request.seed
+    )
+    first, last = request.frames or (min(capture.timesteps), max(capture.timesteps))
+    views = [v for v in capture.views.get("train", ()) if first <= v.timestep <= last]
+    between = f"from timestep {first} to {last}"
     if not views:
-        raise StgaError(f"{request.parent}: its capture has no training views {between}")
+        raise StgaError(f"{parent}: its capture has no training views {between}")
     if not is_faced(capture, views, region):
         raise StgaError(f"region '{name}': faces no training camera {between}")
-    continuation = _continuation(request.parent, frames)
+    continuation = _continuation(parent, (first, last))
     run = replace(
         opened.run, settings=settings, device=device, identity=None, continuation=continuation
     )
@@ -413,11 +384,19 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
     from ..training.run.continuation import select_for_takes
 
     opened = open_run(request.parent, flame=request.flame)
-    run, new = opened.run, [_open_new_take(opened, path) for path in request.captures]
-    roots = [take.root for take in new]
-    twice = next((root for root in roots if roots.count(root) > 1), None)
-    if twice is not None:
-        raise StgaError(f"{twice}: is given twice; expected each take once")
+    run, new = opened.run, list[Capture]()
+    for path in request.captures:
+        take = open_capture(path, run.flame, run.principal_point)
+        require_same_head(opened.capture, take)
+        if not take.views.get("train"):
+            problem = "has no training views, so there is nothing to extend the avatar with"
+            raise StgaError(f"{take.root}: {problem}")
+        require_same_scale(opened.takes[0], take)
+        if any(take.root == old.root for old in opened.takes):
+            raise StgaError(f"{take.root}: is a take of this run already")
+        if any(take.root == other.root for other in new):
+            raise StgaError(f"{take.root}: is given twice; expected each take once")
+        new.append(take)
     everything = [*opened.takes, *new]
     capture = with_refined_tracking(join_takes(everything), request.parent)
     starts = first_timesteps(everything)[len(opened.takes) :]
@@ -432,20 +411,6 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
         say(f"warning: {names}: does not look like the head from this camera; are images swapped?")
     run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
     return opened, capture, selection, run
-
-
-def _open_new_take(opened: OpenedRun, path: Path) -> Capture:
-    run = opened.run
-    take = open_capture(path, run.flame, run.principal_point)
-    require_same_head(opened.capture, take)
-    if not take.views.get("train"):
-        raise StgaError(
-            f"{take.root}: has no training views, so there is nothing to extend the avatar with"
-        )
-    require_same_scale(opened.takes[0], take)
-    if any(take.root == old.root for old in opened.takes):
-        raise StgaError(f"{take.root}: is a take of this run already")
-    return take
 
 
 def _continuation(parent: Path, frames: tuple[int, int]) -> Continuation:

@@ -23,12 +23,8 @@ def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None
     corners = np.stack([points[faces[:, k]].T for k in range(3)]).astype(np.float64)
     low, high = np.clip(corners.min(0)[:2], 0, size), np.clip(corners.max(0)[:2], 0, size)
     area = _crossed(corners[1] - corners[0], corners[2] - corners[0], 0, 1)
-    drawn = (
-        np.isfinite(corners).all((0, 1))
-        & (np.abs(area) > 1e-12)
-        & (low < size).all(0)
-        & (high > 0).all(0)
-    )
+    drawn = np.isfinite(corners).all((0, 1)) & (np.abs(area) > 1e-12)
+    drawn &= (low < size).all(0) & (high > 0).all(0)
     order = np.flatnonzero(drawn)
     # From far to near, so that the nearest are mostly written last.
     order = order[np.argsort(-corners[:, 2, order].sum(0))]
@@ -38,8 +34,7 @@ def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None
 
 
 def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None:
-    """Draw triangles (3 corners, 3, F) row by row: of each the texels between where it begins and
-    ends."""
+    """Draw triangles (3 corners, 3, F) row by row, from texel to texel."""
     size, u, v = len(depth), corners[1] - corners[0], corners[2] - corners[0]
     across, down = _crossed(u, v, 2, 1) / area, _crossed(u, v, 0, 2) / area
     plane = across, down, corners[0, 2] - across * corners[0, 0] - down * corners[0, 1]
@@ -83,8 +78,7 @@ def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write_least(values: np.ndarray, at: np.ndarray, found: np.ndarray) -> None:
-    """As `np.minimum.at`, which older NumPy is slow at: what is still less after it was written is
-    written again."""
+    """As `np.minimum.at`, slow in older NumPy: what is less after writing is written again."""
     while len(at):
         less = found < values[at]
         at, found = at[less], found[less]
@@ -129,8 +123,7 @@ def _windows(values: np.ndarray, width: int, reduced: Callable[..., np.ndarray])
 def _looked_up(
     padded: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, step: int
 ) -> np.ndarray:
-    """(N,) share of the 3 × 3 places around x, y (N,), or of the one, that z (N,) is not farther
-    than."""
+    """(N,) share of the 3 × 3 places around x, y, or of the one, that z is not farther than."""
     flat, width = padded.reshape(-1), len(padded)
     left, top = np.floor(x), np.floor(y)
     right, lower = x - left, y - top
@@ -149,8 +142,9 @@ def _looked_up(
 
 
 def add_lights(
-    points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray, reflectance: np.ndarray,
-    lights: np.ndarray, lit: np.ndarray, irradiance: np.ndarray, highlight: np.ndarray,
+    points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray,
+    reflectance: np.ndarray, lights: np.ndarray, lit: np.ndarray, irradiance: np.ndarray,
+    highlight: np.ndarray,
 ) -> None:  # fmt: skip
     """As `raster.cpu.shade.add_lights`."""
     for start in range(0, len(points), CHUNK_POINTS):
@@ -158,13 +152,8 @@ def add_lights(
         place, normal = (np.ascontiguousarray(rows[part].T) for rows in (points, normals))
         view = eye[:, None] - place
         view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
-        surface = (
-            normal,
-            view,
-            np.maximum(_dot(normal, view), MIN_FACING),
-            roughness[part],
-            reflectance[part],
-        )
+        facing = np.maximum(_dot(normal, view), MIN_FACING)
+        surface = normal, view, facing, roughness[part], reflectance[part]
         arriving, reflected = np.zeros_like(view), np.zeros_like(view)
         for light in lights:
             toward, strength, width = toward_light(light, place)
@@ -188,8 +177,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def toward_light(
     light: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors (3, N) to a light (a row of `raster.cpu.shade`), factors (N,) of its color, and
-    its width (N,)."""
+    """Unit vectors (3, N) to a light's row, factors (N,) of its color, and its width (N,)."""
     if light[0] == SUN:
         ones = np.ones(points.shape[1], np.float32)
         return np.broadcast_to(-light[4:7, None], points.shape), ones, light[15] * ones
@@ -207,11 +195,10 @@ def toward_light(
 
 
 def _gloss(
-    toward: np.ndarray, width: np.ndarray, normal: np.ndarray, view: np.ndarray, toward_eye: np.ndarray,
-    roughness: np.ndarray, reflectance: np.ndarray,
+    toward: np.ndarray, width: np.ndarray, normal: np.ndarray, view: np.ndarray,
+    toward_eye: np.ndarray, roughness: np.ndarray, reflectance: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """(N,) as `raster.cpu.shade.ggx` of lights that are `width` (N,) wide; 0 where there is no
-    roughness."""
+    """(N,) as `raster.cpu.shade.ggx` of lights `width` (N,) wide; 0 without roughness."""
     half = toward + view
     half *= 1 / np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))
     facing = np.maximum(_dot(normal, toward), 0)

@@ -17,24 +17,19 @@ MAX_PIXELS, MAX_HEADER_BYTES = 1 << 26, 1 << 16
 HEADER = re.compile(
     rb"#\?(?:RADIANCE|RGBE)[^\n]*\n(?:[^\n]*\n){0,200}?\n-Y (\d{1,6}) \+X (\d{1,6})\n"
 )
-MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 0x7FFF
-"""Widths of images whose rows may be compressed."""
+MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 0x7FFF  # Widths of images whose rows may be compressed
 MAX_SUNS = 4
 SUN_CONTRAST = 12.0
 """How much brighter than the mean of the environment a pixel must be to belong to a sun."""
-SUN_RADIUS = np.radians(12)
-"""Bright pixels within this angle of the brightest one are one sun."""
+SUN_RADIUS = np.radians(12)  # Bright pixels within this angle of the brightest one are one sun
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From Blender's axes (z up) to those of a capture that its add-on shows upright (y up, the face
 looks along z)."""
 
 
 def read_hdr(path: Path) -> np.ndarray:
-    """(H, W, 3) float32 linear radiance of a Radiance picture (.hdr, RGBE), rows from the top.
-
-    Reads flat and run-length encoded rows (Ward, "Real Pixels", Graphics Gems II). Raises
-    StgaError.
-    """
+    """(H, W, 3) float32 radiance of a .hdr picture (RGBE), flat or run-length encoded (Ward,
+    Graphics Gems II), from the top. Raises StgaError."""
     data = read_bytes(path)
     header = HEADER.match(data[:MAX_HEADER_BYTES])
     if header is None:
@@ -86,22 +81,13 @@ def _unpacked(body: np.ndarray, at: int, channel: np.ndarray) -> int:
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (H, W, 3) that the pixels of an equirectangular image show, and their solid
-    angles (H, 1).
-
-    Blender's: z up, the image's middle shows +x, its quarter to the left +y.
-    """
+    """Unit vectors (H, W, 3) of an equirectangular image's pixels, as Blender's (z up, middle +x,
+    left quarter +y), and their solid angles (H, 1)."""
     polar = np.pi * (np.arange(height) + 0.5) / height
     turn = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
     ring = np.sin(polar)[:, None]
-    vectors = np.stack(
-        [
-            ring * np.cos(turn),
-            ring * np.sin(turn),
-            np.broadcast_to(np.cos(polar)[:, None], (height, width)),
-        ],
-        axis=-1,
-    )
+    height_of = np.broadcast_to(np.cos(polar)[:, None], (height, width))
+    vectors = np.stack([ring * np.cos(turn), ring * np.sin(turn), height_of], axis=-1)
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     return vectors, ((edges[:-1] - edges[1:]) * 2 * np.pi / width)[:, None]
 
@@ -161,8 +147,7 @@ MAX_NUMBER = 1e6
 
 @dataclass(frozen=True)
 class LightEntry:
-    """A table [[lights]]: see `values.Light`; `strength` is Blender's, in W/m² of a sun and in W of
-    others."""
+    """A table [[lights]] of `values.Light`; `strength` is Blender's: W/m² of a sun, else W."""
 
     kind: str = setting(choices=KINDS)
     strength: float = setting(minimum=0, maximum=MAX_NUMBER)
@@ -183,8 +168,7 @@ class LightEntry:
 
 @dataclass(frozen=True)
 class LightFile:
-    """A file of lights, in meters and axes of the capture. world: radiance from everywhere. See
-    `values.Lighting`."""
+    """Lights in meters and axes of the capture (`values.Lighting`). world: radiance everywhere."""
 
     world: tuple[float, float, float] = setting((0.0, 0.0, 0.0), 0, MAX_NUMBER)
     lights: tuple[LightEntry, ...] = ()
@@ -201,17 +185,15 @@ class LightFile:
 
 
 def read_lighting(path: Path) -> Lighting:
-    """The lighting of an .hdr environment, which stands as Blender shows it around the upright
-    head, or of a .toml
-    file (`LightFile`). Raises StgaError naming the file."""
+    """The lighting of an .hdr environment, as Blender shows it around the upright head, or of a
+    .toml `LightFile`."""
     suffix = path.suffix.lower()
     if suffix == ".hdr":
         world, suns = split_environment(read_hdr(path))
         return Lighting(world, suns)
     if suffix != ".toml":
-        raise StgaError(
-            f"{path}: expected light as an environment (.hdr) or a list of lights (.toml)"
-        )
+        problem = "expected light as an environment (.hdr) or a list of lights (.toml)"
+        raise StgaError(f"{path}: {problem}")
     values = read_toml(path)
     try:
         entries = values.get("lights", [])
@@ -235,20 +217,16 @@ def _completed(kind: type, values: Any) -> Any:
     if not isinstance(values, dict):
         return values
     defaults = {spec.name: spec.default for spec in fields(kind) if spec.default is not MISSING}
-    return {
-        **{name: list(v) if isinstance(v, tuple) else v for name, v in defaults.items()},
-        **values,
-    }
+    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in defaults.items()}
+    return {**plain, **values}
 
 
 def turned(lighting: Lighting, center: np.ndarray, degrees: float) -> Lighting:
     """The lighting turned about the upward axis (+y) through center (3,)."""
     angle = np.radians(degrees)
     matrix = np.eye(4)
-    matrix[0, [0, 2]], matrix[2, [0, 2]] = (
-        (np.cos(angle), np.sin(angle)),
-        (-np.sin(angle), np.cos(angle)),
-    )
+    matrix[0, [0, 2]] = (np.cos(angle), np.sin(angle))
+    matrix[2, [0, 2]] = (-np.sin(angle), np.cos(angle))
     matrix[:3, 3] = center - matrix[:3, :3] @ center
     lights = tuple(light.transformed(matrix) for light in lighting.lights)
     return replace(lighting, world=rotated(lighting.world, matrix[:3, :3]), lights=lights)

@@ -21,24 +21,11 @@ MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800
 MIN_FACING = 0.35
 """Cosine between a triangle's normal and the direction to the camera, below which its color is not
 used."""
-HIDDEN_M = 0.003
-"""A triangle is hidden by what is nearer to the camera by as much."""
+HIDDEN_M = 0.003  # A triangle is hidden by what is nearer to the camera by as much
 POINTS = (np.eye(3) + 1 / 3) / 2
 """(3, 3) barycentric coordinates of the points of a triangle whose pixels are read."""
 SATURATED_LEVEL, DARK_LEVEL = 252, 4
 """Levels of 255 from which on, and up to which, a channel says nothing."""
-
-
-@dataclass(frozen=True)
-class Observed:
-    """Triangles' colors at T timesteps.
-
-    color    (T, F, 3) linear; NaN where no camera sees the triangle
-    cameras  (T, F) how many see it
-    """
-
-    color: np.ndarray
-    cameras: np.ndarray
 
 
 def views_by_time(capture: Capture) -> dict[int, list[View]]:
@@ -46,18 +33,17 @@ def views_by_time(capture: Capture) -> dict[int, list[View]]:
     found: dict[int, list[View]] = {}
     for view in capture.views.get("train", ()):
         found.setdefault(view.timestep, []).append(view)
-    return {
-        time: evenly_spread(found[time], MAX_CAMERAS)
-        for time in evenly_spread(sorted(found), MAX_TIMESTEPS)
-    }
+    times = evenly_spread(sorted(found), MAX_TIMESTEPS)
+    return {time: evenly_spread(found[time], MAX_CAMERAS) for time in times}
 
 
-def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -> Observed:
-    """Mean color of each triangle in the darker half of the cameras that face it, which have the
-    fewest highlights.
+def observe(
+    capture: Capture, exposure: ViewExposure, report: Report = ignore
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean linear color (T, F, 3) of triangles in the darker half of the cameras that face them,
+    which have the fewest highlights, NaN where none does; and how many (T, F) do.
 
-    T are those of `views_by_time`, in its order; reads all their images. exposure: as in
-    `estimate.Known`.
+    T are the `views_by_time`, whose images are all read. exposure: as in `Known`.
     """
     by_time = views_by_time(capture)
     colors, cameras = [], []
@@ -65,16 +51,19 @@ def observe(capture: Capture, exposure: ViewExposure, report: Report = ignore) -
         report(Progress(n / max(len(by_time), 1), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
         seen = np.stack([_view_colors(capture, mesh, view, exposure(view)) for view in views])
-        colors.append(_darker_half(seen))
+        ordered = np.sort(seen, axis=0)  # NaN comes last
+        count = np.isfinite(seen[..., :1]).sum(0)
+        taken = np.arange(len(seen))[:, None, None] < (count + 1) // 2
+        total = np.where(taken, np.nan_to_num(ordered), 0).sum(0)
+        colors.append(np.where(count > 0, total / np.maximum((count + 1) // 2, 1), np.nan))
         cameras.append(np.isfinite(seen[..., 0]).sum(0))
-    return Observed(np.stack(colors), np.stack(cameras))
+    return np.stack(colors), np.stack(cameras)
 
 
 def _view_colors(
     capture: Capture, mesh: np.ndarray, view: View, exposure: np.ndarray | None
 ) -> np.ndarray:
-    """(F, 3) linear mean color of each triangle at POINTS, without its camera's exposure (2, 3);
-    NaN where it is hidden or seen aslant."""
+    """(F, 3) mean linear color of triangles, exposure undone; NaN where hidden or aslant."""
     gain, offset = np.eye(2)[:, :1] if exposure is None else exposure
     scale = min(1.0, MAX_SIDE_PX / max(view.camera.width, view.camera.height))
     view, image, mask = read_view(view, scale)
@@ -114,45 +103,26 @@ def _inner(mask: np.ndarray) -> np.ndarray:
     )
 
 
-def _darker_half(colors: np.ndarray) -> np.ndarray:
-    """(F, 3) of colors by camera (C, F, 3), NaN where unseen: channel by channel the mean of the
-    darker half."""
-    ordered = np.sort(colors, axis=0)  # NaN comes last
-    count = np.isfinite(colors[..., :1]).sum(0)
-    taken = np.arange(len(colors))[:, None, None] < (count + 1) // 2
-    total = np.where(taken, np.nan_to_num(ordered), 0).sum(0)
-    return np.where(count > 0, total / np.maximum((count + 1) // 2, 1), np.nan)
-
-
 ITERATIONS = 40
-PRIOR = 0.7
-"""Weight of alike albedos, as a multiple of the observations of a triangle that is seen at every
-timestep."""
-POSED_DIRECTIONS = 96
-"""By which the transfer of a posed mesh is found, at each timestep."""
-UNSEEN_WEIGHT = 1e-3
-"""Of a timestep at which no camera sees a vertex, where each camera counts 1."""
+PRIOR = 0.7  # Weight of alike albedos, in observations of a triangle seen at every timestep
+POSED_DIRECTIONS = 96  # By which the transfer of a posed mesh is found, at each timestep
+UNSEEN_WEIGHT = 1e-3  # Of a timestep at which no camera sees a vertex, where each camera counts 1
 MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
 """Transfer of the constant harmonic below which a triangle counts for nothing: its own shadow hides
 the light."""
-LOSS_SCALE = 3.0
-"""Residual at which an observation's weight has halved, in medians."""
+LOSS_SCALE = 3.0  # Residual at which an observation's weight has halved, in medians
 RIDGE = 1e-4
 MIN_ARRIVING, DARK = 0.02, 1e-5
 """Least irradiance that a color is divided by, as a share of the mean; and what counts as no light
 or albedo."""
-TYPICAL_ALBEDO = 0.36
-"""Of skin (green), which sets the level of an estimated light; exposure and the eyedropper correct
-it."""
+TYPICAL_ALBEDO = 0.36  # Of skin (green): the level of an estimated light, until it is corrected
 HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
 """Residuals from which on the light is too hard to be taken away, and at which albedo is damped
 most."""
 MAX_DAMPING = 0.6
 CARD_REFLECTANCE = 0.18
 
-EYE_ROUGHNESS = 0.2
-"""Of highlights on eyes: about as sharp as splats of half a millimeter on a ball of 12 mm can
-show."""
+EYE_ROUGHNESS = 0.2  # Of highlights on eyes: as sharp as splats of half a millimeter can show
 MIN_RADIUS_M, MAX_RADIUS_M = 0.007, 0.017
 MAX_DEVIATION = 0.12
 """Share of the radius by which the vertices of an eyeball may leave the sphere, on average."""
@@ -179,21 +149,15 @@ class Known:
 def estimate_light(
     capture: Capture, known: Known = Known(), report: Report = ignore
 ) -> AvatarLight:
-    """The light of the capture and how its neutral mesh receives light. Raises StgaError without
-    training views."""
+    """The light of the capture and how its head receives it. Raises StgaError without views."""
     if not capture.views.get("train"):
-        raise StgaError(
-            f"{capture.root}: has no training views, from which its light could be estimated"
-        )
+        problem = "has no training views, from which its light could be estimated"
+        raise StgaError(f"{capture.root}: {problem}")
     transfer, occlusion = transfer_of(capture.neutral, capture.faces)
-    observed = observe(capture, known.exposure, report)
-    posed = np.stack(
-        [
-            transfer_of(capture.mesh(time), capture.faces, POSED_DIRECTIONS)[0]
-            for time in views_by_time(capture)
-        ]
-    )
-    radiance, residual = fit_light(observed.color, posed[:, capture.faces].mean(2), known.radiance)
+    color, cameras = observe(capture, known.exposure, report)
+    times, faces = views_by_time(capture), capture.faces
+    posed = np.stack([transfer_of(capture.mesh(t), faces, POSED_DIRECTIONS)[0] for t in times])
+    radiance, residual = fit_light(color, posed[:, faces].mean(2), known.radiance)
     source = "estimated"
     if known.radiance is not None:
         source = "file"
@@ -201,37 +165,24 @@ def estimate_light(
         assert known.toward is not None
         # At the level and white balance at which gray that faces `toward` shows the card's colors.
         arriving = np.maximum((basis(known.toward) * LAMBERT @ radiance).mean(0), 1e-6)
-        radiance, source = (
-            radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving),
-            "gray_card",
-        )
-    bounce = Bounce(capture.neutral, capture.faces, occlusion)
-    irradiance = recorded_irradiance(
-        np.maximum(posed @ radiance, DARK), observed.cameras, capture.faces, bounce
-    )
-    damping = MAX_DAMPING * float(
-        np.clip((residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL), 0, 1)
-    )
+        radiance = radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving)
+        source = "gray_card"
+    bounce, direct = Bounce(capture.neutral, faces, occlusion), np.maximum(posed @ radiance, DARK)
+    irradiance = recorded_irradiance(direct, cameras, faces, bounce)
+    hardness = (residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL)
+    damping = MAX_DAMPING * float(np.clip(hardness, 0, 1))
     return AvatarLight(
-        radiance=radiance.astype(np.float32),
-        transfer=transfer,
-        occlusion=occlusion,
-        irradiance=irradiance.astype(np.float32),
-        roughness=wet_roughness(capture.neutral, capture.faces),
-        residual=residual,
-        damping=round(damping, 3),
-        source=source,
-    )
+        radiance=radiance.astype(np.float32), transfer=transfer, occlusion=occlusion,
+        irradiance=irradiance.astype(np.float32), roughness=wet_roughness(capture.neutral, faces),
+        residual=residual, damping=round(damping, 3), source=source,
+    )  # fmt: skip
 
 
 def recorded_irradiance(
     direct: np.ndarray, cameras: np.ndarray, faces: np.ndarray, bounce: Bounce
 ) -> np.ndarray:
-    """(V, 3): mean over timesteps of what arrived at vertices, direct (T, V, 3) and by skin around.
-
-    Timesteps count as many times as cameras (T, F) see the vertex then: teeth where the mouth is
-    open, eyeballs where the lids are.
-    """
+    """(V, 3): mean of direct (T, V, 3) and of skin around; each timestep counts as many times as
+    cameras (T, F) see the vertex: teeth in an open mouth."""
     total, count = np.zeros(direct.shape[1:]), np.zeros((direct.shape[1], 1))
     for arriving, seen in zip(direct, cameras, strict=True):
         weight = (
@@ -280,18 +231,15 @@ def fit_light(
 
 
 def _albedo(
-    color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray, typical: np.ndarray, faces: int,
-    times: int,
+    color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray,
+    typical: np.ndarray, faces: int, times: int,
 ) -> np.ndarray:  # fmt: skip
-    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical` by the
-    prior."""
+    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical`."""
     prior = PRIOR * times * (arriving**2).mean(0)
     found = np.empty_like(color)
     for k in range(3):
-        upper = (
-            np.bincount(face, weight[:, k] * color[:, k] * arriving[:, k], faces)
-            + prior[k] * typical[k]
-        )
+        weighted = weight[:, k] * color[:, k] * arriving[:, k]
+        upper = np.bincount(face, weighted, faces) + prior[k] * typical[k]
         lower = np.bincount(face, weight[:, k] * arriving[:, k] ** 2, faces) + prior[k]
         found[:, k] = (upper / lower)[face]
     return found
@@ -314,11 +262,8 @@ def _solve(
 
 
 def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V,) float32: EYE_ROUGHNESS on eyeballs, 0 elsewhere (skin).
-
-    An eyeball is a part of its own that is nearly a sphere of an eye's size, as in FLAME and
-    ICT-FaceKit.
-    """
+    """(V,) float32: EYE_ROUGHNESS on eyeballs, parts of their own that are nearly spheres of an
+    eye's size, 0 elsewhere."""
     part = connected_parts(len(neutral), faces)
     found = np.zeros(len(neutral), np.float32)
     used = np.zeros(len(neutral), bool)

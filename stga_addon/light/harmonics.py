@@ -13,8 +13,7 @@ GLOSSY = np.array([1.0] + [0.85] * 3 + [0.62] * 5)
 
 
 def basis(directions: np.ndarray) -> np.ndarray:
-    """(N, 9) of unit vectors (N, 3), orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x²
-    − y²."""
+    """(N, 9) of unit vectors (N, 3): 1, y, z, x, xy, yz, 3z² − 1, xz, x² − y², orthonormal."""
     x, y, z = np.asarray(directions).T
     constant, *rest = harmonics(-x, -y, z)[:COUNT]
     return np.stack([np.full_like(x, constant), *rest], axis=-1)

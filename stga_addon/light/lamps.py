@@ -13,16 +13,12 @@ from .array_kernels import toward_light
 from .harmonics import COUNT, basis
 from .values import Caster, Light, Lighting
 
-MAP_SIZE = 512
-"""Texels a side of a light's shadow map, which just holds the head."""
-LIFT_M = 0.001
-"""Points are lifted off the surface by as much along its normal, so that it does not shade
-itself."""
+MAP_SIZE = 512  # Texels a side of a light's shadow map, which just holds the head
+LIFT_M = 0.001  # Points are lifted off the surface by it, so that it does not shade itself
 BIAS_M, MAX_BIAS_M = 0.001, 0.006
 """A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the
 taps, at most MAX_BIAS_M."""
-TAP_STEP = 1.0
-"""Texels between the 3 × 3 places that are looked up: splats soften edges already."""
+TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats soften edges already
 Projection = Callable[[np.ndarray], np.ndarray]
 """Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light
 cannot see them."""
@@ -30,11 +26,8 @@ cannot see them."""
 
 @dataclass(frozen=True)
 class LightView:
-    """How a light sees space: parallel for a sun, else in perspective from its position.
-
-    axes (3, 3): columns across, up and forward. origin (3,). scale: texels per meter, or per unit
-    of slope.
-    """
+    """How a light sees space, parallel or in perspective from `origin` (3,). axes (3, 3): columns
+    across, up, forward. scale: texels per meter, or per unit of slope."""
 
     axes: np.ndarray
     origin: np.ndarray
@@ -45,8 +38,7 @@ class LightView:
 
 @dataclass(frozen=True)
 class HeadBounds:
-    """Middle (3,) of a posed head's box, the diagonal of the box, and the radius around its middle
-    of the head."""
+    """Middle (3,) of a posed head's box, its diagonal, and the head's radius around the middle."""
 
     center: np.ndarray
     diagonal: float
@@ -63,11 +55,8 @@ def head_bounds(vertices: np.ndarray) -> HeadBounds:
 
 
 def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
-    """The view of a light around a head.
-
-    A light inside the sphere around the head sees it under a wide angle, and loses what lies behind
-    it.
-    """
+    """The view of a light around a head: wide, and without what lies behind it, from inside the
+    head's sphere."""
     center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
     if light.kind == "sun":
         forward, distance, scale = light.direction, np.inf, size / 2 / radius
@@ -112,13 +101,9 @@ class ShadowMap:
     """A light's depth map of a posed head (V, 3) meters and of other objects."""
 
     def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        light: Light,
-        casters: Sequence[Caster] = (),
+        self, vertices: np.ndarray, faces: np.ndarray, light: Light, casters: Sequence[Caster] = (),
         size: int = MAP_SIZE,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._project = light_projection(vertices, light, size)
         self._light, self._texel_m = light, texel_meters(head_bounds(vertices), size)
         is_parallel = light.kind == "sun"
@@ -129,56 +114,37 @@ class ShadowMap:
             if not is_parallel:
                 points[:, 2] = -1 / points[:, 2]
             kernels("shadow").add_depths(points, np.ascontiguousarray(mesh.faces, np.int32), depth)
-        self.depth = (
-            depth
-            if is_parallel
-            else np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
-        )
+        if not is_parallel:
+            depth = np.divide(-1, depth, np.full_like(depth, np.inf), where=depth < 0)
+        self.depth = depth
 
     def lit(
-        self,
-        points: np.ndarray,
-        bias: float = BIAS_M,
-        step: float = TAP_STEP,
+        self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP,
         normals: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """(N,) float32, 0…1: how much of the light reaches points (N, 3), which are lifted off the
-        surface.
-
-        normals (N, 3): of the surface there, which make `bias` larger on slopes.
-        """
+    ) -> np.ndarray:  # fmt: skip
+        """(N,) float32, 0…1: how much light reaches points (N, 3) lifted off the surface, whose
+        normals (N, 3) make `bias` larger on slopes."""
         found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
         if normals is not None:
-            biases = self._slope_bias(points, normals, bias, step)
+            if self._light.kind == "sun":
+                cosine = normals @ -self._light.direction.astype(np.float32)
+            else:
+                away = self._light.position.astype(np.float32) - points
+                length = np.sqrt(np.einsum("nk,nk->n", away, away))
+                cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
+            cosine = np.clip(cosine, 0.05, 1)
+            slope = np.sqrt(1 - cosine**2) / cosine
+            sloped = bias + (step + 1) * self._texel_m * slope
+            biases = np.asarray(np.minimum(sloped, max(bias, MAX_BIAS_M)), np.float32)
         places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
         kernels("shadow").lit_shares(self.depth, places, biases, np.float32(step), found)
         return found
 
-    def _slope_bias(
-        self, points: np.ndarray, normals: np.ndarray, bias: float, step: float
-    ) -> np.ndarray:
-        """(N,) float32 meters."""
-        if self._light.kind == "sun":
-            cosine = normals @ -self._light.direction.astype(np.float32)
-        else:
-            away = self._light.position.astype(np.float32) - points
-            length = np.sqrt(np.einsum("nk,nk->n", away, away))
-            cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
-        cosine = np.clip(cosine, 0.05, 1)
-        slope = np.sqrt(1 - cosine**2) / cosine
-        return np.asarray(
-            np.minimum(bias + (step + 1) * self._texel_m * slope, max(bias, MAX_BIAS_M)), np.float32
-        )
-
 
 def kernels(name: str) -> Any:
-    """The module `raster.cpu.shade`, with `add_lights`, or `raster.cpu.shadow`, with `add_depths`
-    and `lit_shares`."""
-    return (
-        array_kernels
-        if find_spec("numba") is None
-        else import_module(f"...raster.cpu.{name}", __name__)
-    )
+    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`), or NumPy's."""
+    has_numba = find_spec("numba") is not None
+    return import_module(f"...raster.cpu.{name}", __name__) if has_numba else array_kernels
 
 
 FEW, SOME, MANY = 1, 2, 3
@@ -190,12 +156,9 @@ class Lamps:
     """Lights around a head posed as mesh (V, 3) meters, with what blocks them."""
 
     def __init__(
-        self,
-        lighting: Lighting,
-        mesh: np.ndarray,
-        faces: np.ndarray,
+        self, lighting: Lighting, mesh: np.ndarray, faces: np.ndarray,
         casters: Sequence[Caster] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         center = (mesh.max(0) + mesh.min(0)) / 2
         self._maps: list[ShadowMap] = []
         rows = [np.zeros((0, 16), np.float32)]
@@ -211,15 +174,10 @@ class Lamps:
         return self.shade(points, normals, np.zeros(3), np.zeros(len(points), np.float32), 0.0)[0]
 
     def shade(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        eye: np.ndarray,
-        roughness: np.ndarray,
+        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray,
         reflectance: float,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Irradiance and highlight (N, 3) float32 at points (N, 3), seen from eye (3,); see
-        `raster.cpu.shade`."""
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Irradiance and highlight (N, 3) at points (N, 3) seen from eye (3,)."""
         found = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
         if not len(self._table):
             return found
@@ -235,8 +193,7 @@ class Lamps:
 
 
 def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
-    """(points, 16) float32: a light as rows of the table of `raster.cpu.shade`, for a head around
-    `center` (3,)."""
+    """(points, 16) float32: a light as rows of `raster.cpu.shade`, for a head at `center` (3,)."""
     places, width = _places(light, center)
     intensity = {"sun": 1.0, "point": 1 / (4 * np.pi), "spot": 1 / (4 * np.pi), "area": 1 / np.pi}[
         light.kind
@@ -250,8 +207,7 @@ def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
 
 
 def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
-    """Positions (points, 3) that stand for a light, and the width of each for
-    `raster.cpu.shade`."""
+    """Positions (points, 3) that stand for a light, and the width of each."""
     if light.kind == "sun":
         return light.position[None], float(np.tan(light.angle / 2))
     if light.kind != "area":
@@ -269,8 +225,7 @@ def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def distant_light(light: Light, center: np.ndarray) -> np.ndarray:
-    """(9, 3) harmonics of a light as if it were far away from a head around `center` (3,), without
-    shadows."""
+    """(9, 3) harmonics of a light as if far away from a head at `center` (3,), unshadowed."""
     found = np.zeros((COUNT, 3))
     for row in light_rows(light, center, -1):
         toward, strength, _ = toward_light(row, np.asarray(center, np.float32)[:, None])

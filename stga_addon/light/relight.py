@@ -1,5 +1,4 @@
-"""Colors of an avatar's splats under the light of a scene, and how much of the recorded ones that
-light keeps."""
+"""Colors of splats under a scene's light, and how much of the recorded ones that light keeps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,15 +16,11 @@ from .lamps import LIFT_M, Lamps, distant_light
 from .surface import Bounce, Lashes, at_splats, find_lashes, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
-UNLIKE_LIGHT = 0.2
-"""Difference between two lights from which on nothing is kept, as a share of the capture's
-light."""
+UNLIKE_LIGHT = 0.2  # Difference of two lights from which on nothing is kept, as a share
 ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
 """Difference between what arrives at a splat, now and in the capture, up to which all is kept and
 from which on nothing, as a share: other objects' shadows."""
-RIDGE = 1e-6
-"""Of the mean of a matrix's diagonal, added to it: meshes that receive no light in some
-harmonics."""
+RIDGE = 1e-6  # Of the mean of a diagonal, added to it: meshes without light in some harmonics
 
 
 @dataclass(frozen=True)
@@ -41,8 +36,7 @@ class Kept:
 
 
 def recorded_light(transfer: np.ndarray, bounce: Bounce, irradiance: np.ndarray) -> np.ndarray:
-    """(9, 3) harmonics of the light that gave vertices of the neutral mesh irradiance (V, 3);
-    transfer (V, 9)."""
+    """(9, 3) of the light that gave the neutral mesh irradiance (V, 3); transfer (V, 9)."""
     direct = np.repeat(transfer.T[..., None].astype(np.float64), 3, axis=2)
     columns = np.stack([each + bounce.light(each) for each in direct], axis=1)
     found = np.empty((COUNT, 3))
@@ -54,11 +48,8 @@ def recorded_light(transfer: np.ndarray, bounce: Bounce, irradiance: np.ndarray)
 
 
 def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
-    """By the light of the capture and of the scene, both (9, 3) in the same axes, lamps as if they
-    were far away.
-
-    They are compared as irradiance by direction, each channel but for a factor.
-    """
+    """By the capture's and the scene's light (9, 3), lamps far away, compared as irradiance by
+    direction, each channel but for a factor."""
     old, new = (LAMBERT[:COUNT, None] * light for light in (recorded, distant))
     gain = np.maximum((old * new).sum(0) / np.maximum((old * old).sum(0), 1e-12), 0)
     difference = float(
@@ -86,11 +77,8 @@ def _smooth_step(values: np.ndarray) -> np.ndarray:
     return np.asarray(values * values * (3 - 2 * values))
 
 
-REFLECTANCE = 0.04
-"""Of skin, eyes and teeth seen straight on: a refractive index of 1.5."""
-MIN_IRRADIANCE = 0.15
-"""Least irradiance of the capture that color is divided by, as a share of its mean: what was darker
-is noise."""
+REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
+MIN_IRRADIANCE = 0.15  # Least irradiance that color is divided by, as a share of its mean: noise
 HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.034, 0.14, 0.1
 """Part of what arrived in the capture that came back as highlights, from skin and from wet eyes,
 which mirror what is in front of them; it is taken from the recorded colors, of which at least
@@ -101,11 +89,8 @@ VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
 
 
 class Relighter:
-    """An avatar whose file holds its light (`Avatar.light`), ready to be lit by a scene; made once,
-    used every frame.
-
-    Properties are float32, by splat. Raises StgaError where the avatar has no light.
-    """
+    """An avatar with the light of its file, to be lit by a scene; made once. Properties are
+    float32, by splat. Raises StgaError where the avatar has no light."""
 
     def __init__(self, avatar: Avatar) -> None:
         if avatar.light is None:
@@ -149,8 +134,7 @@ class Relighter:
 
     @cached_property
     def diffuse_color(self) -> np.ndarray:
-        """(N, 3) recorded sRGB without what depends on the view: mean over directions from which a
-        splat is seen."""
+        """(N, 3) recorded sRGB, mean over directions from which a splat is seen."""
         sh = self.avatar.splats.sh
         means = np.repeat(VIEW_MEANS, (1, 3, 5, 7))[: sh.shape[1], None].astype(np.float32)
         normals = self._at_splats(
@@ -160,8 +144,7 @@ class Relighter:
 
     @cached_property
     def recorded_light(self) -> np.ndarray:
-        """(9, 3) harmonics of the capture's light in the axes of the neutral mesh, mean over its
-        timesteps."""
+        """(9, 3) of the capture's light in the neutral mesh's axes, mean over time."""
         return recorded_light(self.light.transfer, self.bounce, self.light.irradiance)
 
     @cached_property
@@ -170,14 +153,12 @@ class Relighter:
         return find_lashes(self.avatar, self.corners, self.weights, self.roughness, self.albedo)
 
     def lash_casters(self, mesh: np.ndarray, lighting: Lighting) -> tuple[Caster, ...]:
-        """The lashes of a head posed as `mesh` (V, 3), where there are any and a light throws
-        shadows."""
+        """The lashes of a head posed as `mesh` (V, 3), if a light throws shadows."""
         shadowed = lighting.shadows and any(light.casts_shadow for light in lighting.lights)
         return (self.lashes.caster(mesh),) if shadowed and len(self.lashes.face) else ()
 
     def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
-        """(9, 3): the world's harmonics in the axes of the neutral mesh, for a head posed as `mesh`
-        (V, 3): what `transfer` is multiplied with."""
+        """(9, 3) of the world in the neutral mesh's axes, for a posed `mesh` (V, 3)."""
         # Open vertices, which the jaw moves least, say how the head is turned.
         weights = np.asarray(self.light.occlusion, np.float64) + 1e-3
         rotation, _ = weighted_procrustes(
@@ -188,11 +169,8 @@ class Relighter:
     def colors(
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
     ) -> np.ndarray:
-        """(N, 3) float32 sRGB of the splats, not clipped above 1: the `sh` of degree 0 is (color −
-        0.5) / SH_C0.
-
-        mesh: (V, 3) posed. eye: (3,) position of the camera. All in meters of the avatar's space.
-        """
+        """(N, 3) float32 sRGB of the splats, (color − 0.5) / SH_C0 their `sh`, not clipped above 1,
+        on a posed mesh (V, 3) seen from eye (3,), in meters."""
         return linear_to_srgb(self.radiance(mesh, eye, lighting, casters)).astype(np.float32)
 
     def radiance(
@@ -209,9 +187,8 @@ class Relighter:
         return lit if share == 1 else share * lit + (1 - share) * self._recorded(mesh, eye)
 
     def distant_in_head(self, mesh: np.ndarray, lighting: Lighting) -> tuple[np.ndarray, Kept]:
-        """(9, 6) float32 harmonics of the world, and of the world with lamps as if they were far
-        away, in the axes of the neutral mesh, for a head posed as `mesh` (V, 3); and how much of
-        recorded colors they keep."""
+        """(9, 6) of the world, and of it with lamps far away, in the neutral mesh's axes for a
+        posed `mesh`; and what is kept."""
         center = (mesh.max(0) + mesh.min(0)) / 2
         distant = lighting.world + sum(
             (distant_light(light, center) for light in lighting.lights), np.zeros((9, 3))
@@ -249,11 +226,9 @@ class Relighter:
         )
         arriving += np.maximum(self.transfer @ world, 0) + at_splats[:, 6:]
         highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
-        albedo = (
-            self._albedo(self.diffuse_color + self._strain_color(mesh))
-            if self._strained
-            else self.albedo
-        )
+        albedo = self.albedo
+        if self._strained:
+            albedo = self._albedo(self.diffuse_color + self._strain_color(mesh))
         lit = np.asarray(
             albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight
         )
@@ -263,15 +238,10 @@ class Relighter:
         return lit
 
     def _sky_highlight(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        eye: np.ndarray,
-        world: np.ndarray,
+        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray,
         roughness: np.ndarray,
-    ) -> np.ndarray:
-        """(N, 3) of the world: its mean radiance around the mirrored direction times the lobe's
-        reflectance (Karis 2014)."""
+    ) -> np.ndarray:  # fmt: skip
+        """(N, 3) of the world: radiance around the mirrored direction (Karis 2014)."""
         if not np.any(world):
             return np.zeros_like(points)
         view = self._unit(eye.astype(np.float32) - points)
@@ -306,18 +276,13 @@ class Relighter:
 
     def _strain_color(self, mesh: np.ndarray) -> np.ndarray:
         splats = self.avatar.splats
-        return np.asarray(
-            np.einsum(
-                "ns,nsc->nc", self.avatar.frames(mesh).strain[splats.face], splats.strain_color
-            )
-        )
+        strain = self.avatar.frames(mesh).strain[splats.face]
+        return np.asarray(np.einsum("ns,nsc->nc", strain, splats.strain_color))
 
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""
-        splats, direction = (
-            self.avatar.splats,
-            self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32)),
-        )
+        splats = self.avatar.splats
+        direction = self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32))
         color = sh_color(splats.sh, direction)
         if self._strained:
             color = color + self._strain_color(mesh)
@@ -339,11 +304,8 @@ class Relighter:
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:
-    """The avatar without its light: colors are albedo in sRGB, from every side and under every
-    strain the same.
-
-    Raises StgaError where the avatar has no light.
-    """
+    """The avatar without its light: its colors are albedo in sRGB, whatever the view and strain.
+    Raises StgaError where the avatar has no light."""
     color = linear_to_srgb(np.clip(Relighter(avatar).albedo, 0, 1))
     sh = ((color[:, None] - 0.5) / SH_C0).astype(np.float32)
     splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))

@@ -1,5 +1,4 @@
-"""GLSL that lights splats as `relight.Relighter` does, for Blender's shaders and the web page's
-player."""
+"""GLSL that lights splats as `relight.Relighter` does, for Blender and the web page."""
 
 from pathlib import Path
 

@@ -16,8 +16,7 @@ from .lamps import ShadowMap
 from .values import Caster, Light
 
 DIRECTIONS = 192
-MAP_SIZE, BIAS_M, LIFT_M = 256, 0.0015, 0.002
-"""As in `lamps`, for maps of half the size."""
+MAP_SIZE, BIAS_M, LIFT_M = 256, 0.0015, 0.002  # As in `lamps`, for maps of half the size
 
 
 def transfer_of(
@@ -33,10 +32,8 @@ def transfer_of(
     normals = vertex_normals(vertices, faces)
     points, sky = vertices + LIFT_M * normals, even_directions(directions)
     harmonics = basis(sky) * (4 * np.pi / directions)
-    transfer, open_sky, whole_sky = (
-        np.zeros((len(vertices), harmonics.shape[1])),
-        *np.zeros((2, len(vertices))),
-    )
+    transfer = np.zeros((len(vertices), harmonics.shape[1]))
+    open_sky, whole_sky = np.zeros((2, len(vertices)))
     for direction, harmonic in zip(sky, harmonics, strict=True):
         cosine = np.maximum(normals @ direction, 0)
         depths = ShadowMap(
@@ -49,11 +46,8 @@ def transfer_of(
     return transfer.astype(np.float32), (open_sky / np.maximum(whole_sky, 1e-9)).astype(np.float32)
 
 
-CELL_M = 0.02
-"""Side of the cells in which irradiance is averaged; a vertex sees the mean of its own and the 26
-around it."""
-SKIN = np.array([0.5, 0.33, 0.25])
-"""Albedo of the skin that light is reflected by."""
+CELL_M = 0.02  # Side of the cells in which irradiance is averaged, with the 26 around a vertex's
+SKIN = np.array([0.5, 0.33, 0.25])  # Albedo of the skin that light is reflected by
 MIN_OPEN = 0.3
 """Share of the sky that a vertex must see to count as lit skin: those inside the head do not."""
 
@@ -71,8 +65,7 @@ class Bounce:
         self._sum_of_weights = self._around(self._weight)
 
     def light(self, irradiance: np.ndarray) -> np.ndarray:
-        """(V, 3) irradiance that a vertex gets from skin around it, of what arrives at vertices (V,
-        3)."""
+        """(V, 3) irradiance from skin around a vertex, by what arrives at vertices (V, 3)."""
         near = np.stack(
             [self._around(self._weight * channel) for channel in np.asarray(irradiance).T], axis=-1
         )
@@ -102,7 +95,15 @@ def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     face = avatar.splats.face.astype(np.int64)
     points = points_to_world(avatar.splats.xyz, frames, face)
-    corners, beyond = avatar.neutral[avatar.faces].astype(np.float64), _beyond_edges(avatar.faces)
+    edges = np.sort(
+        avatar.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2).astype(np.int64), axis=1
+    )
+    key = edges[:, 0] * (int(avatar.faces.max(initial=0)) + 1) + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(key[order][1:] == key[order][:-1])
+    found = np.full(len(key), -1)
+    found[order[same]], found[order[same + 1]] = order[same + 1] // 3, order[same] // 3
+    corners, beyond = avatar.neutral[avatar.faces].astype(np.float64), found.reshape(-1, 3)
     inside, weights, distance = _nearest(points, corners[face])
     found, walking, at = face.copy(), np.arange(len(face)), face
     for _ in range(MAX_STEPS):
@@ -117,20 +118,8 @@ def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
     return found, weights.astype(np.float32)
 
 
-def _beyond_edges(faces: np.ndarray) -> np.ndarray:
-    """(F, 3) the triangle beyond the edge that is opposite to each corner; -1: none."""
-    edges = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2).astype(np.int64), axis=1)
-    key = edges[:, 0] * (int(faces.max(initial=0)) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(key[order][1:] == key[order][:-1])
-    found = np.full(len(key), -1)
-    found[order[same]], found[order[same + 1]] = order[same + 1] // 3, order[same] // 3
-    return found.reshape(-1, 3)
-
-
 def _nearest(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Barycentric coordinates (N, 3) of points (N, 3) in the planes of triangles (N, 3, 3), the
-    same clamped to the triangle, and the square of the distance (N,) from there."""
+    """Barycentric coordinates (N, 3) in triangles' planes, clamped, and squared distance (N,)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     offset = points - a
     uu, uv, vv = _dot(first, first), _dot(first, second), _dot(second, second)
@@ -149,8 +138,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def at_splats(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(N, C) float32 of values (V, C) at points of triangles: faces (N, 3) their corners, weights
-    (N, 3)."""
+    """(N, C) float32 of values (V, C) at corners `faces` (N, 3) with weights (N, 3)."""
     values = np.ascontiguousarray(values, np.float32)
     found = np.zeros((len(faces), values.shape[1]), np.float32)
     for k in range(3):
@@ -160,24 +148,17 @@ def at_splats(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.
     return found
 
 
-REACH_M = 0.025
-"""From the middle of an eyeball."""
+REACH_M = 0.025  # From the middle of an eyeball
 MIN_HEIGHT_M = 0.002
 """Above the mesh: shadow maps have a bias, and splats of skin lie within 1.5 mm."""
 MIN_OPACITY, MAX_ALBEDO = 0.3, 0.15
-EXTENT = 2.0
-"""Distance of a lash's corners from its middle, in standard deviations of the splat: gaps between
-lashes close."""
+EXTENT = 2.0  # A lash's half length in standard deviations of the splat: gaps close
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 @dataclass(frozen=True)
 class Lashes:
-    """Four-cornered cards in the frames of triangles.
-
-    face (M,) of the mesh. corners (M, 4, 3) float32 in the frame of that triangle
-    (`avatar.embedding`).
-    """
+    """Four-cornered cards (M, 4, 3) in the frames (`avatar.embedding`) of triangles (M,)."""
 
     avatar: Avatar
     face: np.ndarray
@@ -194,17 +175,11 @@ class Lashes:
 
 
 def find_lashes(
-    avatar: Avatar,
-    corners: np.ndarray,
-    weights: np.ndarray,
-    roughness: np.ndarray,
+    avatar: Avatar, corners: np.ndarray, weights: np.ndarray, roughness: np.ndarray,
     albedo: np.ndarray,
-) -> Lashes:
-    """The lashes of an avatar whose light is known.
-
-    corners, weights (N, 3): `surface.surface_points`. roughness (N,) and albedo (N, 3) of the
-    splats.
-    """
+) -> Lashes:  # fmt: skip
+    """The lashes of an avatar with light; corners, weights (N, 3) of `surface_points`, roughness
+    (N,) and albedo (N, 3) of the splats."""
     assert avatar.light is not None
     splats, neutral = avatar.splats, avatar.neutral.astype(np.float64)
     frames = face_frames(neutral, avatar.faces, neutral, avatar.convention)
@@ -216,7 +191,14 @@ def find_lashes(
     above = points - at_splats(neutral, corners[found], weights[found])
     height = (above * normal).sum(1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
     found = found[height > MIN_HEIGHT_M]
-    return Lashes(avatar, splats.face[found], _cards(avatar, found))
+    rows = avatar.splats.rows(found)
+    scale = np.exp(rows.log_scale.astype(np.float64))
+    longest = np.argsort(-scale, axis=1, kind="stable")[:, :2]
+    axes = np.swapaxes(to_matrices(rows.rotation), 1, 2)
+    splat, lengths = np.arange(len(found)), EXTENT * np.take_along_axis(scale, longest, 1)
+    first, second = (lengths[:, k, None] * axes[splat, longest[:, k]] for k in range(2))
+    offsets = np.stack([first, second, -first, -second], axis=1)
+    return Lashes(avatar, splats.face[found], np.asarray(rows.xyz[:, None] + offsets, np.float32))
 
 
 def _near_eyes(points: np.ndarray, neutral: np.ndarray, avatar: Avatar) -> np.ndarray:
@@ -229,20 +211,3 @@ def _near_eyes(points: np.ndarray, neutral: np.ndarray, avatar: Avatar) -> np.nd
         middle = neutral[wet & (part == label)].mean(0)
         near |= np.linalg.norm(points - middle, axis=1) < REACH_M
     return near
-
-
-def _cards(avatar: Avatar, splat: np.ndarray) -> np.ndarray:
-    """(M, 4, 3) float32: ends of the two longest axes of splats (M,), in turn, in the frames of
-    their triangles."""
-    rows = avatar.splats.rows(splat)
-    scale = np.exp(rows.log_scale.astype(np.float64))
-    longest = np.argsort(-scale, axis=1, kind="stable")[:, :2]
-    axes = np.swapaxes(to_matrices(rows.rotation), 1, 2)
-    first, second = (
-        EXTENT
-        * np.take_along_axis(scale, longest[:, k, None], 1)
-        * axes[np.arange(len(splat)), longest[:, k]]
-        for k in range(2)
-    )
-    offsets = np.stack([first, second, -first, -second], axis=1)
-    return np.asarray(rows.xyz[:, None] + offsets, np.float32)

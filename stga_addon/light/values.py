@@ -19,13 +19,7 @@ import numpy as np
 KINDS = "sun", "point", "spot", "area"
 SHAPES = "rectangle", "ellipse"
 MODES = "recorded", "scene", "mix"
-SKIN_ROUGHNESS = 0.45
-"""Of the highlight on skin (GGX, Blender's Principled BSDF)."""
-
-
-def _direction(vector: object) -> np.ndarray:
-    array = np.asarray(vector, np.float64)
-    return np.asarray(array / max(float(np.linalg.norm(array)), 1e-30))
+SKIN_ROUGHNESS = 0.45  # Of the highlight on skin (GGX, Blender's Principled BSDF)
 
 
 @dataclass(frozen=True)
@@ -71,7 +65,8 @@ class Light:
         for name in ("color", "position"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         for name in ("direction", "tangent"):
-            object.__setattr__(self, name, _direction(getattr(self, name)))
+            array = np.asarray(getattr(self, name), np.float64)
+            object.__setattr__(self, name, array / max(float(np.linalg.norm(array)), 1e-30))
 
     def transformed(self, matrix: np.ndarray) -> "Light":
         """The light in another space: matrix (4, 4) rigid, or with uniform scale, which scales
@@ -82,13 +77,10 @@ class Light:
         """
         scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
         return replace(
-            self,
-            position=matrix[:3, :3] @ self.position + matrix[:3, 3],
-            direction=matrix[:3, :3] @ self.direction,
-            tangent=matrix[:3, :3] @ self.tangent,
-            radius=self.radius * scale,
-            size=(self.size[0] * scale, self.size[1] * scale),
-        )
+            self, position=matrix[:3, :3] @ self.position + matrix[:3, 3],
+            direction=matrix[:3, :3] @ self.direction, tangent=matrix[:3, :3] @ self.tangent,
+            radius=self.radius * scale, size=(self.size[0] * scale, self.size[1] * scale),
+        )  # fmt: skip
 
 
 def no_world() -> np.ndarray:
@@ -132,8 +124,7 @@ class Lighting:
 
 @dataclass(frozen=True)
 class Caster:
-    """Something else in the scene that throws shadows onto the head: vertices (V, 3) meters,
-    triangles (F, 3)."""
+    """Something else that throws shadows onto the head: (V, 3) meters, triangles (F, 3)."""
 
     vertices: np.ndarray
     faces: np.ndarray

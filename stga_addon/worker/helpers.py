@@ -11,13 +11,13 @@ import pickle
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from threading import Lock, Thread
+from queue import SimpleQueue
 from traceback import format_exc
-from types import TracebackType
 from typing import IO, Any, BinaryIO
 
 import numpy as np
@@ -27,21 +27,17 @@ from ..files import read_npz, write_npz
 from .launch import end_with_this_process, start_python
 from .training_python import own_python
 
-MAX_HELPERS = 8
-"""Each takes some 300 MB."""
+MAX_HELPERS = 8  # Each takes some 300 MB
 THREADS_VARIABLE = "OMP_NUM_THREADS"
 SINGLE = dict.fromkeys(
     (THREADS_VARIABLE, "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
-)
-"""Environment variables of a helper."""
+)  # Environment variables of a helper
 REPORT_INTERVAL_S = 0.2
-STEPS_KEY = "steps"
-"""In the file of a kept result: how many steps it took."""
+STEPS_KEY = "steps"  # In the file of a kept result: how many steps it took
 STEP, RESULT, ERROR = "step", "result", "error"
 """What a helper's messages are: a pair of this and a value."""
 
-Step = Callable[[], None]
-"""Called by work after each of its steps."""
+Step = Callable[[], None]  # Called by work after each of its steps
 
 
 def processors() -> int:
@@ -52,23 +48,21 @@ def processors() -> int:
 class Helpers:
     """Processes that are started when there is work for two, and end with the `with` block.
 
-    count: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to
+    limit: how many at most; None: one per processor or thread in OMP_NUM_THREADS, up to
     MAX_HELPERS. With one, all work is done in this process. folder: of the results that `map`
     keeps; None: none is kept.
     """
 
-    def __init__(self, count: int | None = None, folder: Path | None = None) -> None:
-        limit = os.environ.get(THREADS_VARIABLE, "")
-        usual = min(int(limit) if limit.isdecimal() else processors(), MAX_HELPERS)
-        self._count, self._folder = usual if count is None else count, folder
+    def __init__(self, limit: int | None = None, folder: Path | None = None) -> None:
+        threads = os.environ.get(THREADS_VARIABLE, "")
+        usual = min(int(threads) if threads.isdecimal() else processors(), MAX_HELPERS)
+        self._count, self._folder = usual if limit is None else limit, folder
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> "Helpers":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
 
     def end(self) -> None:
@@ -83,12 +77,9 @@ class Helpers:
         self._processes = []
 
     def map(
-        self,
-        work: Callable[..., Any],
-        parts: Sequence[tuple],
-        done: Callable[[int], None],
+        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None],
         keep: bool = False,
-    ) -> list[Any]:
+    ) -> list[Any]:  # fmt: skip
         """The results of work(*part, step) of every part, in order.
 
         work: a function of a module, which calls `step` after each of its steps; parts and results
@@ -99,145 +90,98 @@ class Helpers:
         StgaError where a helper ends before its work does.
         """
         if keep and self._folder is not None:
-            work, parts = (
-                _kept,
-                [(self._folder / f"{_digest(work, part)}.npz", work, part) for part in parts],
-            )
-        count = min(self._count, len(parts))
-        if count < 2:
-            steps = _Counter()
-            return [work(*part, lambda: done(steps.add())) for part in parts]
-        return self._shared(work, parts, done, count)
+            files = [self._folder / f"{_digest(work, part)}.npz" for part in parts]
+            parts = [(file, work, part) for file, part in zip(files, parts, strict=True)]
+            work = _kept
+        if min(self._count, len(parts)) >= 2:
+            return self._shared(work, parts, done)
+        steps = count(1)
+        return [work(*part, lambda: done(next(steps))) for part in parts]
 
     def run(self, work: Callable[..., Any], part: tuple, done: Callable[[int], None]) -> Any:
-        """The result of work(*part, step) of one helping process, as `map`; for what is not worth
-        two."""
-        if self._count < 2:
-            return self.map(work, [part], done)[0]
-        return self._shared(work, [part], done, 1)[0]
+        """The result of work(*part, step) of one helper, as `map`; for what is not worth two."""
+        shared = self._shared if self._count >= 2 else self.map
+        return shared(work, [part], done)[0]
 
     def _shared(
-        self,
-        work: Callable[..., Any],
-        parts: Sequence[tuple],
-        done: Callable[[int], None],
-        count: int,
+        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None]
     ) -> list[Any]:
-        """The results of so many helping processes."""
-        while len(self._processes) < count:
+        """The results of as many helping processes as there are parts for."""
+        number = min(self._count, len(parts))
+        while len(self._processes) < number:
             self._processes.append(_start())
-        task = _Task(work, parts)
-        threads = [
-            Thread(target=task.feed, args=(process,), daemon=True)
-            for process in self._processes[:count]
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            while thread.is_alive() and not task.errors:
-                thread.join(REPORT_INTERVAL_S)
-                done(task.steps.value)
-        if task.errors:
-            raise task.errors[0]
-        done(task.steps.value)
-        return task.results
+        idle: SimpleQueue[subprocess.Popen[bytes]] = SimpleQueue()
+        for process in self._processes[:number]:
+            idle.put(process)
+        steps: list[None] = []  # threads append one for each
+
+        def answer(part: tuple) -> Any:
+            process = idle.get()
+            assert process.stdin is not None
+            assert process.stdout is not None
+            try:
+                _send(process.stdin, (work, part))
+                while (message := _Unpickler(process.stdout).load())[0] == STEP:
+                    steps.append(None)
+            except (EOFError, OSError, pickle.UnpicklingError) as error:
+                problem = f"before its work did (exit status {process.poll()})"
+                raise StgaError(f"a helping process ended {problem}") from error
+            idle.put(process)
+            if message[0] == ERROR:
+                raise message[1]
+            return message[1]
+
+        pool = ThreadPoolExecutor(number)
+        try:
+            answers = [pool.submit(answer, part) for part in parts]
+            waiting: Collection[Future[Any]] = answers
+            while waiting:
+                ended, waiting = wait(waiting, REPORT_INTERVAL_S, FIRST_EXCEPTION)
+                for one in ended:
+                    one.result()
+                done(len(steps))
+            return [one.result() for one in answers]
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _digest(work: Callable[..., Any], part: tuple) -> str:
     """Changes with any of the arguments."""
-    return hashlib.sha256(
-        pickle.dumps((work.__qualname__, part), pickle.HIGHEST_PROTOCOL)
-    ).hexdigest()[:32]
+    arguments = pickle.dumps((work.__qualname__, part), pickle.HIGHEST_PROTOCOL)
+    return hashlib.sha256(arguments).hexdigest()[:32]
 
 
 def _kept(
     file: Path, work: Callable[..., dict[str, Any]], part: tuple, step: Step
 ) -> dict[str, Any]:
-    """The result of work(*part, step), read from the file where it is there and whole, else written
-    into it."""
+    """The result of work(*part, step), read from the file where it is whole, else written there."""
     with suppress(StgaError, KeyError, TypeError):
         found = read_npz(file)
         for _ in range(int(found.pop(STEPS_KEY))):
             step()
         return found
-    steps = _Counter()
+    taken = 0
 
     def counted() -> None:
-        steps.add()
+        nonlocal taken
+        taken += 1
         step()
 
     found = work(*part, counted)
-    write_npz(file, {**found, STEPS_KEY: np.array(steps.value)})
+    write_npz(file, {**found, STEPS_KEY: np.array(taken)})
     return found
 
 
-class _Counter:
-    """A number that threads add to."""
-
-    def __init__(self) -> None:
-        self.value, self._lock = 0, Lock()
-
-    def add(self) -> int:
-        with self._lock:
-            self.value += 1
-            return self.value
-
-
-class _Task:
-    """What `Helpers.map` does at a time: parts that are left, and results and errors of the
-    others."""
-
-    def __init__(self, work: Callable[..., Any], parts: Sequence[tuple]) -> None:
-        self.results: list[Any] = [None] * len(parts)
-        self.errors: list[BaseException] = []
-        self.steps, self._work = _Counter(), work
-        self._left: SimpleQueue[tuple[int, tuple]] = SimpleQueue()
-        for numbered in enumerate(parts):
-            self._left.put(numbered)
-
-    def feed(self, process: "subprocess.Popen[bytes]") -> None:
-        """Hand parts to a process until none is left."""
-        try:
-            while not self.errors:
-                number, part = self._left.get_nowait()
-                self.results[number] = self._answer(process, part)
-        except Empty:
-            return
-        except (EOFError, OSError, pickle.UnpicklingError):
-            code = process.poll()
-            self.errors.append(
-                StgaError(f"a helping process ended before its work did (exit status {code})")
-            )
-        except BaseException as error:  # raised again by the thread that waits
-            self.errors.append(error)
-
-    def _answer(self, process: "subprocess.Popen[bytes]", part: tuple) -> Any:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        _send(process.stdin, (self._work, part))
-        while True:
-            kind, value = _Unpickler(process.stdout).load()
-            if kind == STEP:
-                self.steps.add()
-            elif kind == ERROR:
-                raise value
-            else:
-                return value
-
-
 def _start() -> "subprocess.Popen[bytes]":
+    quiet: dict[str, Any] = {"preexec_fn": end_with_this_process()}
+    if os.name == "nt":
+        quiet = {"creationflags": 0x08000000}  # no console window
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    quiet = (
-        {"creationflags": 0x08000000}
-        if os.name == "nt"
-        else {"preexec_fn": end_with_this_process()}
-    )
     return start_python(own_python(), ["stga_addon.worker.helpers"], SINGLE, **pipes, **quiet)
 
 
 class _Unpickler(pickle.Unpickler):
-    """Finds this package's functions and classes by the name that it has in this process: another
-    one in Blender."""
+    """Finds this package's names under its name in this process: another one in Blender."""
 
     def find_class(self, module: str, name: str) -> Any:
         own = (__package__ or "").removesuffix(".worker")
@@ -268,8 +212,7 @@ def claim_stdout() -> BinaryIO:
 
 
 def help_until_closed() -> None:
-    """Work on what comes from standard input, and answer on standard output, until the process that
-    asks has gone."""
+    """Work on what comes from stdin, and answer on stdout, until the asker has gone."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks

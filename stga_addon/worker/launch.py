@@ -27,15 +27,12 @@ PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 NICENESS, BACKGROUND_NICENESS = 5, 15
 """Added to the nice value of a worker, so that Blender has precedence, and of what runs in the
 background, so that workers have."""
-PR_SET_PDEATHSIG = 1
-"""Of prctl(2)."""
+PR_SET_PDEATHSIG = 1  # Of prctl(2)
 # Windows: own process group, so that closing the console does not end the worker; no console
 # window; and BELOW_NORMAL_PRIORITY_CLASS. Elsewhere: an own session.
-_DETACHED: dict[str, Any] = (
-    {"creationflags": 0x00000200 | 0x08000000 | 0x00004000}
-    if os.name == "nt"
-    else {"start_new_session": True}
-)
+_DETACHED: dict[str, Any] = {"start_new_session": True}
+if os.name == "nt":
+    _DETACHED = {"creationflags": 0x00000200 | 0x08000000 | 0x00004000}
 
 
 def cache_folder() -> Path:
@@ -55,10 +52,8 @@ def is_preparing() -> bool:
 
 
 def prepare_status_folder(folder: Path) -> None:
-    """Create the status folder, or remove the previous worker's status from it.
-
-    Raises StgaError while that worker is running, or where the folder cannot be written.
-    """
+    """Create the status folder, or empty it. Raises StgaError while a worker is running in it, or
+    it cannot be written."""
     refuse_running_worker(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -76,22 +71,14 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
     Raises StgaError where the interpreter cannot be started; then only the status is removed from
     the folder.
     """
+    path, nothing = folder / LOG_FILE, subprocess.DEVNULL
     try:
-        log = os.open(folder / LOG_FILE, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
+        log = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
     except OSError as error:
-        raise StgaError(
-            f"{folder / LOG_FILE}: cannot be written ({error.strerror or error})"
-        ) from error
+        raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
+    streams: dict[str, Any] = {"stdin": nothing, "stdout": log, "stderr": subprocess.STDOUT}
     try:
-        process = start_python(
-            python,
-            arguments,
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            **_DETACHED,
-        )
+        process = start_python(python, arguments, cwd=folder, **streams, **_DETACHED)
     except StgaError:
         remove_status_folder(folder)
         raise
@@ -102,12 +89,10 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
 
 
 def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start `python -m ARGUMENTS…` at low priority, without a status; what it prints is dropped.
-    Raises StgaError where the interpreter cannot be started."""
-    nothing = subprocess.DEVNULL
-    process = start_python(
-        python, arguments, stdin=nothing, stdout=nothing, stderr=nothing, **_DETACHED
-    )
+    """Start `python -m ARGUMENTS…` at low priority, without status and output."""
+    streams = ("stdin", "stdout", "stderr")
+    nothing: dict[str, Any] = dict.fromkeys(streams, subprocess.DEVNULL)
+    process = start_python(python, arguments, **nothing, **_DETACHED)
     _give_precedence(process, BACKGROUND_NICENESS)
     return process
 
@@ -116,9 +101,8 @@ def _give_precedence(process: subprocess.Popen[bytes], niceness: int) -> None:
     """Lower the priority of a process on Linux and macOS; Windows starts it with a low one."""
     if os.name != "nt":
         with suppress(OSError):  # the process has ended already
-            os.setpriority(
-                os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness
-            )
+            own = os.getpriority(os.PRIO_PROCESS, 0)
+            os.setpriority(os.PRIO_PROCESS, process.pid, own + niceness)
 
 
 def start_python(
@@ -127,27 +111,20 @@ def start_python(
     variables: Mapping[str, str] | None = None,
     **options: Any,
 ) -> subprocess.Popen[Any]:
-    """Start `python -m ARGUMENTS…` with `worker_environment`.
-
-    variables: environment variables to add. options: those of subprocess.Popen.
-    Raises StgaError where the interpreter cannot be started.
-    """
+    """Start `python -m ARGUMENTS…` in `worker_environment` and `variables`; options are those of
+    Popen. Raises StgaError where the interpreter cannot be started."""
     environment = {**worker_environment(os.environ, python), **(variables or {})}
     try:
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
         reason = getattr(error, "strerror", None) or error
-        raise StgaError(
-            f"{python}: cannot be started as a Python interpreter ({reason})"
-        ) from error
+        problem = f"cannot be started as a Python interpreter ({reason})"
+        raise StgaError(f"{python}: {problem}") from error
 
 
 def end_with_this_process() -> Callable[[], None] | None:
-    """A `preexec_fn` by which Linux kills the started process when the thread that starts it has
-    gone, killed or not.
-
-    None on other systems, where such a process goes on to its end.
-    """
+    """A `preexec_fn` by which Linux kills the started process with the thread that starts it; None
+    on other systems, where it goes on to its end."""
     if not sys.platform.startswith("linux"):
         return None
     import ctypes  # before the fork, after which nothing may be imported
@@ -173,32 +150,21 @@ def worker_environment(variables: Mapping[str, str], python: str) -> dict[str, s
     """
     is_own = python in (sys.executable, own_python())
     cache = variables.get(CACHE_VARIABLE) if is_own else None
-    compiled = (
-        {
-            "PYTHONPYCACHEPREFIX": os.path.join(cache, BYTECODE),
-            "MPLCONFIGDIR": os.path.join(cache, CHARTS),
-        }
-        if cache
-        else {"PYTHONDONTWRITEBYTECODE": "1"}  # the extension's folder belongs to Blender
-    )
-    own_paths = filter(None, sys.path) if is_own else ()
     dropped = ("PYTHON",) if is_own else ("PYTHONHOME", "PYTHONSTARTUP")
     kept = {name: value for name, value in variables.items() if not name.startswith(dropped)}
-    return {
-        **kept,
-        **({"PYTHONNOUSERSITE": "1"} if is_own else {}),
-        **compiled,
-        "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *own_paths]),
-        "PYTHONSAFEPATH": "1",
-        "PYTHONUNBUFFERED": "1",
-        "PYTHONUTF8": "1",
-    }
+    if is_own:
+        kept["PYTHONNOUSERSITE"] = "1"
+    if cache:
+        kept["PYTHONPYCACHEPREFIX"] = os.path.join(cache, BYTECODE)
+        kept["MPLCONFIGDIR"] = os.path.join(cache, CHARTS)
+    else:
+        kept["PYTHONDONTWRITEBYTECODE"] = "1"  # the extension's folder belongs to Blender
+    path = os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path if is_own else ())])
+    always = dict.fromkeys(("PYTHONSAFEPATH", "PYTHONUNBUFFERED", "PYTHONUTF8"), "1")
+    return {**kept, **always, "PYTHONPATH": path}
 
 
 def same_interpreter_environment(variables: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables for another process of this interpreter: the packages that this process
-    finds."""
-    return {
-        **variables,
-        "PYTHONPATH": os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)]),
-    }
+    """For another process of this interpreter, with the packages of this one."""
+    path = os.pathsep.join([str(PACKAGES_FOLDER), *filter(None, sys.path)])
+    return {**variables, "PYTHONPATH": path}

@@ -1,5 +1,4 @@
-"""Lock files that end with the process that holds them; leases, which it renews, where the storage
-has no locks."""
+"""Lock files that end with their process; leases, which it renews, on storage without locks."""
 
 import errno
 import os
@@ -13,12 +12,8 @@ from filelock import FileLock, SoftFileLease, Timeout
 from ..errors import StgaError
 from ..files import file_size
 
-ACQUIRE_TIMEOUT_S = 0.3
-"""How long a lock is waited for: a process that only asks whether it is held has it for a
-moment."""
-PROBE_TIMEOUT_S = 0.03
-"""The same between two processes that only ask; Blender's timer waits that long for a worker of
-another Blender."""
+ACQUIRE_TIMEOUT_S = 0.3  # For a lock, which a process that only asks has for a moment
+PROBE_TIMEOUT_S = 0.03  # The same between processes that only ask, as Blender's timer does
 RETRY_INTERVAL_S = 0.002
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without working locks answers: some NFS and parallel file systems."""
@@ -27,9 +22,7 @@ BEAT_S, EXPIRY_S = 5.0, 30.0
 holder that was killed on another machine, or stands still (a suspended machine, storage that
 hangs)."""
 LOOK_INTERVAL_S = 0.2
-OWNER_OFFSET = 1
-"""Where the owner's process number starts: on Windows, other processes cannot read the first byte,
-which is locked."""
+OWNER_OFFSET = 1  # Of the process number: Windows locks the first byte, which nobody can read
 
 
 @contextmanager
@@ -59,7 +52,13 @@ def _hold_file_lock(path: Path) -> Iterator[None]:
     except Timeout as error:
         raise BlockingIOError(f"{path} is held by another process") from error
     try:
-        _write_owner(path)
+        with suppress(OSError):  # only messages need it
+            descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                os.lseek(descriptor, OWNER_OFFSET, os.SEEK_SET)
+                os.write(descriptor, b"%-20d" % os.getpid())
+            finally:
+                os.close(descriptor)
         yield
     finally:
         with suppress(OSError):  # Windows removes no open file, which leaves an empty lock behind
@@ -69,18 +68,17 @@ def _hold_file_lock(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
-    """Wait until another holder is gone, or has stood still for EXPIRY_S. Raises BlockingIOError
-    when it renews."""
+    """Wait until another holder is gone or still for EXPIRY_S; BlockingIOError if it renews."""
     lease = SoftFileLease(
         path, lease_duration=EXPIRY_S, heartbeat_interval=BEAT_S, thread_local=False
     )
     before = _renewed_s(path)
     try:
+        stood_still = (None, before)
         lease.acquire(
-            timeout=2 * EXPIRY_S,
-            poll_interval=LOOK_INTERVAL_S,
-            cancel_check=lambda: _renewed_s(path) not in (None, before),
-        )
+            timeout=2 * EXPIRY_S, poll_interval=LOOK_INTERVAL_S,
+            cancel_check=lambda: _renewed_s(path) not in stood_still,
+        )  # fmt: skip
     except Timeout as error:
         raise BlockingIOError(f"{path} is held by another process") from error
     try:
@@ -90,8 +88,7 @@ def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process holds the lock; False where the file is missing or cannot be
-    opened."""
+    """Whether a living process holds the lock; False where it cannot be opened."""
     if not path.is_file() or path.is_symlink():
         return False
     try:
@@ -137,13 +134,3 @@ def _is_renewed(lease: Path) -> bool:
     with suppress(OSError), tempfile.TemporaryFile(dir=lease.parent) as now:
         return before is not None and os.fstat(now.fileno()).st_mtime - before < EXPIRY_S
     return False
-
-
-def _write_owner(path: Path) -> None:
-    with suppress(OSError):  # only messages need it
-        descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0))
-        try:
-            os.lseek(descriptor, OWNER_OFFSET, os.SEEK_SET)
-            os.write(descriptor, b"%-20d" % os.getpid())
-        finally:
-            os.close(descriptor)

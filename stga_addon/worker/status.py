@@ -19,19 +19,17 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 from ..errors import StgaError
-from ..files import file_size, read_json, write_json
+from ..files import RENAME_PATIENCE_S, file_size, read_json, write_json
 from .lock import hold_lock, is_locked, lock_owner
 
 STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
-STATUS_INTERVAL_S = 0.5
-"""Least time between two writes of status.json with the same message."""
-MIN_FREE_BYTES = 1 << 20
-"""Free space below which a disk counts as full."""
+STATUS_INTERVAL_S = 0.5  # Least time between two writes of status.json with the same message
+MIN_FREE_BYTES = 1 << 20  # Free space below which a disk counts as full
 LOG_TAIL_LINES, REPORT_LOG_LINES = 6, 200
-MAX_LOG_LINE_BYTES = 400
-"""Assumed length of a log line, which bounds how much of the log is read."""
+MAX_LOG_LINE_BYTES = 400  # Assumed length of a log line, which bounds how much of the log is read
 
 
 class WorkerState(StrEnum):
@@ -53,6 +51,9 @@ class WorkerState(StrEnum):
     @property
     def failed(self) -> bool:
         return self in (WorkerState.FAILED, WorkerState.LOST)
+
+
+ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
 
 
 @dataclass(frozen=True)
@@ -81,52 +82,38 @@ class WorkerStatus:
 
 @dataclass(frozen=True)
 class WorkerSnapshot:
-    """State and status of a worker at one moment; `log_tail`: the last lines of its log where it
-    failed."""
+    """State and status of a worker; `log_tail`: the last lines of its log where it failed."""
 
     state: WorkerState = WorkerState.NONE
     status: WorkerStatus = field(default_factory=WorkerStatus)
     log_tail: tuple[str, ...] = ()
 
 
-def derive_state(
-    status: WorkerStatus | None, alive: bool, cancel_requested: bool, started: bool
-) -> WorkerState:
-    """State of a worker.
-
-    status: the latest one, or None. alive: whether the process lives. started: whether one was ever
-    started.
-    """
-    if status is not None and status.state != WorkerState.WORKING:
-        return WorkerState(status.state)
-    if not alive:
-        return WorkerState.LOST if started else WorkerState.NONE
-    if cancel_requested:
-        return WorkerState.CANCELLING
-    return WorkerState.STARTING if status is None else WorkerState.WORKING
-
-
 # Reading
 
 
 def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None) -> WorkerSnapshot:
-    """Snapshot of the worker of a status folder; `process`: the worker, where this process started
-    it."""
+    """Snapshot of a status folder; `process`: its worker, where this process started it."""
     code = None if process is None else process.poll()
     # The process before the status: one that ends between the two reads has written its final
     # status by then.
     alive = (process is not None and code is None) or is_locked(folder / LOCK_FILE)
     status = read_status(folder)
-    state = derive_state(
-        status, alive, (folder / CANCEL_FILE).exists(), (folder / LOG_FILE).exists()
-    )
+    cancelled, started = ((folder / name).exists() for name in (CANCEL_FILE, LOG_FILE))
+    if status is not None and status.state != WorkerState.WORKING:
+        state = WorkerState(status.state)
+    elif not alive:
+        state = WorkerState.LOST if started else WorkerState.NONE
+    elif cancelled:
+        state = WorkerState.CANCELLING
+    else:
+        state = WorkerState.STARTING if status is None else WorkerState.WORKING
     status = status or WorkerStatus()
     if state == WorkerState.LOST:
         error = describe_lost_worker(folder, code)
         status = replace(status, state=WorkerState.LOST, message="", detail="", error=error)
-    return WorkerSnapshot(
-        state, status, tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ()
-    )
+    log_tail = tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ()
+    return WorkerSnapshot(state, status, log_tail)
 
 
 def describe_lost_worker(folder: Path, exit_code: int | None = None) -> str:
@@ -135,37 +122,27 @@ def describe_lost_worker(folder: Path, exit_code: int | None = None) -> str:
         if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
             return f"Worker exited unexpectedly: the disk that holds {folder} is full"
     if exit_code is not None and exit_code > 0:
-        last = log_lines(folder, 1)
-        return f"Worker exited with status {exit_code}: {last[0].strip() if last else 'its log is empty'}"
+        last = log_lines(folder, 1) or ["its log is empty"]
+        return f"Worker exited with status {exit_code}: {last[0].strip()}"
     signal = f" (signal {-exit_code})" if exit_code else ""
-    return f"Worker exited unexpectedly{signal}; it was killed or may have run out of memory. Log: {folder / LOG_FILE}"
+    why = f"it was killed or may have run out of memory. Log: {folder / LOG_FILE}"
+    return f"Worker exited unexpectedly{signal}; {why}"
 
 
 def read_status(folder: Path) -> WorkerStatus | None:
     """The latest status; None where status.json is missing or malformed."""
     try:
-        values = read_json(folder / STATUS_FILE)
-        status = WorkerStatus(**values)
-        texts = (status.message, status.detail, status.error, status.traceback)
-        machine = status.machine
+        status = WorkerStatus(**read_json(folder / STATUS_FILE))
+        texts = (status.message, status.detail, status.error, status.traceback, status.machine)
         figures = {str(name): float(value) for name, value in status.figures.items()}
-        states = (
-            WorkerState.WORKING,
-            WorkerState.FINISHED,
-            WorkerState.CANCELLED,
-            WorkerState.FAILED,
-        )
-        if status.state not in states or not all(
-            isinstance(text, str) for text in (*texts, machine)
-        ):
-            return None
-        if not 0 <= status.progress <= 1 or not 0 <= status.seconds < math.inf:
-            return None
+        progress, seconds = float(status.progress), float(status.seconds)
     except (StgaError, TypeError, ValueError, AttributeError):
         return None
-    return WorkerStatus(
-        status.state, float(status.progress), *texts, figures, machine, float(status.seconds)
-    )
+    is_known = status.state in (WorkerState.WORKING, *ENDS)
+    are_numbers = 0 <= progress <= 1 and 0 <= seconds < math.inf
+    if not (is_known and are_numbers and all(isinstance(text, str) for text in texts)):
+        return None
+    return replace(status, progress=progress, figures=figures, seconds=seconds)
 
 
 def log_lines(folder: Path, count: int) -> list[str]:
@@ -192,8 +169,7 @@ def failure_report(folder: Path, snapshot: WorkerSnapshot) -> str:
 
 
 def request_cancel(folder: Path) -> None:
-    """Ask the worker to stop and to keep what it has. Raises StgaError where the folder cannot be
-    written."""
+    """Ask the worker to stop and to keep what it has. Raises StgaError."""
     path = folder / CANCEL_FILE
     try:
         with suppress(FileExistsError):
@@ -205,17 +181,13 @@ def request_cancel(folder: Path) -> None:
 def refuse_running_worker(folder: Path) -> None:
     """Raises StgaError while a worker is running in the folder."""
     if is_locked(folder / LOCK_FILE):
-        raise StgaError(
-            f"{folder}: another worker is running here (process {lock_owner(folder / LOCK_FILE)})"
-        )
+        problem = f"another worker is running here (process {lock_owner(folder / LOCK_FILE)})"
+        raise StgaError(f"{folder}: {problem}")
 
 
 def remove_status_folder(folder: Path, other_files: Iterable[str] = ()) -> None:
-    """Remove the files of a worker's status and `other_files`, then the folder where nothing else
-    is in it.
-
-    Raises StgaError while the worker is running, or where a file cannot be removed.
-    """
+    """Remove a worker's status and `other_files`, and the folder where nothing else is in it.
+    Raises StgaError while the worker is running, or a file stays."""
     refuse_running_worker(folder)
     try:
         for name in (STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE, *other_files):
@@ -241,44 +213,30 @@ class StatusWriter:
         self._began_s = time.monotonic()
 
     def update(
-        self,
-        progress: float,
-        message: str,
-        detail: str = "",
+        self, progress: float, message: str, detail: str = "",
         figures: Callable[[], Mapping[str, float]] = dict,
-    ) -> bool:
-        """Write the status, at most every STATUS_INTERVAL_S; returns whether to stop and keep what
-        there is.
-
-        figures: called when the status is written; numbers that are not finite are left out.
-        """
+    ) -> bool:  # fmt: skip
+        """Write the status, at most every STATUS_INTERVAL_S, with the finite `figures`; returns
+        whether to stop and keep what there is."""
         self.cancel_requested = (self.folder / CANCEL_FILE).exists()
         now = time.monotonic()
         if message != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
             finite = {name: value for name, value in figures().items() if math.isfinite(value)}
-            progress = min(max(progress, 0.0), 1.0)
-            working = WorkerState.WORKING
-            self._status = replace(
-                self._status, state=working, progress=progress, message=message, detail=detail, figures=finite,
-                seconds=self._seconds(),
-            )  # fmt: skip
-            self._written_s = now
-            # a missing status stops no work; the work itself reports a full disk
-            with suppress(StgaError):
-                # the next one comes soon
-                write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=0.0)
+            share, self._written_s = min(max(progress, 0.0), 1.0), now
+            # the next one comes soon
+            self._write(0.0, progress=share, message=message, detail=detail, figures=finite)
         return self.cancel_requested
 
     def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:
         """Write the final status."""
-        final = replace(
-            self._status, state=state, error=error, traceback=trace, seconds=self._seconds()
-        )
-        with suppress(StgaError):  # `inspect_worker` reports a worker that is gone
-            write_json(self.folder / STATUS_FILE, asdict(final))
+        self._write(RENAME_PATIENCE_S, state=state, error=error, traceback=trace)
 
-    def _seconds(self) -> float:
-        return round(time.monotonic() - self._began_s, 3)
+    def _write(self, patience_s: float, **changes: Any) -> None:
+        seconds = round(time.monotonic() - self._began_s, 3)
+        self._status = replace(self._status, seconds=seconds, **changes)
+        # A missing status stops no work, and `inspect_worker` reports a worker that is gone.
+        with suppress(StgaError):
+            write_json(self.folder / STATUS_FILE, asdict(self._status), patience_s=patience_s)
 
 
 @contextmanager
@@ -308,13 +266,10 @@ def status_writer(folder: Path) -> Iterator[StatusWriter]:
             writer.finish(WorkerState.CANCELLED)
             raise
         except BaseException as error:
-            writer.finish(WorkerState.FAILED, _summarize(error), traceback.format_exc())
+            lines = str(error).strip().splitlines()
+            summary = ": ".join([type(error).__name__, *lines[:1]])
+            if isinstance(error, ModuleNotFoundError):
+                summary = f"{sys.executable} lacks the package '{error.name}'"
+            writer.finish(WorkerState.FAILED, summary, traceback.format_exc())
             raise
         writer.finish(WorkerState.CANCELLED if writer.cancel_requested else WorkerState.FINISHED)
-
-
-def _summarize(error: BaseException) -> str:
-    if isinstance(error, ModuleNotFoundError):
-        return f"{sys.executable} lacks the package '{error.name}'"
-    lines = str(error).strip().splitlines()
-    return ": ".join([type(error).__name__, *lines[:1]])

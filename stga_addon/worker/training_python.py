@@ -1,5 +1,4 @@
-"""The Python that tracks and trains: Blender's own where it has the packages, or one that was
-chosen."""
+"""The Python that tracks and trains: Blender's own with the packages, or a chosen one."""
 
 import os
 import sys
@@ -9,30 +8,17 @@ from pathlib import Path
 
 from ..errors import StgaError
 
-REQUIREMENTS = {
-    "numpy": "numpy>=1.26,<3",
-    "torch": "torch>=2.4,<3",
-    "numba": "numba>=0.60,<1",
-    "scipy": "scipy>=1.11,<2",
-    "PIL": "pillow>=10,<14",
-    "platformdirs": "platformdirs>=4,<5",
-    "trimesh": "trimesh>=4,<6",
-    "tqdm": "tqdm>=4.60,<5",
-    "filelock": "filelock>=4,<5",
-    "matplotlib": "matplotlib>=3.8,<4",
-    "av": "av>=14,<19",
+REQUIREMENTS = {  # Module -> requirement of tracking and training, as in `pyproject.toml`
+    "numpy": "numpy>=1.26,<3", "torch": "torch>=2.4,<3", "numba": "numba>=0.60,<1",
+    "scipy": "scipy>=1.11,<2", "PIL": "pillow>=10,<14", "platformdirs": "platformdirs>=4,<5",
+    "trimesh": "trimesh>=4,<6", "tqdm": "tqdm>=4.60,<5", "filelock": "filelock>=4,<5",
+    "matplotlib": "matplotlib>=3.8,<4", "av": "av>=14,<19",
     "cv2": "opencv-python-headless>=4.12,<5",
-}
-"""Packages that tracking and training need: imported module -> requirement, which `pyproject.toml`
-repeats."""
+}  # fmt: skip
 GPU_REQUIREMENT = "wgpu>=0.32,<1"
 """Trains on a GPU; without it, or where it has no driver, the CPU trains."""
-PYTHON_VARIABLE = "STGA_PYTHON"
-"""Environment variable that names the interpreter that tracks and trains, above every other choice:
-for farms."""
-BLENDER_VARIABLE = "STGA_BLENDER"
-"""Environment variable with the command that starts Blender on a machine that renders .blend
-files."""
+PYTHON_VARIABLE = "STGA_PYTHON"  # Names the training Python, above every other choice: for farms
+BLENDER_VARIABLE = "STGA_BLENDER"  # The command that starts Blender on a machine that renders
 
 
 def package_name(requirement: str) -> str:
@@ -52,22 +38,16 @@ def own_python() -> str:
     if Path(sys.executable).is_relative_to(prefix):
         return sys.executable
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    names = (
-        ("bin/python.exe", "python.exe")
-        if os.name == "nt"
-        else (f"bin/python{version}", "bin/python3")
-    )
-    return next(
-        (str(path) for path in (prefix / name for name in names) if path.is_file()), sys.executable
-    )
+    names = (f"bin/python{version}", "bin/python3")
+    if os.name == "nt":
+        names = ("bin/python.exe", "python.exe")
+    paths = (prefix / name for name in names)
+    return next((str(path) for path in paths if path.is_file()), sys.executable)
 
 
 def find_training_python(preferred: str = "") -> str:
-    """The interpreter that tracks and trains: $STGA_PYTHON, else `preferred` (Blender's
-    preferences), else this one.
-
-    Raises StgaError where this one is left and lacks packages.
-    """
+    """The interpreter that tracks and trains: $STGA_PYTHON, else `preferred`, else this one. Raises
+    StgaError where this one is left and lacks packages."""
     chosen = os.environ.get(PYTHON_VARIABLE) or preferred
     if chosen:  # without a folder, a program that is found on PATH
         return os.path.abspath(chosen) if os.path.dirname(chosen) else chosen
@@ -75,8 +55,9 @@ def find_training_python(preferred: str = "") -> str:
     if missing:
         version = sys.version.split()[0]
         raise StgaError(
-            f"{own_python()} (Python {version}) lacks {', '.join(missing)}. Install the complete edition of the "
-            f"add-on, or choose a Python that has them in its preferences or by {PYTHON_VARIABLE}"
+            f"{own_python()} (Python {version}) lacks {', '.join(missing)}. Install the complete "
+            "edition of the add-on, or choose a Python that has them in its preferences or by "
+            f"{PYTHON_VARIABLE}"
         )
     return own_python()
 

@@ -23,9 +23,7 @@ class SimulatedEngine:
 
     interval_s = 0.0
 
-    def __init__(
-        self, outcome: Outcome = finished, room: int = 1 << 30, takes_all: bool = False
-    ) -> None:
+    def __init__(self, outcome=finished, room=1 << 30, takes_all=False):
         self.outcome, self.room, self.takes_all = outcome, room, takes_all
         self.submitted: list[str] = []
         self.most = 0

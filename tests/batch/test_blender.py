@@ -50,7 +50,8 @@ out = "{engine}"
 threads = 1
 memory_gb = 1
 """ + "".join(
-    f'[job.film-{first}]\nrequest = "render-blend"\nblend = "head.blend"\nframes = [{first}, {last}]\n'
+    f'[job.film-{first}]\nrequest = "render-blend"\nblend = "head.blend"\nframes = [{first}, '
+    f"{last}]\n"
     for first, last in ((0, 1), (2, 3), (4, 4))
 )
 COMMAND = """
@@ -82,7 +83,8 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         blender("--background", "--python-exit-code", "1", "--python", folder / "make.py")
         names = folder / "whole/######"
         blender(
-            "--background", folder / "head.blend", "--engine", "STGA_SPLATS", "--render-output", names,
+            "--background", folder / "head.blend", "--engine", "STGA_SPLATS", "--render-output",
+                names,
             "--render-format", "PNG", "--frame-start", 0, "--frame-end", 4, "--render-anim",
         )  # fmt: skip
         yield folder

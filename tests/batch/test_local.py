@@ -14,14 +14,13 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.batch.engines.local import LocalEngine
-from stga_addon.batch.plan import Job, read_plan
+from stga_addon.batch.plan import read_plan
 from stga_addon.batch.run import Batch, JobState
 from stga_addon.cli.main import main
 from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE
 
-from .conftest import TrainedHere
 from .simulated import InProcessEngine, carry_out
 from .tiny import ITERATIONS, check_interrupted, interrupt_batch, splats_of, tiny_plan
 
@@ -33,13 +32,7 @@ KILLS = int(os.environ.get("STGA_BATCH_KILLS", 2))
 docs/batch.md."""
 
 
-def killer(
-    jobs: tuple[Job, ...],
-    kills: int,
-    ended: threading.Event,
-    killed: list[str],
-    resumable: list[str],
-) -> None:
+def killer(jobs, kills, ended, killed, resumable):
     """Kill workers, none more than four times: in turn at a random moment, and when there is a
     checkpoint.
 
@@ -69,9 +62,7 @@ def killer(
 
 
 @pytest.mark.nightly
-def test_killed_workers_resume_to_the_same_bits(
-    tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_workers_resume_to_the_same_bits(tmp_path, trained_here, monkeypatch):
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     seeds, iterations = max(1, KILLS // 3), max(ITERATIONS, 80 * KILLS)
@@ -110,36 +101,23 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "2 jobs, 2 to do; 12 s of work" in printed
 
 
-def test_captures_of_the_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     """Catches options that are forgotten where captures are given, or silently ignored where a plan
     is."""
     monkeypatch.setattr("stga_addon.batch.engines.make_engine", lambda *_: InProcessEngine())
     tiny_plan(tmp_path)
     capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
     options = [
-        "--iterations",
-        "2",
-        "--device",
-        "cpu",
-        "--threads",
-        "1",
-        "--principal-point",
-        "opencv",
-        "--seed",
-        "5",
-    ]
+        "--iterations", "2", "--device", "cpu", "--threads", "1", "--principal-point", "opencv",
+        "--seed", "5",
+    ]  # fmt: skip
     assert main(["batch", capture, "--out", out, *options]) == 0
     assert "1 of 1 jobs finished" in capsys.readouterr().out
     run = read_run(tmp_path / "out/train-capture")
     settings = run.settings
     assert (run.principal_point, settings.iterations, settings.seed, run.device) == (
-        "opencv",
-        2,
-        5,
-        "cpu",
-    )
+        "opencv", 2, 5, "cpu",
+    )  # fmt: skip
     assert main(["batch", capture, "--preset", "draft"]) == 2
     assert "--out: is missing" in capsys.readouterr().err
     assert main(["batch", capture, "--out", out]) == 2

@@ -37,14 +37,17 @@ engine = make_engine("ray")
 assert os.environ["RAY_AUTH_MODE"] == "token"
 import ray
 address = ray.get_runtime_context().gcs_address
-look = f"from ray._raylet import GcsClient; print(GcsClient(address={address!r}).get_all_node_info(timeout=60))"
+client = f"GcsClient(address={address!r})"
+look = f"from ray._raylet import GcsClient; print({client}.get_all_node_info(timeout=60))"
 for token, code in ((os.environ["RAY_AUTH_TOKEN"], 0), ("0" * 64, 1)):
     variables = {**os.environ, "RAY_AUTH_TOKEN": token}
-    asked = subprocess.run([sys.executable, "-c", look], env=variables, capture_output=True, text=True, timeout=120)
+    asked = subprocess.run([sys.executable, "-c", look], env=variables, capture_output=True,
+        text=True, timeout=120)
     assert asked.returncode == code, asked
     assert ("InvalidAuthToken" in asked.stderr) == bool(code), asked
 look = {"request": "select", "capture": "capture"}
-batch, _ = carry_out(make_plan({"out": "runs", "job": {"look": look}}, Path(sys.argv[2]), "plan"), engine)
+batch, _ = carry_out(make_plan({"out": "runs", "job": {"look": look}}, Path(sys.argv[2]), "plan"),
+    engine)
 print(sorted((entry.job.name, str(entry.state), entry.error) for entry in batch.entries.values()))
 """
 NODES = """
@@ -60,16 +63,19 @@ from stga_addon.training.run.folder import CHECKPOINT
 from stga_addon.worker.lock import is_locked
 from stga_addon.worker.status import LOCK_FILE
 
-kills, seeds, size = int(sys.argv[3]), int(sys.argv[4]), {"num_cpus": 1, "object_store_memory": 80_000_000}
+kills, seeds = int(sys.argv[3]), int(sys.argv[4])
+size = {"num_cpus": 1, "object_store_memory": 80_000_000}
 cluster = Cluster(initialize_head=True, head_node_args={**size, "num_cpus": 0})
-nodes = [cluster.add_node(**size) for _ in range(min(2, seeds))]  # each of them with work, so that a kill hits
+# each of them with work, so that a kill hits
+nodes = [cluster.add_node(**size) for _ in range(min(2, seeds))]
 plan = tiny_plan(Path(sys.argv[2]), seeds, int(sys.argv[5]))
 chance, killed, resumable, engine = random.Random(5), 0, 0, make_engine("ray", cluster.address)
 with ThreadPoolExecutor(1) as pool:
     running = pool.submit(carry_out, plan, engine)
     # In this thread: a node sets a signal handler, which only the main thread can.
     while killed < kills and not wait([running], chance.uniform(0.2, 1)).done:
-        begun = [job.request_folder for job in plan.jobs if is_locked(job.request_folder / LOCK_FILE)]
+        folders = [job.request_folder for job in plan.jobs]
+        begun = [folder for folder in folders if is_locked(folder / LOCK_FILE)]
         with_checkpoint = [folder for folder in begun if (folder.parent / CHECKPOINT).exists()]
         if with_checkpoint if killed % 2 else begun:
             cluster.remove_node(nodes.pop(0), allow_graceful=False)
@@ -89,13 +95,9 @@ def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
     """Lines that a script prints in a process of its own, which Ray leaves its settings to."""
     command = [sys.executable, "-c", script, str(ROOT), *map(str, arguments)]
     done = subprocess.run(
-        command,
-        env={**ray_variables(), **variables},
-        capture_output=True,
-        text=True,
-        timeout=1200,
+        command, env={**ray_variables(), **variables}, capture_output=True, text=True, timeout=1200,
         cwd=ROOT,
-    )
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     return done.stdout.splitlines()
 

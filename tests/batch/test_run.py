@@ -245,12 +245,9 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
     def job(name: str, **needs: float) -> Job:
         found = empty_jobs(tmp_path, 1).jobs[0]
         return Job(
-            name,
-            "look",
-            found.request,
-            tmp_path / name,
+            name, "look", found.request, tmp_path / name,
             resources=Resources(**{"threads": 1, **needs}),
-        )
+        )  # fmt: skip
 
     assert engine.has_room(job("huge", threads=64, memory_gb=100.0))
     engine.adopt(job("a", threads=2, memory_gb=3.0, gpu=True))
@@ -269,9 +266,7 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
         (True, "exit 2", False),
     ],
 )
-def test_a_killed_worker_is_told_from_a_mistake(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, windows: bool, ending: str, is_lost: bool
-) -> None:
+def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, ending, is_lost):
     """Catches a killed worker that is not tried again on Windows, where a kill is an exit status
     like others."""
     monkeypatch.setattr(local, "IS_WINDOWS", windows)
@@ -331,9 +326,7 @@ def _hold(folder: str, held: Any) -> None:
 
 
 @pytest.mark.parametrize("locks", ["work", "fail"])
-def test_two_batches_cannot_take_one_folder(
-    tmp_path: Path, locks: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
     """Catches two batches that write into each other's jobs, also where the storage knows no file
     locks."""
     if locks == "fail":
@@ -425,7 +418,8 @@ def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
         map(float, line.split()) for line in run.stdout.splitlines()
     )
     print(
-        f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; {large_s / small_s:.2f}"
+        f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; "
+        f"{large_s / small_s:.2f}"
     )
     assert large_s < 1.8 * small_s
     assert large_kb - small_kb < 30 * (JOBS - few)

@@ -14,7 +14,6 @@ from stga_addon.errors import StgaError
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE, StatusWriter, WorkerState
 
-from .conftest import TrainedHere
 from .simulated import carry_out, empty_jobs
 from .slurm_cluster import Cluster, running_cluster
 from .tiny import check_interrupted, interrupt_batch, splats_of, tiny_plan
@@ -38,9 +37,7 @@ def on_cluster(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
 
 
 @pytest.mark.needs("slurm")
-def test_same_results_through_slurm(
-    on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere
-) -> None:
+def test_same_results_through_slurm(on_cluster, tmp_path, trained_here):
     """Catches jobs that begin before those they come after, or train something else than on this
     machine; and a killed worker whose job is lost."""
     there = tiny_plan(tmp_path)
@@ -70,9 +67,7 @@ def test_same_results_through_slurm(
 
 @pytest.mark.nightly
 @pytest.mark.needs("slurm")
-def test_jobs_of_a_dead_node_resume_elsewhere(
-    on_cluster: Cluster, tmp_path: Path, trained_here: TrainedHere, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_of_a_dead_node_resume_elsewhere(on_cluster, tmp_path, trained_here, monkeypatch):
     """Catches a job that is lost with its machine, or is another one when it was resumed on the
     next."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
@@ -137,9 +132,7 @@ def test_what_slurm_refuses_is_a_sentence(on_cluster: Cluster, tmp_path: Path) -
     assert "sbatch: " in batch.entries["huge"].error
 
 
-def test_what_waits_in_the_queue_is_submitted_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_waits_in_the_queue_is_submitted_once(tmp_path, monkeypatch):
     """Catches a batch that ends because squeue failed once, and jobs that the next start submits
     again while they wait.
 

@@ -23,7 +23,8 @@ ROOT = Path(__file__).resolve().parents[2]
 ITERATIONS = 400
 """Some seconds of training, so that workers and machines can be killed between checkpoints."""
 RAY_SETTINGS = {
-    "worker_niceness": "0", "health_check_initial_delay_ms": "1000", "health_check_period_ms": "1000",
+    "worker_niceness": "0", "health_check_initial_delay_ms": "1000", "health_check_period_ms":
+        "1000",
     "health_check_failure_threshold": "3", "health_check_timeout_ms": "10000",
 }  # fmt: skip
 """Tasks have the priority of the tests beside them (Ray's own is 15 lower, and takes minutes then);
@@ -76,7 +77,8 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     (base / "plan.toml").write_text(
         'out = "runs"\n[resources]\nthreads = 1\nmemory_gb = 0.5\n'
         + "".join(
-            f'[job.train-{name}]\nrequest = "train"\ndevice = "cpu"\nprincipal_point = "opencv"\nminutes = 0.1\n'
+            f'[job.train-{name}]\nrequest = "train"\ndevice = "cpu"\nprincipal_point = '
+            f'"opencv"\nminutes = 0.1\n'
             f'capture = "{capture}"\n'
             'settings = { strategy = "selective", iterations = 100000, hull_points = false }\n'
             for name, capture in (("good", "capture"), ("bad", "bad"))
@@ -84,13 +86,9 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     )
     command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]
     started = subprocess.Popen(
-        command,
-        cwd=ROOT,
-        env=ray_variables(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+        command, cwd=ROOT, env=ray_variables(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True,
-    )
+    )  # fmt: skip
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         status, failed = (read_status(base / f"runs/train-{name}/job") for name in ("good", "bad"))

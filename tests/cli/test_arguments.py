@@ -9,16 +9,10 @@ from stga_addon.options import color, duration
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [
-        ("90", 90),
-        ("90s", 90),
-        ("10m", 600),
-        ("1h30m", 5400),
-        ("1h", 3600),
-        ("1.5m", 90),
-        ("1m30", 90),
-        (" 2m ", 120),
+        ("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("1h", 3600), ("1.5m", 90),
+        ("1m30", 90), (" 2m ", 120),
     ],
-)
+)  # fmt: skip
 def test_durations(text: str, seconds: float) -> None:
     """Catches minutes taken for seconds."""
     assert duration(text) == seconds

@@ -5,11 +5,11 @@ from contextlib import redirect_stdout
 from io import StringIO
 
 import pytest
+from command_line import stga
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
 from stga_addon.cli.main import main
-from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.tracking import write_capture
 from stga_addon.tracking.torso import FollowedTorso
@@ -17,14 +17,9 @@ from stga_addon.tracking.torso import FollowedTorso
 
 def make(take, out, *more):
     arguments = [
-        "--model",
-        str(take / "head.npz"),
-        "--out",
-        str(out),
-        "--landmarks",
-        str(take / "points"),
-    ]
-    return main(["avatar", str(take / "footage"), *arguments, "--iterations", "6", *more])
+        "--model", str(take / "head.npz"), "--out", str(out), "--landmarks", str(take / "points"),
+    ]  # fmt: skip
+    return stga("avatar", take / "footage", *arguments, "--iterations 6", *more)
 
 
 @pytest.fixture(scope="module")
@@ -122,13 +117,9 @@ def test_a_mistyped_footage_leaves_nothing_behind(take, tmp_path, capsys):
     """Catches a folder that remembers the mistake, and refuses the mended command as one of other
     inputs."""
     mistyped = [
-        "avatar",
-        str(tmp_path / "nowhere"),
-        "--model",
-        str(take / "head.npz"),
-        "--out",
+        "avatar", str(tmp_path / "nowhere"), "--model", str(take / "head.npz"), "--out",
         str(tmp_path / "out"),
-    ]
+    ]  # fmt: skip
     assert main(mistyped) == 2
     assert "nowhere: is neither a folder nor a video" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -154,10 +145,3 @@ def test_a_python_without_blender_says_so(take, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(commands, "carry_out", lambda request: None)
     assert make(take, tmp_path / "out") == 0
     assert "this Python has no bpy" in capsys.readouterr().out
-
-
-def test_a_blend_file_needs_an_avatar(tmp_path):
-    """Catches a traceback for a folder that `stga avatar` did not finish."""
-    with pytest.raises(StgaError, match=r"inputs\.json"):
-        commands.write_blend(tmp_path, lambda capture: capture)
-    assert not list(tmp_path.iterdir())

@@ -14,6 +14,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from capture import factory
+from command_line import stga
 from PIL import Image
 
 from stga_addon import __version__
@@ -76,37 +77,12 @@ def test_train(trained: Path, root: Path) -> None:
     assert len(read_avatar(trained / "avatar.npz").splats) >= 15 * 320
 
 
-def test_train_with_defaults_and_every_option(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches defaults without the lattice, and a strategy, threshold or seed that is ignored."""
-    out = tmp_path / "run"
-    options = "--iterations 3 --strategy selective --threshold 0.0005 --seed 5 --device cpu --principal-point vhap"
-    assert main(["train", str(root), "--out", str(out), *options.split()]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"avatar: {out / 'avatar.npz'}"
-    run = read_run(out)
-    assert (run.settings.seed, run.settings.selection.threshold, run.settings.strategy) == (
-        5,
-        0.0005,
-        "selective",
-    )
-    splats = read_avatar(out / "avatar.npz").splats
-    assert (~splats.unbound).sum() == 6 * 320
-
-
 def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
     """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
     out = tmp_path / "run"
     arguments = [
-        "train",
-        str(root),
-        "--out",
-        str(out),
-        "--budget",
-        "0.2s",
-        "--strategy",
-        "gaussian-avatars",
-    ]
+        "train", str(root), "--out", str(out), "--budget", "0.2s", "--strategy", "gaussian-avatars",
+    ]  # fmt: skip
     assert main(arguments) == 0
     first = read_checkpoint(out)
     assert 0.2 <= first.elapsed_s < 1.5
@@ -152,9 +128,7 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.needs("adapter")
-def test_render_on_a_gpu(
-    trained: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_render_on_a_gpu(trained, root, tmp_path, monkeypatch):
     """Catches a device that renders something else, or is not asked."""
     from stga_addon.raster.gpu import compose as gpu
 
@@ -163,21 +137,7 @@ def test_render_on_a_gpu(
     cameras = root / "transforms_val.json"
     for device in ("cpu", "gpu"):
         out = tmp_path / device
-        assert (
-            main(
-                [
-                    "render",
-                    str(trained),
-                    "--cameras",
-                    str(cameras),
-                    "--out",
-                    str(out),
-                    "--device",
-                    device,
-                ]
-            )
-            == 0
-        )
+        assert stga("render", trained, "--cameras", cameras, "--out", out, "--device", device) == 0
     names = sorted(path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.png"))
     assert rendered.call_count == len(names) > 0
     for name in names:
@@ -187,32 +147,6 @@ def test_render_on_a_gpu(
         )
         assert np.abs(one - other).max() <= 1
         assert one.std() > 5
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("black", (0, 0, 0)), ("1,0,0.2", (255, 0, 51)), ("white", (255, 255, 255))]
-)
-def test_render_background(
-    trained: Path, root: Path, tmp_path: Path, name: str, value: tuple[int, int, int]
-) -> None:
-    """Catches a background that is not the one asked for."""
-    cameras = str(root / "transforms_val.json")
-    assert (
-        main(
-            [
-                "render",
-                str(trained),
-                "--cameras",
-                cameras,
-                "--out",
-                str(tmp_path),
-                "--background",
-                name,
-            ]
-        )
-        == 0
-    )
-    assert pixels(tmp_path / "00000_02.png")[1, 1].tolist() == list(value)
 
 
 def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -> None:
@@ -225,9 +159,7 @@ def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -
     ):
         assert main(["render", *map(str, source), *cameras, "--out", str(tmp_path / name)]) == 0
     ply = tmp_path / "frame.ply"
-    assert (
-        main(["export", str(trained), "--format", "ply", "--timestep", "1", "--out", str(ply)]) == 0
-    )
+    assert stga("export", trained, "--format ply --timestep 1 --out", ply) == 0
     assert main(["render", str(ply), *cameras, "--out", str(tmp_path / "ply")]) == 0
     for name in ("00000_02.png", "00001_02.png"):
         np.testing.assert_array_equal(
@@ -235,26 +167,6 @@ def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -
         )
     right, baked = (pixels(tmp_path / kind / "00001_02.png").astype(int) for kind in ("run", "ply"))
     assert np.abs(right - baked).max() <= 1
-
-
-def test_render_names(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches pictures that overwrite each other: a name used in two folders, or twice; images need
-    not exist."""
-    document = json.loads((root / "transforms_val.json").read_text())
-    first = document["frames"][0]
-    paths = ["a/0.png", "b/0.png", "b/1.jpg", "b/1.jpg", "../c/2"]
-    for entry in [first, *document["frames"]]:
-        entry.pop("fg_mask_path", None)
-    document["frames"] = [{**first, "file_path": path} for path in paths]
-    cameras = tmp_path / "ball" / "cameras.json"
-    cameras.parent.mkdir()
-    cameras.write_text(json.dumps(document))
-    out = tmp_path / "out"
-    assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out)]) == 0
-    assert len(pictures(out)) == len(paths)
-    assert {"a_0.png", "b_0.png"} <= set(pictures(out))
-    assert all(name.endswith(".png") for name in pictures(out))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball", "out"]
 
 
 def test_names_of_a_long_capture() -> None:
@@ -268,11 +180,8 @@ def test_names_of_a_long_capture() -> None:
     assert unique_names(paths) == [Path(path).name for path in paths]
     assert process_time() - begin < 5
     assert unique_names(["a.png", "a.png", "a_2.png", "a.png"]) == [
-        "a.png",
-        "a_2.png",
-        "a_2_2.png",
-        "a_3.png",
-    ]
+        "a.png", "a_2.png", "a_2_2.png", "a_3.png",
+    ]  # fmt: skip
 
 
 def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
@@ -297,9 +206,7 @@ def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
     )
 
 
-def test_export_says_which_frames_there_are(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_says_which_frames_there_are(trained, tmp_path, capsys):
     """Catches a range that is cut to the capture's without a message, a message about one that is
     not, and frames numbered from zero instead of by their timestep."""
     sequence = ["export", str(trained), "--format", "ply-sequence"]
@@ -314,62 +221,8 @@ def test_export_says_which_frames_there_are(
     assert low[0] > low[1] > low[2]
 
 
-def test_export_a_range_as_usd(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches timesteps outside the range, and a size that is not told before."""
-    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
-    out = tmp_path / "a.usdc"
-    assert (
-        main(
-            [
-                "export",
-                str(trained),
-                "--format",
-                "usd",
-                "--frames",
-                "1:3",
-                "--fps",
-                "50",
-                "--out",
-                str(out),
-            ]
-        )
-        == 0
-    )
-    assert "2 frames of" in capsys.readouterr().out
-    stage = usd.Stage.Open(str(out))
-    assert stage.GetTimeCodesPerSecond() == 50
-    assert stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("positions").GetTimeSamples() == [
-        1,
-        3,
-    ]
-
-
-@pytest.mark.parametrize(
-    ("format", "suffix", "magic"), [("gltf", ".glb", b"glTF"), ("spz", ".spz", b"\x1f\x8b")]
-)
-def test_export_one_frame(
-    trained: Path, tmp_path: Path, format: str, suffix: str, magic: bytes
-) -> None:
-    """Catches a format that the command cannot write, or writes for another frame than asked
-    for."""
-    files = [tmp_path / f"neutral{suffix}", tmp_path / f"frame{suffix}"]
-    for out, chosen in zip(files, ([], ["--timestep", "3"]), strict=True):
-        assert main(["export", str(trained), "--format", format, "--out", str(out), *chosen]) == 0
-    neutral, frame = (out.read_bytes() for out in files)
-    assert neutral.startswith(magic)
-    assert neutral != frame
-
-
 @pytest.mark.parametrize("format", ["ply-sequence", "web"])
-def test_export_to_a_full_disk(
-    trained: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    format: str,
-) -> None:
+def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format):
     """Catches a range that fills the disk."""
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
     out = tmp_path / ("o.html" if format == "web" else "o")
@@ -395,9 +248,7 @@ def test_run_of_a_flame_capture(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["eval", str(out), "--flame", str(elsewhere)]) == 0
 
 
-def test_eval_with_a_capture_that_has_moved(
-    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_with_a_capture_that_has_moved(trained, root, tmp_path, capsys):
     """Catches a run that cannot be evaluated where its capture lies elsewhere, and one measured on
     another capture."""
     run, moved = (
@@ -435,20 +286,13 @@ NONSENSE_OPTIONS = [
 @pytest.mark.parametrize(
     ("command", "option", "value"), NONSENSE_OPTIONS, ids=lambda text: ascii(text)[:20]
 )
-def test_option_values_without_meaning(
-    root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    command: str,
-    option: str,
-    value: str,
-) -> None:
+def test_option_values_without_meaning(root, tmp_path, capsys, command, option, value):
     """Catches a traceback from deep inside, a run that trains nothing, for ever or everything, a
     selection of nothing or everything, one of two budgets that is ignored, and a long sentence."""
     *others, name = option.split()
     out = [f"--out={tmp_path / 'run'}"] if name != "--out" else []
     with pytest.raises(SystemExit, match="2"):
-        main([command, str(root), *out, *others, f"{name}={value}"])
+        stga(command, root, *out, *others, f"{name}={value}")
     error = capsys.readouterr().err
     assert f"argument {name}: " in error
     assert len(error) < 3000
@@ -480,16 +324,8 @@ def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that the parser lost, and an extension without `development` whose parser
     needs it."""
     shipped = {
-        "train",
-        "refine",
-        "presets",
-        "render",
-        "eval",
-        "select",
-        "export",
-        "info",
-        "perform",
-    }
+        "train", "refine", "presets", "render", "eval", "select", "export", "info", "perform",
+    }  # fmt: skip
     shipped |= {"avatar", "batch", "drive", "extend", "relight", "track"}
     assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
     monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
@@ -511,13 +347,8 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
     asked for where none is needed."""
     flame, model = factory.write_flame_capture(tmp_path / "flame")
     exported = [
-        "export",
-        str(trained / "avatar.npz"),
-        "--format",
-        "ply",
-        "--out",
-        str(tmp_path / "a.ply"),
-    ]
+        "export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(tmp_path / "a.ply"),
+    ]  # fmt: skip
     for missing, arguments, says in (
         (
             "torch numba wgpu",
@@ -536,9 +367,7 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
     assert len(read_ply(tmp_path / "a.ply")) == len(read_avatar(trained / "avatar.npz").splats)
 
 
-def test_interruption_and_mistakes_have_their_codes(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
     """Catches a traceback after Ctrl-C, and an unexpected exception reported as the user's
     mistake."""
 
@@ -560,7 +389,7 @@ def test_interruption_and_mistakes_have_their_codes(
     assert "nested too deeply" in refused(capsys, "info", root)
     fails_with(RuntimeError("a bug"))
     with pytest.raises(RuntimeError, match="a bug"):
-        main(["info", str(root)])
+        stga("info", root)
 
 
 # In a process of its own
@@ -580,12 +409,7 @@ def test_as_a_module(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["{}", "[]", "null", "3", '{"capture": 5}', "{", None])
-def test_damaged_folder_of_the_open_head(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    content: str | None,
-) -> None:
+def test_damaged_folder_of_the_open_head(tmp_path, capsys, monkeypatch, content):
     """Catches a traceback for a folder in STGA_HEAD that is damaged, empty or missing."""
     if content is not None:
         (tmp_path / "head.json").write_text(content)
@@ -597,36 +421,17 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     """Catches a refinement that is put into the run's own folder, one that cannot be evaluated or
     refined again, and one that says nothing about what it gained."""
     runs = Path(shutil.copytree(trained, tmp_path / "anna"))
-    assert (
-        main(["refine", str(runs), "--region", "mouth", "--frames", "1-3", "--iterations", "6"])
-        == 0
-    )
+    assert stga("refine", runs, "--region mouth --frames 1-3 --iterations 6") == 0
     printed = capsys.readouterr().out
     assert "region: " in printed
     assert f"avatar: {tmp_path / 'anna_2' / 'avatar.npz'}" in printed
-    assert (
-        main(
-            [
-                "refine",
-                str(tmp_path / "anna_2"),
-                "--region",
-                "mouth",
-                "--iterations",
-                "3",
-                "--growth",
-                "0.5",
-            ]
-        )
-        == 0
-    )
+    assert stga("refine", tmp_path / "anna_2", "--region mouth --iterations 3 --growth 0.5") == 0
     assert read_checkpoint(tmp_path / "anna_3").iteration == 3
     assert main(["refine", str(tmp_path / "anna_3"), "--resume"]) == 0
     assert main(["eval", str(tmp_path / "anna_3")]) == 0
 
 
-def test_extend(
-    trained: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_extend(trained, root, tmp_path, capsys):
     """Catches an extended run that cannot be evaluated, rendered or extended again, and one that
     does not say what it learned and forgot."""
     runs, take = (

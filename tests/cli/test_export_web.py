@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture.factory import edit, write_flame_capture, write_mesh_capture
+from command_line import stga
 from export.web.web_data import read_web_data
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
@@ -29,20 +30,7 @@ def test_frames_cameras_and_selection_of_a_capture(avatar_file, tmp_path):
     capture = open_capture(tmp_path / "capture")
     first, last = capture.timesteps[1], capture.timesteps[-1]
     words = ["--capture", str(capture.root), "--frames", f"{first}:{last}", "--fps", "30"]
-    assert (
-        main(
-            [
-                "export",
-                str(avatar_file),
-                "--format",
-                "web",
-                *words,
-                "--out",
-                str(tmp_path / "a.stga"),
-            ]
-        )
-        == 0
-    )
+    assert stga("export", avatar_file, "--format web", *words, "--out", tmp_path / "a.stga") == 0
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     frames = len(capture.timesteps) - 1
     assert (header["title"], header["fps"]) == ("anna", 30)
@@ -55,14 +43,10 @@ def test_the_captures_own_rate(avatar_file, tmp_path):
     """Catches footage of 60 frames a second that plays 2.4 times too slowly."""
     edit(tmp_path / "capture/transforms_train.json", lambda document: document.update(fps=60))
     words = ["--capture", str(tmp_path / "capture"), "--out"]
-    assert (
-        main(["export", str(avatar_file), "--format", "web", *words, str(tmp_path / "a.stga")]) == 0
-    )
+    assert stga("export", avatar_file, "--format web", *words, tmp_path / "a.stga") == 0
     assert read_web_data((tmp_path / "a.stga").read_bytes())[0]["fps"] == 60
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
-    assert (
-        main(["export", str(avatar_file), "--format", "usd", *words, str(tmp_path / "a.usdc")]) == 0
-    )
+    assert stga("export", avatar_file, "--format usd", *words, tmp_path / "a.usdc") == 0
     assert usd.Stage.Open(str(tmp_path / "a.usdc")).GetTimeCodesPerSecond() == 60
 
 
@@ -70,21 +54,7 @@ def test_a_run_brings_its_capture(tmp_path):
     """Catches a run whose page lacks the motion, cameras or selection that it was trained with."""
     capture = open_capture(write_mesh_capture(tmp_path / "capture"))
     run = tmp_path / "anna"
-    assert (
-        main(
-            [
-                "train",
-                str(capture.root),
-                "--out",
-                str(run),
-                "--iterations",
-                "2",
-                "--schedule",
-                "paper",
-            ]
-        )
-        == 0
-    )
+    assert stga("train", capture.root, "--out", run, "--iterations 2 --schedule paper") == 0
     assert main(["export", str(run), "--format", "web", "--out", str(tmp_path / "a.stga")]) == 0
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert header["title"] == "anna"
@@ -97,10 +67,7 @@ def test_a_run_brings_its_capture(tmp_path):
 
 def test_an_avatar_alone_is_a_still(avatar_file, tmp_path):
     """Catches a page that cannot be made without a capture."""
-    assert (
-        main(["export", str(avatar_file), "--format", "web", "--out", str(tmp_path / "a.html")])
-        == 0
-    )
+    assert stga("export", avatar_file, "--format web --out", tmp_path / "a.html") == 0
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "<title>anna</title>" in text
     assert "{{" not in text.partition('<script type="module">')[0]
@@ -115,15 +82,9 @@ def test_what_is_left_of_flame_is_said(tmp_path, capsys):
     splats = lattice_splats(neutral, capture.faces, sh_degree=1, convention="stga")
     write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
     words = [
-        "export",
-        str(tmp_path / "anna.npz"),
-        "--format",
-        "web",
-        "--capture",
-        str(root),
-        "--flame",
+        "export", str(tmp_path / "anna.npz"), "--format", "web", "--capture", str(root), "--flame",
         str(model),
-    ]
+    ]  # fmt: skip
     assert main([*words, "--motion-only", "--out", str(tmp_path / "a.stga")]) == 0
     assert (
         "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence"
@@ -138,9 +99,7 @@ def test_what_is_left_of_flame_is_said(tmp_path, capsys):
 def test_mistakes_are_one_sentence(avatar_file, tmp_path, capsys):
     """Catches a traceback, a page under a name that no browser opens, and a range of frames that is
     ignored."""
-    assert (
-        main(["export", str(avatar_file), "--format", "web", "--out", str(tmp_path / "a.txt")]) == 2
-    )
+    assert stga("export", avatar_file, "--format web --out", tmp_path / "a.txt") == 2
     assert ".html" in capsys.readouterr().err
     assert not (tmp_path / "a.txt").exists()
     words = ["--frames", "1:2", "--out", str(tmp_path / "a.html")]

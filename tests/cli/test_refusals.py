@@ -19,46 +19,61 @@ REFUSALS = [
     ("info {root} --presets", "--presets: has no effect without --json"),
     ("export {run} --format gltf --frames 0:1 --out {o}",
      "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web"),
-    ("export {run} --format usd --timestep 1 --out {o}", "--timestep cannot be combined with --format usd"),
+    ("export {run} --format usd --timestep 1 --out {o}",
+     "--timestep cannot be combined with --format usd"),
     ("export {run} --format ply --motion-only --out {o}",
      "--motion-only cannot be combined with --format ply, only with web"),
-    ("export {run} --format usd --out {o}.usda", "o.usda: expected a name that ends in .usdc or .usdz"),
+    ("export {run} --format usd --out {o}.usda",
+     "o.usda: expected a name that ends in .usdc or .usdz"),
     ("refine {run}", "--region: is missing"),
     ("extend {run}", "CAPTURE: is missing"),
     # Options that another replaces, or that have no effect without another
     *((f"train {{root}} --out {{o}} --iterations 1 {options}", says) for options, says in (
-        ("--schedule paper --strategy gaussian-avatars", "--schedule paper: cannot be combined with --strategy "
+        ("--schedule paper --strategy gaussian-avatars",
+         "--schedule paper: cannot be combined with --strategy "
          "gaussian-avatars, which has settings of its own"),
         ("--schedule paper --preset draft", "--preset: cannot be combined with --schedule paper"),
-        ("--preset final --strategy gaussian-avatars", "--preset: cannot be combined with --strategy gaussian-avatars"),
-        ("--threshold 0.01", "--threshold: has no effect without --strategy selective, or --schedule paper"),
-        ("--threshold 0.01 --strategy global --schedule paper", "--threshold: has no effect without"))),
-    ("avatar {root} --model m.npz --out {o} --threshold 0.01", "--threshold: has no effect without --strategy"),
+        ("--preset final --strategy gaussian-avatars",
+         "--preset: cannot be combined with --strategy gaussian-avatars"),
+        ("--threshold 0.01",
+         "--threshold: has no effect without --strategy selective, or --schedule paper"),
+        ("--threshold 0.01 --strategy global --schedule paper",
+         "--threshold: has no effect without"))),
+    ("avatar {root} --model m.npz --out {o} --threshold 0.01",
+     "--threshold: has no effect without --strategy"),
     ("render {avatar} --video v.mp4 --capture {root} --principal-point opencv",
      "--principal-point: has no effect without --cameras"),
     ("export {avatar} --format ply --out {o}.ply --motion take.csv",
      "--motion: has no effect with --format ply without --timestep"),
     # A resumed run goes on as it began
-    *((f"train {{root}} --out {{run}} --resume {option}", f"{option.split()[0]}: this run began with")
+    *((f"train {{root}} --out {{run}} --resume {option}",
+     f"{option.split()[0]}: this run began with")
       for option in ("--stop-when-flat", "--target-psnr 30", "--preset final", "--seed 5")),
     *((f"{command} {{none}} {option} --resume",
-       f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined with --resume, which "
+       f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined with "
+       f"--resume, which "
        "continues the run in RUN as it began")
       for command, option in (
-        ("refine", "--region mouth"), ("refine", "--frames 1-3"), ("refine", "--growth 0.5"), ("refine", "--budget 1m"),
-        ("refine", "--out anna_2"), ("extend", "--iterations 9"), ("extend", "--seed 1"), ("extend", "smile"))),
+        ("refine", "--region mouth"), ("refine", "--frames 1-3"), ("refine", "--growth 0.5"),
+         ("refine", "--budget 1m"),
+        ("refine", "--out anna_2"), ("extend", "--iterations 9"), ("extend", "--seed 1"),
+         ("extend", "smile"))),
     ("refine {run} --resume", "does not continue another run"),
     # Captures that are missing, broken, or others
     ("train {none} --out {o} --iterations 3", "is not a folder"),
     *((f"{command} {{broken}}{options}", "transforms_val.json: is not valid JSON")
-      for command, options in (("train", " --out {o} --iterations 3"), ("info", ""), ("select", ""))),
+      for command,
+      options in (("train", " --out {o} --iterations 3"), ("info", ""), ("select", ""))),
     ("train {bare} --out {o} --iterations 3", "has no training views"),
     ("eval {moved} --split test", "has other images"),
     ("train {cameras5} --out {run} --resume",
      "was trained on {root} (3 cameras, 3 timesteps), but {cameras5} (5 cameras"),
-    ("render {avatar} --capture {coarse} --cameras {cameras} --out {o}", "{coarse}: its mesh has other triangles"),
-    ("export {run} --capture {coarse} --format ply-sequence --out {o}", "{coarse}: its mesh has other triangles"),
-    ("export {run} --format gaussian-avatars --out {o}", "needs the FLAME parameters of a FLAME capture"),
+    ("render {avatar} --capture {coarse} --cameras {cameras} --out {o}",
+     "{coarse}: its mesh has other triangles"),
+    ("export {run} --capture {coarse} --format ply-sequence --out {o}",
+     "{coarse}: its mesh has other triangles"),
+    ("export {run} --format gaussian-avatars --out {o}",
+     "needs the FLAME parameters of a FLAME capture"),
     # Runs and avatars that are missing, broken, or there already
     ("train {root} --out {run} --iterations 3", "already holds a run; give --resume"),
     ("refine {run} --region mouth --out {run}", "already holds a run"),
@@ -66,7 +81,8 @@ REFUSALS = [
     ("train {root} --out {file} --iterations 3", "cannot be written"),
     ("eval {avatar}", "avatar.npz"),
     ("eval {root}", "holds no run"),
-    *((f"render {{folder}}/{name} --capture {{root}} --cameras {{cameras}} --out {{o}}", f"{name}: ")
+    *((f"render {{folder}}/{name} --capture {{root}} --cameras {{cameras}} --out {{o}}",
+     f"{name}: ")
       for name in ("half.npz", "foreign.npz", "none.npz")),
     ("render {folder}/mesh.ply --cameras {cameras} --out {o}", "mesh.ply: "),
     ("render {folder}/none.ply --cameras {cameras} --out {o}", "none.ply: "),
@@ -85,9 +101,7 @@ REFUSALS = [
 
 
 @pytest.fixture(scope="session")
-def refusable(
-    root: Path, trained: Path, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
+def refusable(root, trained, tmp_path_factory):
     """What REFUSALS name, by name."""
     folder = tmp_path_factory.mktemp("refusals")
     names = {
@@ -134,9 +148,7 @@ def refusable(
 
 
 @pytest.mark.parametrize(("command", "says"), REFUSALS, ids=[command for command, _ in REFUSALS])
-def test_refusals(
-    refusable: dict[str, Path], capsys: pytest.CaptureFixture[str], command: str, says: str
-) -> None:
+def test_refusals(refusable, capsys, command, says):
     """Catches a traceback, an option that does nothing, talk of something else, and a command that
     fails but has made a folder, or overwritten a run or a recording."""
     before = {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()}

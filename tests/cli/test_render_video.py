@@ -67,9 +67,7 @@ def test_video_of_the_motion(parts: dict[str, Path], tmp_path: Path) -> None:
         assert errors[timestep] < 12  # colors at half the resolution: splats are a few pixels wide
 
 
-def test_a_range_of_frames(
-    parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_range_of_frames(parts, tmp_path, capsys):
     """Catches ranges that leave a frame to nobody, render it twice, or change it."""
     cameras = ["--cameras", parts["capture"] / "transforms_train.json"]
     names = {}
@@ -151,10 +149,7 @@ def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes(
-    parts: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    arguments: list[str], reason: str,
-) -> None:  # fmt: skip
+def test_mistakes(parts, tmp_path, monkeypatch, capsys, arguments, reason):
     """Catches a mistake that ends in a traceback, or in a file."""
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.iterdir())

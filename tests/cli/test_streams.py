@@ -25,13 +25,9 @@ def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     code."""
     script = f'stga() {{ {STGA} "$@"; }}\n{command}\nexit ${{PIPESTATUS[0]}}'
     return subprocess.run(
-        ["bash", "-c", script],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env={**os.environ, **environment},
-        timeout=120,
-    )
+        ["bash", "-c", script], capture_output=True, text=True, cwd=ROOT,
+        env={**os.environ, **environment}, timeout=120,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("command", ["info", "select", "presets --help"])
@@ -73,8 +69,10 @@ THREE = """
 import os, sys
 from stga_addon.cli.main import main
 capture, out = sys.argv[1:]
-train = ["train", capture, "--out", f"{out}/run", "--iterations", "2", "--strategy", "gaussian-avatars"]
-render = ["render", f"{out}/run", "--cameras", f"{capture}/transforms_val.json", "--out", f"{out}/pictures"]
+train = ["train", capture, "--out", f"{out}/run", "--iterations", "2", "--strategy",
+    "gaussian-avatars"]
+render = ["render", f"{out}/run", "--cameras", f"{capture}/transforms_val.json", "--out",
+    f"{out}/pictures"]
 codes = [main(arguments) for arguments in (train, render, ["info", "/none"])]
 null = os.stat(os.devnull)
 assert codes == [0, 0, 2] and all(os.path.samestat(os.fstat(number), null) for number in range(3))
@@ -97,16 +95,9 @@ def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path)
     than 130 after Ctrl-C."""
     out = tmp_path / "run"
     command = [
-        sys.executable,
-        "-m",
-        "stga_addon",
-        "train",
-        str(capture),
-        "--out",
-        str(out),
-        "--budget",
+        sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out), "--budget",
         "60s",
-    ]
+    ]  # fmt: skip
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import stga
 from flame.small_head import small_head, write_flame
 from PIL import Image
 
@@ -43,7 +44,8 @@ def files(tmp_path_factory) -> dict[str, Path]:
     camera = look_at(np.array([0.0, 0.0, 0.8]), np.zeros(3), 64, 64, 130.0)
     world = np.linalg.inv(np.vstack([camera.world_to_camera, [0, 0, 0, 1]])[:4])
     world[:, 1:3] *= -1
-    entry = {"file_path": "x.png", "timestep_index": 0, "camera_index": 0, "transform_matrix": world.tolist(),
+    entry = {"file_path": "x.png", "timestep_index": 0, "camera_index": 0,
+        "transform_matrix": world.tolist(),
              "fl_x": 130.0, "fl_y": 130.0, "cx": 32.0, "cy": 32.0, "w": 64, "h": 64}  # fmt: skip
     (folder / "cameras.json").write_text(json.dumps({"frames": [entry]}))
     return {name: folder / name for name in ("flame.npz", "a.npz", "take.csv", "cameras.json")}
@@ -54,15 +56,7 @@ def test_convert_there_and_back(files, tmp_path, capsys):
     sides, and a strength that changes no CSV, or a motion twice."""
     out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
     assert (
-        main(
-            [
-                "drive",
-                *map(
-                    str,
-                    (files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out),
-                ),
-            ]
-        )
+        stga("drive", files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out)
         == 0
     )
     model = small_head(0)
@@ -105,13 +99,8 @@ def test_the_bundled_heads_motion_needs_no_model(files, tmp_path):
 def test_render_and_export_a_performance(files, tmp_path, capsys):
     """Catches a command that takes FLAME motions alone, or options that change nothing."""
     base = [
-        "render",
-        files["a.npz"],
-        "--cameras",
-        files["cameras.json"],
-        "--motion",
-        files["take.csv"],
-    ]
+        "render", files["a.npz"], "--cameras", files["cameras.json"], "--motion", files["take.csv"],
+    ]  # fmt: skip
     base += ["--flame", files["flame.npz"], "--gain", "head=0", "--device", "cpu", "--out"]
     assert main([str(a) for a in [*base, tmp_path / "full"]]) == 0
     assert main([str(a) for a in [*base, tmp_path / "less", "--gain", "jaw=0.2"]]) == 0
@@ -123,15 +112,9 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
     assert np.abs(full[0] - less[0]).max() <= 1
     assert np.abs(full[9] - full[0]).sum() > 2 * np.abs(less[9] - less[0]).sum() > 0
     ply = [
-        files["a.npz"],
-        "--format",
-        "ply",
-        "--timestep",
-        9,
-        "--motion",
-        files["take.csv"],
+        files["a.npz"], "--format", "ply", "--timestep", 9, "--motion", files["take.csv"],
         "--flame",
-    ]
+    ]  # fmt: skip
     assert main(["export", *map(str, [*ply, files["flame.npz"], "--out", tmp_path / "a.ply"])]) == 0
     assert (tmp_path / "a.ply").stat().st_size > 1000
     assert main([str(a) for a in [*base, tmp_path / "x", "--stay-trained"]]) == 2

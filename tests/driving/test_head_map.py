@@ -77,7 +77,8 @@ def test_points_lie_where_the_masks_are(demo):
     for point, mask in ((NOSE_TIP, "nose"), (UPPER_LIP, "lips"), (LOWER_LIP, "lips")):
         assert np.isin(corners[point], model.masks[mask]).any(), mask
     near_eyes = [np.linalg.norm(at[p] - model.v_template[model.masks[m]], axis=1).min()
-                 for p, m in ((LEFT_EYE, "left_eye_region"), (RIGHT_EYE, "right_eye_region"))]  # fmt: skip
+                 for p, m in ((LEFT_EYE, "left_eye_region"),
+                     (RIGHT_EYE, "right_eye_region"))]  # fmt: skip
     assert max(near_eyes) < 0.006
     assert at[LEFT_EYE, 0] > 0.02 and at[RIGHT_EYE, 0] < -0.02  # noqa: PT018
     assert at[CHIN, 1] < at[LOWER_LIP, 1] < at[NOSE_TIP, 1]

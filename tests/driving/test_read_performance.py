@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,9 +30,7 @@ RNG = np.random.default_rng(0)
 WEIGHTS = RNG.random((6, 52)).round(4)
 
 
-def write_csv(
-    path: Path, codes: list[str], weights: np.ndarray, header: list[str] = HEADER
-) -> Path:
+def write_csv(path, codes, weights, header=HEADER):
     """A Live Link Face file; head rotation is (0.1, 0.2, 0.3) in each row."""
     values = {
         **dict(zip(PASCAL, weights.T, strict=True)),
@@ -115,20 +112,16 @@ def test_every_json_form_and_audio2face_csv(tmp_path):
     ]
     documents = {
         "audio2face": {
-            "exportFps": 25.0,
-            "numPoses": 52,
-            "numFrames": 6,
-            "facsNames": names,
+            "exportFps": 25.0, "numPoses": 52, "numFrames": 6, "facsNames": names,
             "weightMat": rows,
         },
         "lam": {
-            "names": names,
-            "metadata": {"fps": 25.0},
+            "names": names, "metadata": {"fps": 25.0},
             "frames": [{"weights": row, "time": n / 25} for n, row in enumerate(rows)],
         },
         "mediapipe": {"fps": 25, "frames": mediapipe},
         "plain": {"fps": 25, "frames": [dict(zip(names, row, strict=True)) for row in rows]},
-    }
+    }  # fmt: skip
     for name, document in documents.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(document))
         found = read_performance(tmp_path / f"{name}.json")

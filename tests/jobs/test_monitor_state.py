@@ -56,9 +56,7 @@ def after(*events: Event, state: RequestState = TRAINING) -> tuple[RequestState,
     return state, list(effects)
 
 
-def status(
-    state: WorkerState, preview: int = 0, folder: Path = JOB, error: str = "", **wanted: bool
-) -> StatusRead:
+def status(state, preview=0, folder=JOB, error="", **wanted):
     """A status that was read; preview: stamp of the preview file, 0: there is none."""
     files = RunFiles(preview=(preview, 1) if preview else None)
     return StatusRead(folder, WorkerSnapshot(state, WorkerStatus(error=error)), files, **wanted)
@@ -137,7 +135,7 @@ def test_dismiss(kind):
     assert effects == [RemoveFiles(JOB), *stored, Redraw()]
 
 
-@pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
+@pytest.mark.parametrize("kind", [Kind.TRAINING, Kind.TRACKING, *TRANSIENT])
 def test_a_result_that_cannot_be_shown(kind):
     """Catches a failure that nobody sees, and one that is tried again for ever."""
     state, effects = after(
@@ -145,7 +143,7 @@ def test_a_result_that_cannot_be_shown(kind):
     )
     assert (state.error, state.interval_s, state.is_running) == ("no head", None, False)
     assert PushUndo() not in effects
-    done = Store(RUN, True) if kind == Kind.TRACKING else RemoveFiles(JOB)
+    done = RemoveFiles(JOB) if kind in TRANSIENT else Store(RUN, True)
     assert done in effects
 
 
@@ -203,12 +201,6 @@ def test_every_request_of_blender_has_a_kind():
 
 
 # Trainings
-
-
-def test_start_is_stored_and_monitored():
-    """Catches a training that the .blend file forgets, or that keeps the state of the one
-    before."""
-    assert after(START)[1] == [Store(RUN, False), ReadCurve(RUN), Redraw()]
 
 
 def test_each_preview_is_loaded_once():
@@ -269,27 +261,6 @@ def test_result_waits_for_the_preview_that_is_being_built():
     assert after(SceneFree(), state=state)[1] == [Show(PREVIEW)]
     _, effects = after(Shown(undoable=True), status(WorkerState.FINISHED, preview=1), state=state)
     assert loads(effects) == [AVATAR]
-
-
-def test_avatar_that_cannot_be_shown_is_reported():
-    """Catches a failure that nobody sees, and one that is tried again for ever."""
-    state, effects = after(START, status(WorkerState.FINISHED), Failed("no head"))
-    assert (state.error, state.result_shown, state.interval_s) == ("no head", True, None)
-    assert effects == [Store(RUN, True), Redraw()]
-    state, _ = after(START, status(WorkerState.WORKING, preview=1), Failed("no head"))
-    assert (state.error, state.result_shown, state.interval_s) == (
-        "no head",
-        False,
-        CHECK_INTERVAL_S,
-    )
-
-
-@pytest.mark.parametrize("end", [WorkerState.FAILED, WorkerState.LOST, WorkerState.NONE])
-def test_failure_shows_no_avatar(end):
-    """Catches an avatar that is shown of a training that failed."""
-    state, effects = after(START, status(WorkerState.WORKING), status(end))
-    assert effects == [Redraw()]
-    assert not state.result_shown
 
 
 def test_undo_does_not_lose_the_request():
@@ -357,20 +328,6 @@ def test_unexpected_error_stops_until_the_next_start_or_check():
     for restart in (START, status(WorkerState.WORKING)):
         restarted, _ = after(restart, status(WorkerState.WORKING), state=state)
         assert (restarted.interval_s, restarted.error) == (CHECK_INTERVAL_S, "")
-
-
-def test_training_that_ends_while_a_preview_is_shown():
-    """Catches checks that end with the worker, so that its last avatar never reaches the scene."""
-    state, _ = after(
-        START, status(WorkerState.WORKING, preview=1), status(WorkerState.CANCELLED, preview=1)
-    )
-    state, _ = after(Shown(), state=state)
-    assert state.interval_s == CHECK_INTERVAL_S
-    state, effects = after(status(WorkerState.CANCELLED, preview=1), state=state)
-    assert loads(effects) == [AVATAR]
-    state, _ = after(Shown(), state=state)
-    assert state.result_shown
-    assert state.interval_s is None
 
 
 # An avatar from footage

@@ -2,7 +2,6 @@
 sentence."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -123,9 +122,7 @@ def test_damaged_meshes(folder: Path, arrays: dict[str, np.ndarray], expected: s
         ({"motion": {"pose": np.zeros((1, 2))}}, r"played: pose has shape \(1, 2\)"),
     ],
 )
-def test_what_a_head_cannot_have_played(
-    folder: Path, changes: dict[str, Any], expected: str
-) -> None:
+def test_what_a_head_cannot_have_played(folder, changes, expected):
     """Catches a traceback for arrays of another head in a request, or a page whose parts are of
     different frames."""
     root, model = write_flame_capture(folder / "flame")
@@ -137,9 +134,7 @@ def test_what_a_head_cannot_have_played(
         export_played(folder, Played(meshes, **changes), root, model)
 
 
-def export_played(
-    folder: Path, played: Played, root: Path | None = None, model: Path | None = None
-) -> None:
+def export_played(folder, played, root=None, model=None):
     """Export a page of an avatar that moves as `played`."""
     root = root or folder / "capture"
     capture = open_capture(root, model)

@@ -12,12 +12,9 @@ from stga_addon.worker import training_python
 from stga_addon.worker.training_python import PYTHON_VARIABLE, REQUIREMENTS, find_training_python
 
 FOUND = {
-    "python": "3.11.7",
-    "versions": dict.fromkeys(REQUIREMENTS, "1.0"),
-    "failures": {},
-    "device": "CPU with 4 threads",
-    "adapters": ["Card (Vulkan)"],
-}
+    "python": "3.11.7", "versions": dict.fromkeys(REQUIREMENTS, "1.0"), "failures": {},
+    "device": "CPU with 4 threads", "adapters": ["Card (Vulkan)"],
+}  # fmt: skip
 
 
 def check(python: object, timeout_s: float = 120.0):

@@ -88,9 +88,7 @@ def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_
     assert blender_command() == ["blender"]
 
 
-def test_what_went_wrong_is_a_sentence(
-    shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_went_wrong_is_a_sentence(shot, tmp_path, monkeypatch):
     """Catches a film that counts as finished although frames are missing, and a Blender that is not
     there."""
     monkeypatch.setenv("FAILS", "10")
@@ -107,9 +105,7 @@ def test_what_went_wrong_is_a_sentence(
         perform(shot, ignore, lambda line: None)
 
 
-def test_cancelling_ends_blender(
-    shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
     """Catches a Blender that goes on after Ctrl-C, and pictures of which only a part is written."""
     monkeypatch.setenv("PAUSE", "0.3")
 
@@ -127,9 +123,7 @@ def test_cancelling_ends_blender(
 @pytest.mark.skipif(
     not sys.platform.startswith("linux"), reason="Linux ends a process with the one that started it"
 )
-def test_blender_ends_with_a_killed_worker(
-    shot: RenderBlend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blender_ends_with_a_killed_worker(shot, tmp_path, monkeypatch):
     """Catches two Blenders that render the same frames after a worker was killed, and half a
     picture among the rest."""
     monkeypatch.setenv("PAUSE", "0.5")

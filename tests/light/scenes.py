@@ -24,9 +24,7 @@ def ball_and_plate(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
     return np.array(both.vertices), np.array(both.faces, np.int32)
 
 
-def blocked(
-    points: np.ndarray, direction: np.ndarray, vertices: np.ndarray, faces: np.ndarray
-) -> np.ndarray:
+def blocked(points, direction, vertices, faces):
     """(N,) bool: whether a ray from each point in a direction meets a triangle (Möller and
     Trumbore), float64."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -45,9 +43,7 @@ def blocked(
     return found
 
 
-def lit_avatar(
-    albedo: tuple[float, float, float] = (0.5, 0.3, 0.2), radiance: float = 0.5, degree: int = 0
-) -> Avatar:
+def lit_avatar(albedo=(0.5, 0.3, 0.2), radiance=0.5, degree=0):
     """The ball and plate as an avatar: a splat in the middle of each triangle, recorded in even
     light; its colors are those of a surface of this albedo without highlights."""
     vertices, faces = ball_and_plate()
@@ -66,10 +62,7 @@ def lit_avatar(
     splats = Splats(
         xyz=np.zeros((count, 3), np.float32),
         rotation=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scale=np.full((count, 3), -6, np.float32),
-        opacity=np.full(count, 3, np.float32),
-        sh=sh,
-        face=np.arange(count, dtype=np.int32),
-        unbound=np.zeros(count, bool),
-    )
+        log_scale=np.full((count, 3), -6, np.float32), opacity=np.full(count, 3, np.float32), sh=sh,
+        face=np.arange(count, dtype=np.int32), unbound=np.zeros(count, bool),
+    )  # fmt: skip
     return Avatar(splats, "stga", vertices.astype(np.float32), faces, light=avatar_light)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture import factory
+from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar, write_avatar
@@ -38,27 +39,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert (
-        main(["train", str(root), "--out", str(out), "--iterations", "10", "--schedule", "paper"])
-        == 0
-    )
+    assert stga("train", root, "--out", out, "--iterations 10 --schedule paper") == 0
     return out
 
 
 def rendered(run: Path, root: Path, out: Path, *options: str) -> np.ndarray:
     assert (
-        main(
-            [
-                "render",
-                str(run),
-                "--cameras",
-                str(root / "transforms_val.json"),
-                "--out",
-                str(out),
-                *options,
-            ]
-        )
-        == 0
+        stga("render", run, "--cameras", root / "transforms_val.json", "--out", out, *options) == 0
     )
     with Image.open(sorted(out.iterdir())[0]) as image:
         return np.asarray(image).astype(int)
@@ -80,9 +67,7 @@ def test_a_run_ends_with_its_light(run: Path, capsys: pytest.CaptureFixture[str]
     assert "stga relight" in capsys.readouterr().out
 
 
-def test_a_training_that_is_to_leave_light_as_it_is(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_training_that_is_to_leave_light_as_it_is(root, tmp_path, capsys):
     """Catches an effect that cannot be switched off, and a plan that does not name it."""
     assert main(["info", str(root), "--effect", "relight=off"]) == 0
     assert "lights of a scene" in capsys.readouterr().out
@@ -107,9 +92,7 @@ def test_a_gray_card_sets_the_level(run: Path, tmp_path: Path, root: Path) -> No
     np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)
 
 
-def test_a_running_trainings_avatar_is_kept(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_running_trainings_avatar_is_kept(run, tmp_path, monkeypatch, capsys):
     """Catches a light that is written into an older avatar than the one which a training saved
     meanwhile."""
     copy = tmp_path / "run"
@@ -175,9 +158,7 @@ def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
     assert brighter[: len(brighter) // 2 - 5].sum() < 0 < brighter[len(brighter) // 2 + 5 :].sum()
 
 
-def test_render_refuses(
-    run: Path, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_render_refuses(run, root, tmp_path, capsys):
     """Catches a traceback for an avatar without light, and options without effect."""
     plain = tmp_path / "plain.npz"
     write_avatar(plain, replace(read_avatar(run / "avatar.npz"), light=None))

@@ -95,8 +95,10 @@ def test_lights_of_a_text_file(tmp_path):
     """Catches defaults, strength and color that are lost, and mistakes without a sentence."""
     path = tmp_path / "lights.toml"
     path.write_text(
-        'world = [0.1, 0.2, 0.3]\nexposure = 1.5\n[[lights]]\nkind = "sun"\nstrength = 3\ncolor = [1, 0.5, 0.25]\n'
-        'direction = [0, -2, 0]\n[[lights]]\nkind = "area"\nstrength = 10\nposition = [1, 1, 1]\nsize = [0.2, 0.4]\n'
+        'world = [0.1, 0.2, 0.3]\nexposure = 1.5\n[[lights]]\nkind = "sun"\nstrength = 3\ncolor = '
+        "[1, 0.5, 0.25]\n"
+        'direction = [0, -2, 0]\n[[lights]]\nkind = "area"\nstrength = 10\nposition = [1, 1, '
+        "1]\nsize = [0.2, 0.4]\n"
     )
     lighting = read_lighting(path)
     np.testing.assert_allclose(lighting.lights[0].color, [3, 1.5, 0.75])
@@ -107,7 +109,8 @@ def test_lights_of_a_text_file(tmp_path):
     np.testing.assert_allclose(around.lights[1].position, [1, 1, -1], atol=1e-9)
     for text, message in (
         ("lights = 3", "lights"),
-        ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"), ("sky = 1", "sky"), ("world = ", "TOML"),
+        ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"), ("sky = 1", "sky"),
+         ("world = ", "TOML"),
         ('[[lights]]\nkind = "sun"\nstrength = -1', "strength"), ("roughness = 0", "roughness"),
     ):  # fmt: skip
         path.write_text(text)

@@ -1,6 +1,5 @@
 """The estimate of a capture's light, from colors made with a known one."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,15 +27,13 @@ def received() -> np.ndarray:
     return np.asarray(transfer_of(vertices, faces, 96)[0][faces].mean(1), np.float64)
 
 
-def recorded(
-    received: np.ndarray, light: np.ndarray, turns: Sequence[np.ndarray] = (np.eye(3),)
-) -> tuple[np.ndarray, np.ndarray]:
+def recorded(received, light, turns=None):
     """Colors (T, F, 3) of skin with spots of other colors and highlights on some triangles, and
     transfer (T, F, 9)."""
     rng = np.random.default_rng(1)
     albedo = SKIN * rng.uniform(0.9, 1.1, (len(received), 1))
     albedo[rng.random(len(received)) < 0.15] *= 0.2
-    posed = np.stack([received @ rotated(np.eye(9), turn) for turn in turns])
+    posed = np.stack([received @ rotated(np.eye(9), turn) for turn in turns or [np.eye(3)]])
     colors = albedo / np.pi * (posed @ light)
     colors *= rng.normal(1, 0.02, colors.shape)
     colors[:, rng.random(len(received)) < 0.05] += 0.3

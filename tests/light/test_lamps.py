@@ -27,14 +27,10 @@ CASES = {
     ),
     "area": TILTED,
     "disk": Light(
-        "area",
-        np.ones(3) * 40,
-        (0, 0.2, 0.8),
-        direction=(0, 0, -1),
-        size=(0.5, 0.5),
+        "area", np.ones(3) * 40, (0, 0.2, 0.8), direction=(0, 0, -1), size=(0.5, 0.5),
         shape="ellipse",
     ),
-}
+}  # fmt: skip
 
 
 def irradiance(light: Light) -> float:
@@ -66,7 +62,8 @@ scene.world = bpy.data.worlds.new("w")
 scene.world.use_nodes = True
 scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0
 mesh = bpy.data.meshes.new("plane")
-mesh.from_pydata([(-.01, -.01, 0), (.01, -.01, 0), (.01, .01, 0), (-.01, .01, 0)], [], [(0, 1, 2, 3)])
+mesh.from_pydata([(-.01, -.01, 0), (.01, -.01, 0), (.01, .01, 0), (-.01, .01, 0)], [],
+    [(0, 1, 2, 3)])
 scene.collection.objects.link(bpy.data.objects.new("plane", mesh))
 material = bpy.data.materials.new("white")
 material.use_nodes = True

@@ -24,12 +24,7 @@ def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[1].split()[1:6] == ["3000", "iterations", "about", "3", "s"]
 
 
-def test_what_is_timed_is_what_will_train(
-    toy_root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_timed_is_what_will_train(toy_root, tmp_path, capsys, monkeypatch):
     """Catches a GPU that is given the minutes of the CPU."""
     timed: list[str] = []
     monkeypatch.setattr(
@@ -45,12 +40,7 @@ def test_what_is_timed_is_what_will_train(
     assert timed == ["gpu:Card"] * 6
 
 
-def test_a_preset_brings_its_iterations(
-    toy_root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_preset_brings_its_iterations(toy_root, tmp_path, capsys, monkeypatch):
     """Catches a preset that changes nothing, and one that cannot be overruled."""
     train = ["train", str(toy_root), "--out"]
     assert main([*train, str(tmp_path / "preset"), "--preset", "draft", "--target-psnr", "5"]) == 0
@@ -60,11 +50,8 @@ def test_a_preset_brings_its_iterations(
     assert "held-out views: " in out
     settings = read_run(tmp_path / "preset").settings
     assert (settings.preset, settings.iterations, settings.lattice, settings.target_psnr) == (
-        "draft",
-        800,
-        1,
-        5.0,
-    )
+        "draft", 800, 1, 5.0,
+    )  # fmt: skip
     assert main([*train, str(tmp_path / "counted"), "--preset", "final", "--iterations", "3"]) == 0
     settings = read_run(tmp_path / "counted").settings
     assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)

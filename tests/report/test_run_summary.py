@@ -19,23 +19,19 @@ from stga_addon.training.settings import make_settings
 def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
     return [
         {
-            "seconds": 10.0 * n,
-            "psnr": psnr,
-            "ssim": 0.9,
-            "detail_difference": 1 / psnr,
-            "iteration": n,
-            "evaluation_s": 0.2,
-            **more,
+            "seconds": 10.0 * n, "psnr": psnr, "ssim": 0.9, "detail_difference": 1 / psnr,
+            "iteration": n, "evaluation_s": 0.2, **more,
         }
         for n, psnr in enumerate(values, 1)
-    ]
+    ]  # fmt: skip
 
 
 def test_summary_of_a_run() -> None:
     """Catches the last evaluation given for the best one, and figures that were not measured."""
     lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
     assert lines[0] == (
-        "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference 0.0323, after 20 s"
+        "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference "
+        "0.0323, after 20 s"
         " (the saved avatar)"
     )
     assert (
@@ -103,9 +99,7 @@ def test_report_of_a_finished_run(toy: Capture, tmp_path: Path) -> None:
     assert (tmp_path / CURVE).stat().st_size > 1000
 
 
-def test_the_reason_for_no_curve(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_reason_for_no_curve(toy, tmp_path, monkeypatch):
     """Catches a missing library blamed where there was nothing to draw, and the other way round."""
     run = Run(toy.root, None, "vhap", make_settings(iterations=3, hull_points=False, lattice=0))
     train(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)

@@ -32,7 +32,6 @@ from stga_addon.worker.status import (
     WorkerSnapshot,
     WorkerState,
     WorkerStatus,
-    derive_state,
     failure_report,
     inspect_worker,
     log_lines,
@@ -55,7 +54,8 @@ def main():
     with status_writer(Path(sys.argv[1])) as writer:
         print("a line of the log", flush=True)
         for n in range(2000):
-            if writer.update(n / 2000, "counting", "on time", lambda: {"n": n, "nothing": float("nan")}):
+            if writer.update(n / 2000, "counting", "on time",
+                lambda: {"n": n, "nothing": float("nan")}):
                 return
             if sys.argv[2] == "sentence": raise StgaError("capture: is not a folder")
             if sys.argv[2] == "bug": raise ValueError("a bug\\nof two lines")
@@ -97,33 +97,6 @@ def wait(condition: Callable[[], bool], seconds: float = 20.0) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize(
-    ("state", "alive", "cancel_requested", "started", "expected"),
-    [
-        (None, False, False, False, WorkerState.NONE),
-        (None, False, True, False, WorkerState.NONE),
-        (None, True, False, True, WorkerState.STARTING),
-        (None, True, True, True, WorkerState.CANCELLING),
-        (None, False, False, True, WorkerState.LOST),
-        (WorkerState.WORKING, True, False, True, WorkerState.WORKING),
-        (WorkerState.WORKING, True, True, True, WorkerState.CANCELLING),
-        (WorkerState.WORKING, False, False, True, WorkerState.LOST),
-        (WorkerState.WORKING, False, True, True, WorkerState.LOST),
-        *[
-            (end, alive, cancel_requested, True, end)
-            for end in (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
-            for alive in (False, True)
-            for cancel_requested in (False, True)
-        ],
-    ],
-)
-def test_state_is_derived(state, alive, cancel_requested, started, expected):
-    """Catches a living worker reported as dead, or one that wrote its final status reported as
-    alive."""
-    status = None if state is None else WorkerStatus(state)
-    assert derive_state(status, alive, cancel_requested, started) == expected
-
-
 def test_worker_is_cancelled(start):
     """Catches figures that do not arrive, a cancel request that is ignored, and a second worker in
     the folder."""
@@ -156,13 +129,6 @@ def test_worker_is_cancelled(start):
     remove_status_folder(folder)
     assert not folder.exists()
     assert inspect_worker(folder) == WorkerSnapshot()
-
-
-def test_worker_finishes(start):
-    """Catches a finished worker reported as lost."""
-    folder, process = start("done")
-    assert process.wait(20) == 0
-    assert inspect_worker(folder, process).state == WorkerState.FINISHED
 
 
 def test_user_error_is_a_sentence(start):
@@ -288,21 +254,11 @@ def test_symbolic_links_are_not_followed(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "{",
-        "[]",
-        "null",
-        '{"state": "dancing"}',
-        '{"state": 3}',
-        '{"progress": "half"}',
-        '{"progress": NaN}',
-        '{"progress": 2}',
-        '{"error": ["a"]}',
-        '{"figures": []}',
-        '{"figures": {"n": "many"}}',
-        '{"surprise": 1}',
+        "", "{", "[]", "null", '{"state": "dancing"}', '{"state": 3}', '{"progress": "half"}',
+        '{"progress": NaN}', '{"progress": 2}', '{"error": ["a"]}', '{"figures": []}',
+        '{"figures": {"n": "many"}}', '{"surprise": 1}',
     ],
-)
+)  # fmt: skip
 def test_damaged_status_is_ignored(tmp_path, text):
     """Catches an exception in Blender's timer for a truncated or foreign status.json."""
     (tmp_path / STATUS_FILE).write_text(text)

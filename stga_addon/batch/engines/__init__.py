@@ -7,19 +7,14 @@ from ...errors import StgaError
 from ..plan import Engine
 
 ENGINES = {
-    "local": (
-        "LocalEngine",
-        "this machine, as many jobs at once as its processors and memory allow",
-    ),
+    "local": ("LocalEngine", "this machine, as many jobs as its processors and memory allow"),
     "ray": ("RayEngine", "a Ray cluster at --address, or one started here"),
     "slurm": ("SlurmEngine", "a SLURM cluster, as arrays of sbatch"),
 }
-"""Name on the command line, which is the file's -> class, and what it is, for the help."""
 
 
 def make_engine(name: str, address: str = "") -> Engine:
-    """Raises StgaError where the engine is not there, and for an address that is not of a Ray
-    cluster."""
+    """Raises StgaError where the engine is not there; an address is that of a Ray cluster."""
     if address and name != "ray":
         raise StgaError(f"--address: is that of a Ray cluster; expected --engine ray, got {name}")
     make: Any = getattr(import_module(f".{name}", __package__), ENGINES[name][0])

@@ -13,12 +13,9 @@ from ...worker.launch import start_worker
 from ...worker.status import inspect_worker
 from ..plan import Ended, Job, training_python
 
-MEMORY_SHARE = 0.9
-"""Share of the memory that is free at the start that workers may use."""
-GPUS = 1
-"""Jobs at once that need a GPU to themselves."""
-IS_WINDOWS = os.name == "nt"
-"""There, a kill is an exit status like others: 1 by the task manager."""
+MEMORY_SHARE = 0.9  # Share of the memory that is free at the start that workers may use
+GPUS = 1  # Jobs at once that need a GPU to themselves
+IS_WINDOWS = os.name == "nt"  # There, a kill is an exit status like others: 1 by the task manager
 
 
 class LocalEngine:
@@ -41,18 +38,14 @@ class LocalEngine:
         self._jobs: dict[str, tuple[Job, subprocess.Popen[bytes] | None]] = {}
 
     def has_room(self, job: Job) -> bool:
-        """Whether it fits beside what is running; a job that is larger than the machine runs
-        alone."""
+        """Whether it fits beside what is running; a job larger than the machine runs alone."""
         if not self._jobs:
             return True
         wanted = [job.resources, *(other.resources for other, _ in self._jobs.values())]
         threads = sum(resources.threads or self._cores for resources in wanted)
         memory = sum(resources.memory_gb for resources in wanted)
-        return (
-            threads <= self._cores
-            and memory <= self._memory_gb
-            and sum(r.gpu for r in wanted) <= GPUS
-        )
+        fits = threads <= self._cores and memory <= self._memory_gb
+        return fits and sum(resources.gpu for resources in wanted) <= GPUS
 
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
@@ -75,7 +68,10 @@ class LocalEngine:
             snapshot = inspect_worker(job.request_folder, process)
             if not snapshot.state.is_alive:
                 del self._jobs[name]
-                found[name] = Ended(snapshot, process is None or _is_kill(process.returncode))
+                # killed, unless it is the status of a mistake (2) or of a bug (1)
+                code = None if process is None else process.returncode
+                is_lost = not code or code < 0 or (IS_WINDOWS and code != 2)
+                found[name] = Ended(snapshot, is_lost)
         return found
 
     def withdraw(self) -> Sequence[str]:
@@ -85,19 +81,11 @@ class LocalEngine:
         """Workers go on; nothing is held."""
 
 
-def _is_kill(code: int | None) -> bool:
-    """Whether an exit status, of a worker without a final status, is that of a kill; a mistake's is
-    2, a bug's 1."""
-    return not code or code < 0 or (IS_WINDOWS and code != 2)
-
-
 def free_memory_gb() -> float:
     """Memory that is available, in GB; infinite where the system does not say (Windows, macOS)."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
         return math.inf
-    return next(
-        (int(line.split()[1]) * 1024 / 1e9 for line in lines if line.startswith("MemAvailable:")),
-        math.inf,
-    )
+    found = (line.split()[1] for line in lines if line.startswith("MemAvailable:"))
+    return float(next(found, "inf")) * 1024 / 1e9

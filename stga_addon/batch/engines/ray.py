@@ -19,10 +19,8 @@ from ...worker.status import LOG_FILE, inspect_worker, read_status
 from ...worker.training_python import PYTHON_VARIABLE
 from ..plan import Ended, Job, job_command
 
-MAX_WAITING = 1000
-"""Tasks that are submitted at once: more wait here, not in Ray's memory."""
-NODE_RETRIES = 5
-"""How often Ray begins a task again elsewhere whose machine has gone."""
+MAX_WAITING = 1000  # Tasks that are submitted at once: more wait here, not in Ray's memory
+NODE_RETRIES = 5  # How often Ray begins a task again elsewhere whose machine has gone
 TOKEN_MODE, TOKEN = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN"
 """Environment variables by which only who has the token may use a cluster (Ray 2.52)."""
 
@@ -34,14 +32,11 @@ class RayEngine:
     interval_s = 0.2
 
     def __init__(self, address: str) -> None:
-        """Use the cluster at an address; "": one that is started here and ends with the batch.
-
-        Raises StgaError where Ray is not installed, or the cluster cannot be reached.
-        """
+        """Use the cluster at an address; "": one that is started here. Raises StgaError where Ray
+        is not installed, or the cluster not reached."""
         if find_spec("ray") is None:
-            raise StgaError(
-                "--engine ray: the package ray is not installed (it is the extra `ray` of stga-addon)"
-            )
+            problem = "the package ray is not installed (it is the extra `ray` of stga-addon)"
+            raise StgaError(f"--engine ray: {problem}")
         # other users of this machine cannot submit to it
         if not address and TOKEN_MODE not in os.environ:
             os.environ.update({TOKEN_MODE: "token", TOKEN: secrets.token_hex(32)})
@@ -56,9 +51,8 @@ class RayEngine:
                 address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own
             )
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-            raise StgaError(
-                f"--address {address or 'local'}: Ray cannot be reached ({error})"
-            ) from error
+            problem = f"Ray cannot be reached ({error})"
+            raise StgaError(f"--address {address or 'local'}: {problem}") from error
         self._ray = ray
         self._task = ray.remote(max_retries=NODE_RETRIES)(_task(PYTHON_VARIABLE))
         self._adopted: dict[str, Job] = {}
@@ -70,11 +64,8 @@ class RayEngine:
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
             needs = job.resources
-            options = {
-                "num_cpus": needs.threads or 1,
-                "num_gpus": int(needs.gpu),
-                "memory": needs.memory_gb * 1e9,
-            }
+            memory, gpus = needs.memory_gb * 1e9, int(needs.gpu)
+            options = {"num_cpus": needs.threads or 1, "num_gpus": gpus, "memory": memory}
             task = self._task.options(name=job.name, **options)
             log = str(job.request_folder / LOG_FILE)
             self._jobs[task.remote(job_command(job), str(PACKAGES_FOLDER), log)] = job
@@ -83,8 +74,7 @@ class RayEngine:
         self._adopted[job.name] = job
 
     def running(self) -> Mapping[str, str]:
-        """The jobs that have written a status: Ray does not tell cheaply which tasks wait for a
-        machine."""
+        """The jobs that have written a status; Ray does not tell cheaply which tasks wait."""
         jobs = [*self._jobs.values(), *self._adopted.values()]
         begun = [job for job in jobs if read_status(job.request_folder) is not None]
         return dict.fromkeys((job.name for job in begun), "")
@@ -129,13 +119,11 @@ class RayEngine:
 
 
 def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
-    """The function that Ray carries out. It is sent to the machine as it is, which need not have
-    this package in the Python that Ray runs in: it uses nothing from outside itself."""
+    """What Ray carries out: sent as it is to machines without this package, it uses only itself."""
 
     def run_command(command: list[str], packages: str, log: str) -> int:
-        """Run a command with its output in a log; returns its exit code. On Linux it ends with
-        Ray's worker, so that a node that Ray has given up does not go on beside the one that takes
-        over."""
+        """Exit code of a command with its output in a log; on Linux it ends with Ray's worker, as
+        does a lost node."""
         import ctypes
         import os
         import signal
@@ -153,12 +141,8 @@ def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
         end_with_this = None if prctl is None else lambda: prctl(1, signal.SIGKILL)
         with open(log, "ab") as out:
             return subprocess.call(
-                command,
-                env=variables,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=out,
+                command, env=variables, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
                 preexec_fn=end_with_this,
-            )
+            )  # fmt: skip
 
     return run_command

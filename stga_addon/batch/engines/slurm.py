@@ -23,16 +23,12 @@ from ...worker.status import LOG_FILE, WorkerState, inspect_worker
 from ..plan import Ended, Job, Resources, job_command, kind_name
 
 TIMEOUT_S = 60.0
-MAX_ARRAY = 1000
-"""Jobs of an array: SLURM's default MaxArraySize is 1001."""
-QUEUE_FORMAT = "%i|%T|%N"
-"""Of squeue: job, state, machines."""
+MAX_ARRAY = 1000  # Jobs of an array: SLURM's default MaxArraySize is 1001
+QUEUE_FORMAT = "%i|%T|%N"  # Of squeue: job, state, machines
 ON_MACHINE = ("RUNNING", "COMPLETING", "CONFIGURING", "STAGE_OUT")
 GRACE_S = 10.0
 """Seconds after its submission in which a job that squeue does not list yet is not gone."""
-MAX_SILENCE_S = 600.0
-"""How long squeue may fail, as while the controller is started anew, before the batch ends; its
-jobs go on."""
+MAX_SILENCE_S = 600.0  # How long squeue may fail before the batch ends; its jobs go on
 FOLDER, SUBMITTED = "slurm", "submitted.json"
 
 
@@ -57,9 +53,8 @@ class SlurmEngine:
             (name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None
         )
         if missing is not None:
-            raise StgaError(
-                f"--engine slurm: the program {missing} was not found; start it where SLURM is installed"
-            )
+            problem = f"the program {missing} was not found; start it where SLURM is installed"
+            raise StgaError(f"--engine slurm: {problem}")
         self._jobs: dict[str, _Submitted] = {}
         self._names: dict[str, str] | None = None
         self._states: dict[str, tuple[str, str]] | None = None
@@ -69,11 +64,8 @@ class SlurmEngine:
         return True
 
     def submit(self, jobs: Sequence[Job]) -> None:
-        """Submit the jobs but those that are in the queue since an earlier start.
-
-        Raises StgaError with the words of sbatch where it refuses an array, and where squeue does
-        not answer.
-        """
+        """Submit the jobs but those that are in the queue since an earlier start. Raises StgaError
+        with sbatch's words, and where squeue does not answer."""
         names = {job.name: self._name(job) for job in jobs}
         if self._states is None and any(names.values()):
             self._states = _queue()
@@ -97,15 +89,21 @@ class SlurmEngine:
         kind, needs = kind_name(type(jobs[0].request)), jobs[0].resources
         script = jobs[0].folder.parent / FOLDER / f"{kind}-{time.time_ns()}.sh"
         with replacing(script) as partial:
-            partial.write_text(_script(jobs), encoding="utf-8")
+            packages = shlex.quote(str(PACKAGES_FOLDER))
+            lines = ["#!/bin/sh", "# A batch of stga; each job continues what it began before."]
+            lines += [f"export PYTHONPATH={packages}", "case $SLURM_ARRAY_TASK_ID in"]
+            for index, job in enumerate(jobs):
+                log = shlex.quote(str(job.request_folder / LOG_FILE))
+                lines.append(f"{index}) exec {shlex.join(job_command(job))} >>{log} 2>&1 ;;")
+            partial.write_text("\n".join([*lines, "esac", ""]), encoding="utf-8")
         names = {
             self._jobs[other].name for job in jobs for other in job.after if other in self._jobs
         }
         waits = sorted({_array(name) for name in names if name})
         command = [
-            "sbatch", "--parsable", "--requeue", f"--job-name=stga-{kind}", f"--array=0-{len(jobs) - 1}",
-            f"--cpus-per-task={needs.threads or 1}", f"--mem={round(1000 * needs.memory_gb)}M", "--output=/dev/null",
-            *(["--gres=gpu:1"] if needs.gpu else []),
+            "sbatch", "--parsable", "--requeue", "--output=/dev/null", f"--job-name=stga-{kind}",
+            f"--array=0-{len(jobs) - 1}", f"--cpus-per-task={needs.threads or 1}",
+            f"--mem={round(1000 * needs.memory_gb)}M", *(["--gres=gpu:1"] if needs.gpu else []),
             *([f"--dependency=afterany:{':'.join(waits)}"] if waits else []),
             str(script),
         ]  # fmt: skip
@@ -128,8 +126,7 @@ class SlurmEngine:
         return {name: machine for name, (state, machine) in found.items() if state in ON_MACHINE}
 
     def _ask(self) -> bool:
-        """Ask what is in the queue; False where squeue does not answer. Raises StgaError after
-        MAX_SILENCE_S."""
+        """Whether squeue answers what is in the queue; StgaError after MAX_SILENCE_S."""
         try:
             self._states = _queue()
         except StgaError:
@@ -159,20 +156,11 @@ class SlurmEngine:
     def withdraw(self) -> Sequence[str]:
         """Take back the jobs that wait in the queue."""
         self._ask()
-        states = self._states or {}
-        waiting = [
-            name
-            for name, one in self._jobs.items()
-            if states.get(one.name, ("", ""))[0] == "PENDING"
-        ]
+        pending = {name for name, (state, _) in (self._states or {}).items() if state == "PENDING"}
+        waiting = [name for name, one in self._jobs.items() if one.name in pending]
         if waiting:
-            _call(
-                [
-                    "scancel",
-                    "--state=PENDING",
-                    *sorted({_array(self._jobs[name].name) for name in waiting}),
-                ]
-            )
+            arrays = {_array(self._jobs[name].name) for name in waiting}
+            _call(["scancel", "--state=PENDING", *sorted(arrays)])
         for name in waiting:
             del self._jobs[name]
         return waiting
@@ -187,9 +175,7 @@ def _array(name: str) -> str:
 
 
 def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
-    """The jobs, which follow those that they come after, in arrays of the same kind and needs, in
-    an order in which no array waits for a later one: jobs of an array are as many steps from the
-    first."""
+    """Arrays of the same kind and needs, as many steps from the first: none waits for a later."""
     step: dict[str, int] = {}
     arrays: dict[tuple[int, str, Resources, int], list[Job]] = {}
     for job in jobs:
@@ -199,18 +185,6 @@ def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
             number += 1
         arrays[*key, number].append(job)
     return [arrays[key] for key in sorted(arrays, key=lambda key: key[0])]
-
-
-def _script(jobs: Sequence[Job]) -> str:
-    """What each job of an array runs: the command of its index, with its output in the job's own
-    log."""
-    packages = shlex.quote(str(PACKAGES_FOLDER))
-    lines = ["#!/bin/sh", "# A batch of stga; each job continues what it began before."]
-    lines += [f"export PYTHONPATH={packages}", "case $SLURM_ARRAY_TASK_ID in"]
-    for index, job in enumerate(jobs):
-        log = shlex.quote(str(job.request_folder / LOG_FILE))
-        lines.append(f"{index}) exec {shlex.join(job_command(job))} >>{log} 2>&1 ;;")
-    return "\n".join([*lines, "esac", ""])
 
 
 def _queue() -> dict[str, tuple[str, str]]:

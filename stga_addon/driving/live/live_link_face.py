@@ -4,18 +4,24 @@ import struct
 
 import numpy as np
 
-from ..performance import ARKIT_SHAPES, COLUMN, COUNT, MAX_WEIGHT, OPTIONAL, FacePacket
+from ..performance import (
+    ARKIT_SHAPES,
+    COLUMN,
+    COUNT,
+    EXCHANGEABLE,
+    MAX_WEIGHT,
+    OPTIONAL,
+    FacePacket,
+)
 
 VERSION = 6
 MAX_TEXT_BYTES = 512
-ROTATIONS = 9
-"""Yaw, pitch and roll of the head and of both eyes, after the shapes."""
+ROTATIONS = 9  # Yaw, pitch and roll of the head and of both eyes, after the shapes
 _TIME = struct.Struct(">ifii")
 _EXCHANGED = {
-    "jawRight": "jawLeft",
-    "jawLeft": "jawRight",
-    "mouthRight": "mouthLeft",
-    "mouthLeft": "mouthRight",
+    f"{pair}{side}": f"{pair}{other}"
+    for pair in EXCHANGEABLE
+    for side, other in (("Left", "Right"), ("Right", "Left"))
 }
 PACKET_SHAPES = tuple(_EXCHANGED.get(name, name) for name in ARKIT_SHAPES)
 """In the order of the packets, which have the left of jaw and mouth first, unlike the app's CSV
@@ -44,11 +50,8 @@ def decode(data: bytes) -> FacePacket | None:
         return None
     frame, part, rate, denominator = _TIME.unpack_from(data, at)
     at += _TIME.size
-    time = (
-        (frame + part) * denominator / rate
-        if rate > 0 and denominator > 0 and np.isfinite(part)
-        else None
-    )
+    has_clock = rate > 0 and denominator > 0 and np.isfinite(part)
+    time = (frame + part) * denominator / rate if has_clock else None
     subject = texts[1] or texts[0]
     count = data[at] if len(data) > at else 0
     if count == 0:
@@ -58,15 +61,9 @@ def decode(data: bytes) -> FacePacket | None:
     values = np.array(struct.unpack_from(f">{count}f", data, at + 1))
     if not (np.abs(values) <= MAX_WEIGHT).all():
         return None
-    return _packet(values, subject, time)
-
-
-def _packet(values: np.ndarray, subject: str, time: float | None) -> FacePacket:
-    names = (
-        PACKET_SHAPES
-        if len(values) >= COUNT
-        else tuple(name for name in PACKET_SHAPES if name not in OPTIONAL)
-    )
+    names = PACKET_SHAPES
+    if len(values) < COUNT:
+        names = tuple(name for name in PACKET_SHAPES if name not in OPTIONAL)
     weights = np.zeros(COUNT)
     weights[_PACKET_COLUMNS[: len(names)]] = values[: len(names)]
     head = None

@@ -1,5 +1,4 @@
-"""Live sources: their sockets, read without waiting, whose packets count, how well they arrive, and
-recordings."""
+"""Live sources: sockets read without waiting, packets that count, health, recordings."""
 
 import ipaddress
 import socket
@@ -54,34 +53,26 @@ def _single(decode: Callable[[bytes], FacePacket | None]) -> Callable[[bytes, An
 
 SOURCES = {
     "live_link_face": Source(
-        "Live Link Face",
-        11111,
-        _single(live_link_face.decode),
-        hint="Choose the mode Live Link (ARKit) in the app; its MetaHuman Animator mode sends no such weights",
+        "Live Link Face", 11111, _single(live_link_face.decode),
+        hint="Choose the mode Live Link (ARKit) in the app; its MetaHuman Animator mode sends no "
+        "such weights",
     ),
     "facial_mocap": Source(
-        "iFacialMocap",
-        49983,
-        _single(read_performance.parse_packet),
-        request=read_performance.REQUEST,
-        hint="A request is sent to the phone, which answers until it is closed",
+        "iFacialMocap", 49983, _single(read_performance.parse_packet), read_performance.REQUEST,
+        "A request is sent to the phone, which answers until it is closed",
     ),
     "vmc": Source(
-        "VMC (OSC)",
-        39539,
-        lambda data, known: vmc.decode(data, known or vmc.Received()),
-        hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are left out",
+        "VMC (OSC)", 39539, lambda data, known: vmc.decode(data, known or vmc.Received()),
+        hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are "
+        "left out",
     ),
-}
+}  # fmt: skip
 
 
 LOOPBACK = "127.0.0.1"
 MAX_DATAGRAM_BYTES = 1 << 16
-MAX_DATAGRAMS = 256
-"""Read at once: more than a usual socket keeps, so that the newest is among them. A flood does not
-hold Blender up."""
-REQUEST_INTERVAL_S = 1.0
-"""At which a phone that is silent is asked again."""
+MAX_DATAGRAMS = 256  # Read at once, more than a socket keeps; a flood does not hold Blender up
+REQUEST_INTERVAL_S = 1.0  # At which a phone that is silent is asked again
 
 
 class Receiver:
@@ -90,11 +81,8 @@ class Receiver:
     def __init__(
         self, source: Source, address: str = LOOPBACK, port: int = 0, phone: str = ""
     ) -> None:
-        """Listen on `address` and `port` (0: the source's usual one) of this machine.
-
-        phone  address of the phone that a source with a request asks for packets
-        Raises StgaError where that is no address, or the port cannot be opened.
-        """
+        """Listen on `address` and `port` (0: the usual one); phone: whom a source with a request
+        asks. Raises StgaError for no address, or a port that cannot be opened."""
         self.source, self.port = source, port or source.port
         self.phone = str(checked_address("phone's address", phone)) if source.request else ""
         where = checked_address("address to listen on", address)
@@ -107,15 +95,15 @@ class Receiver:
             self._socket.bind((str(where), self.port))
         except OSError as error:
             self._socket.close()
+            problem = f"port {self.port} of {where} cannot be opened ({error.strerror or error})"
             raise StgaError(
-                f"{source.label}: port {self.port} of {where} cannot be opened ({error.strerror or error}); another "
-                "program may be listening on it, or this computer has no such address"
+                f"{source.label}: {problem}; another program may be listening on it, or this "
+                "computer has no such address"
             ) from error
         self.port = self._socket.getsockname()[1]
 
     def read(self) -> list[tuple[str, bytes]]:
-        """The sender's address and the bytes of each datagram that is waiting, at most
-        MAX_DATAGRAMS."""
+        """Sender's address and bytes of the datagrams that wait, up to MAX_DATAGRAMS."""
         found: list[tuple[str, bytes]] = []
         while len(found) < MAX_DATAGRAMS:
             try:
@@ -147,28 +135,21 @@ def checked_address(what: str, text: str) -> ipaddress.IPv4Address | ipaddress.I
 
 
 def leaves_this_machine(source: Source, address: str, phone: str) -> bool:
-    """Whether listening there, or asking the phone, involves other machines. Raises StgaError as
-    `Receiver` does."""
+    """Whether listening, or asking the phone, involves other machines."""
     if not checked_address("address to listen on", address).is_loopback:
         return True
     return bool(source.request) and not checked_address("phone's address", phone).is_loopback
 
 
-Sender = tuple[str, str]
-"""Address and subject: two phones may share either."""
+Sender = tuple[str, str]  # Address and subject: two phones may share either
 
-MAX_SENDERS = 8
-"""Kept in memory; of more, those silent for longest are forgotten."""
-SILENCE_S = 2.0
-"""Without a packet, after which another sender is followed."""
+MAX_SENDERS = 8  # Kept in memory; of more, those silent for longest are forgotten
+SILENCE_S = 2.0  # Without a packet, after which another sender is followed
 RESTART_S = 1.0
 """A clock set back by more is a source that started anew; by less, a packet that came late."""
-PAUSE_S = 2.0
-"""Longer gaps are pauses of the source, not lost packets."""
-GAP = 1.5
-"""Packets farther apart than this many usual steps have lost some between them."""
-STEPS, ARRIVALS = 31, 240
-"""Steps of the source's clock, and arrivals, that are remembered."""
+PAUSE_S = 2.0  # Longer gaps are pauses of the source, not lost packets
+GAP = 1.5  # Packets farther apart than this many usual steps have lost some between them
+STEPS, ARRIVALS = 31, 240  # Steps of the source's clock, and arrivals, that are remembered
 RATE_WINDOW_S = 2.0
 
 
@@ -220,8 +201,7 @@ class Stream:
     )
 
     def receive(self, address: str, data: bytes, now: float) -> FacePacket | None:
-        """Take a datagram; the frame that it holds, where it counts: of the followed sender, with a
-        face, in order."""
+        """Take a datagram; its frame, if it is the followed sender's, in order, with a face."""
         decoded = self.source.decode(data, self._known.get(address))
         if decoded is None:
             self.foreign += 1
@@ -273,8 +253,7 @@ class Stream:
         self._arrivals.clear()
 
     def _is_next(self, time: float | None) -> bool:
-        """Whether a packet of the source's `time` is later than those before; counts what is lost
-        between them."""
+        """Whether a packet of the source's `time` is the latest; counts the lost ones."""
         if time is None:
             return True
         before = self._time
@@ -301,8 +280,7 @@ def _remember(table: OrderedDict[Any, Any], key: Any, value: Any) -> None:
         table.popitem(last=False)
 
 
-RESTING_PACKETS = 15
-"""Whose mean is the resting face: a quarter of a second."""
+RESTING_PACKETS = 15  # Whose mean is the resting face: a quarter of a second
 MIN_STEP_S = 2 / MAX_FPS
 """Between rows: a file's times are rounded, and rows at MAX_FPS could be refused."""
 MAX_LEAD_S = 5.0
@@ -330,8 +308,7 @@ def resting(packets: list[FacePacket]) -> Performance:
 def eased(
     before: Performance | None, row: Performance, step_s: float, smoothing_s: float
 ) -> Performance:
-    """The row, drawn towards the one before it: a low-pass filter of time constant
-    `smoothing_s`."""
+    """The row through a low-pass filter of time constant `smoothing_s` after the one before."""
     if before is None or smoothing_s <= 0:
         return row
     share = 1 - np.exp(-step_s / smoothing_s)
@@ -358,8 +335,7 @@ class Recording:
     _arrived: float = 0.0
 
     def add(self, packet: FacePacket, now: float) -> None:
-        """Take a packet that arrived at `now`; of more than a performance may have, the rest are
-        left out."""
+        """Take a packet that arrived at `now`, up to as many as a performance may have."""
         time = now
         if self._packets:
             before, last, step = self._times[-1], self._packets[-1], now - self._arrived
@@ -386,10 +362,7 @@ class Recording:
         rows = [row_of(packet) for packet in self._packets]
         heads = [row.head for row in rows if row.head is not None]
         times = np.array(self._times) - self._times[0]
-        raw = Performance(
-            times,
-            np.concatenate([row.weights for row in rows]),
-            np.concatenate(heads) if len(heads) == len(rows) else None,
-            1 / float(np.median(np.diff(times))),
-        )
+        weights = np.concatenate([row.weights for row in rows])
+        head = np.concatenate(heads) if len(heads) == len(rows) else None
+        raw = Performance(times, weights, head, 1 / float(np.median(np.diff(times))))
         return corrected(raw, MotionOptions(exchange=self.exchange), self.rest)

@@ -1,5 +1,4 @@
-"""The Virtual Motion Capture protocol: blend shapes and bones as messages of Open Sound Control
-1.0."""
+"""The Virtual Motion Capture protocol: shapes and bones as Open Sound Control 1.0."""
 
 import math
 import struct
@@ -19,8 +18,7 @@ _CONSTANTS: dict[str, Value] = {"T": True, "F": False, "N": None, "I": float("in
 
 
 def messages(data: bytes) -> list[Message] | None:
-    """Address and arguments of every message of a datagram, those of bundles in their order; None
-    for other bytes."""
+    """Address and arguments of a datagram's messages, in order; None for other bytes."""
     found: list[Message] = []
     return found if _read(data, found, 0) else None
 
@@ -161,11 +159,7 @@ def _with(known: Received, message: Message) -> Received:
 
 
 def _head(values: Sequence[Value]) -> tuple[float, float, float] | None:
-    """Yaw, pitch and roll of Unity's quaternion (x, y, z, w).
-
-    Unity's axes are left-handed, with x to the face's right: mirrored in x, rotations about y and z
-    change their sign.
-    """
+    """Yaw, pitch, roll of Unity's quaternion: left-handed, mirrored in x, so y and z turn back."""
     numbers = [value for value in map(_number, values) if value is not None]
     length = math.sqrt(sum(value * value for value in numbers))
     if len(numbers) != 4 or not 0.5 < length < 2:

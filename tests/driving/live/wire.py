@@ -13,14 +13,9 @@ for pair in ("jaw", "mouth"):
 
 
 def live_link_face(
-    weights: dict[str, float],
-    frame: int = 0,
-    head: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    subject: str = "phone",
-    device: str = "DEVICE-1",
-    count: int = 61,
-    rate: int = 60,
-) -> bytes:
+    weights: dict[str, float], frame: int = 0, head: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    subject: str = "phone", device: str = "DEVICE-1", count: int = 61, rate: int = 60,
+) -> bytes:  # fmt: skip
     """Big-endian: version 6; device and subject with their lengths; frame, subframe, rate,
     denominator; the values."""
     values = [weights.get(name, 0.0) for name in UDP_ORDER] + [*head] + [0.0] * 6
@@ -32,9 +27,7 @@ def live_link_face(
     return b"\x06" + names + time + body
 
 
-def facial_mocap(
-    weights: dict[str, float], head: tuple[float, ...] = (0, 0, 0), separator: str = "-"
-) -> bytes:
+def facial_mocap(weights, head=(0, 0, 0), separator="-"):
     """Percent; pitch, yaw and roll in degrees, and a position."""
     fields = []
     for name in ARKIT_SHAPES:
