@@ -12,8 +12,9 @@ const AVERAGING_ROUNDS = 3; // of smoothed strain
 const MIN_SQUARED_NORMAL = 1e-24;
 
 export class Strain {
+  // faces (3·F), neutral (3·V) meters, range (6·F: lowest three, highest three) of strain;
+  // ±MAX_STRAIN without one.
   /**
-   * faces (3·F), neutral (3·V) meters, range (6·F: lowest three, highest three) of strain; ±MAX_STRAIN without one.
    * @param {Values} faces
    * @param {Values} neutral
    * @param {Values} [range]
@@ -21,7 +22,8 @@ export class Strain {
   constructor(faces, neutral, range) {
     this.faces = faces;
     const count = faces.length / 3;
-    this.range = range ?? new Float32Array(6 * count).map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
+    this.range =
+      range ?? new Float32Array(6 * count).map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
     this.values = new Float32Array(3 * count);
     this.gram = new Float64Array(3 * count); // u·u, u·v, v·v of the neutral edges from corner 0
     this.toTensor = new Float32Array(18 * count); // change of gram → tensor xx, yy, zz, xy, yz, zx
@@ -29,7 +31,8 @@ export class Strain {
     this.share = new Float64Array(neutral.length / 3); // of a triangle in the mean of its vertex, and that in its own
     this.atVertex = new Float64Array(2 * neutral.length);
     for (const vertex of faces) this.share[vertex]++;
-    for (let v = 0; v < this.share.length; v++) this.share[v] = 1 / (3 * Math.max(1, this.share[v]));
+    for (let v = 0; v < this.share.length; v++)
+      this.share[v] = 1 / (3 * Math.max(1, this.share[v]));
     for (let f = 0; f < count; f++) this.prepare(f, neutral);
   }
 
@@ -57,19 +60,15 @@ export class Strain {
     for (let k = 0; k < 18; k++) if (k % 6 > 2) this.toPlane[18 * f + k] *= 2;
   }
 
-  /**
-   * Follow the posed vertices (3·V).
-   * @param {Float64Array} vertices
-   */
+  // Follow the posed vertices (3·V).
+  /** @param {Float64Array} vertices */
   update(vertices) {
     this.spread(vertices);
     this.gather();
   }
 
-  /**
-   * Add every triangle's tensor to its three vertices, each of which takes its mean.
-   * @param {Float64Array} vertices
-   */
+  // Add every triangle's tensor to its three vertices, each of which takes its mean.
+  /** @param {Float64Array} vertices */
   spread(vertices) {
     const { faces, gram, toTensor, atVertex, share } = this;
     atVertex.fill(0);
@@ -126,10 +125,8 @@ export class Strain {
 export class SmoothedStrain {
   static components = 3;
 
-  /**
-   * Of `strain` (Strain), which is to be updated first.
-   * @param {Strain} strain
-   */
+  // Of `strain` (Strain), which is to be updated first.
+  /** @param {Strain} strain */
   constructor(strain) {
     const { faces, range } = strain;
     const count = faces.length / 3;
@@ -148,10 +145,9 @@ export class SmoothedStrain {
     this.weigh(edgeCount);
   }
 
-  /**
-   * The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor` leaves it once.
-   * @param {number} edgeCount
-   */
+  // The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor`
+  // leaves it once.
+  /** @param {number} edgeCount */
   weigh(edgeCount) {
     const { edges, ownFactor, share } = this;
     const touching = new Int32Array(edgeCount);
@@ -200,10 +196,9 @@ export class SmoothedStrain {
   }
 }
 
-/**
- * [three times the index of the edge from each corner to the next (3·F), number of edges], by the edges' ends.
- * @type {(faces: Values) => [Int32Array, number]}
- */
+// [three times the index of the edge from each corner to the next (3·F), number of edges], by the
+// edges' ends.
+/** @type {(faces: Values) => [Int32Array, number]} */
 function edgesOf(faces) {
   const vertices = faces.reduce((most, vertex) => Math.max(most, vertex), 0) + 1;
   /** @type {Map<number, number>} */
@@ -218,10 +213,8 @@ function edgesOf(faces) {
   return [edges, index.size];
 }
 
-/**
- * Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
- * @type {(a: ArrayLike<number>, b: ArrayLike<number>, factor: number, out: Float32Array, at: number) => void}
- */
+// Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
+/** @type {(a: ArrayLike<number>, b: ArrayLike<number>, factor: number, out: Float32Array, at: number) => void} */
 function symmetricProduct(a, b, factor, out, at) {
   for (let k = 0; k < 3; k++) {
     const next = (k + 1) % 3;
@@ -239,8 +232,9 @@ const UPRIGHT_COSINE = 0.8;
 export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of matrix | origin, then strain | selected
 
 export class FaceFrames {
+  // Arrays of the data file, and the convention of the embedding; strain is computed where splats
+  // follow it.
   /**
-   * Arrays of the data file, and the convention of the embedding; strain is computed where splats follow it.
    * @param {Pick<Arrays, 'faces' | 'neutral'> & Partial<Arrays>} arrays
    * @param {string} convention
    */
@@ -266,10 +260,8 @@ export class FaceFrames {
       : [];
   }
 
-  /**
-   * Follow the posed vertices (3·V).
-   * @param {Float64Array} vertices
-   */
+  // Follow the posed vertices (3·V).
+  /** @param {Float64Array} vertices */
   update(vertices) {
     this.placeFrames(vertices);
     this.strain?.update(vertices);
@@ -279,12 +271,10 @@ export class FaceFrames {
     }
   }
 
-  /**
-   * "stga": axes [first, normal × first, normal], first from the middle to corner 0; scale sqrt(area / neutral area).
-   * "gaussian_avatars": axes [first, normal, first × normal], first along the first edge; scale the mean of edge and
-   * height.
-   * @param {Float64Array} vertices
-   */
+  // "stga": axes [first, normal × first, normal], first from the middle to corner 0; scale
+  // sqrt(area / neutral area). "gaussian_avatars": axes [first, normal, first × normal], first
+  // along the first edge; scale the mean of edge and height.
+  /** @param {Float64Array} vertices */
   placeFrames(vertices) {
     const { faces, isStga, neutralArea, world } = this;
     for (let f = 0; f < this.count; f++) {
@@ -308,7 +298,11 @@ export class FaceFrames {
       const length = Math.sqrt(x * x + y * y + z * z);
       const uu = ux * ux + uy * uy + uz * uz;
       const vv = vx * vx + vy * vy + vz * vz;
-      const longest = Math.max(uu, vv, (vx - ux) * (vx - ux) + (vy - uy) * (vy - uy) + (vz - uz) * (vz - uz));
+      const longest = Math.max(
+        uu,
+        vv,
+        (vx - ux) * (vx - ux) + (vy - uy) * (vy - uy) + (vz - uz) * (vz - uz),
+      );
       const isShort = length <= MIN_AREA_RATIO * Math.sqrt(longest);
       const isLine = twice <= 2 * MIN_AREA_RATIO * longest;
       if (isShort || isLine) {
@@ -348,10 +342,9 @@ export class FaceFrames {
     }
   }
 
-  /**
-   * Move the origins by a signal (S·F) times coefficients (3·S·F), in each triangle's own axes and unit.
-   * @type {(values: Float64Array, components: number, coefficients: Values) => void}
-   */
+  // Move the origins by a signal (S·F) times coefficients (3·S·F), in each triangle's own axes and
+  // unit.
+  /** @type {(values: Float64Array, components: number, coefficients: Values) => void} */
   moveOrigins(values, components, coefficients) {
     const { count, world } = this;
     for (let f = 0; f < count; f++) {
@@ -369,10 +362,8 @@ export class FaceFrames {
     }
   }
 
-  /**
-   * Write the frames as a camera (row-major 4×4 world to camera) sees them: FACE_FLOATS a triangle.
-   * @type {(camera: ArrayLike<number>, out: Float32Array) => void}
-   */
+  // Write the frames as a camera (row-major 4×4 world to camera) sees them: FACE_FLOATS a triangle.
+  /** @type {(camera: ArrayLike<number>, out: Float32Array) => void} */
   compose(camera, out) {
     const { world, count } = this;
     for (let row = 0; row < 3; row++) {
@@ -389,10 +380,9 @@ export class FaceFrames {
     }
   }
 
-  /**
-   * Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all selected).
-   * @type {(selection: ArrayLike<number> | null, out: Float32Array) => void}
-   */
+  // Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all
+  // selected).
+  /** @type {(selection: ArrayLike<number> | null, out: Float32Array) => void} */
   annotate(selection, out) {
     const strain = this.strain?.values;
     for (let f = 0; f < this.count; f++) {
@@ -403,10 +393,8 @@ export class FaceFrames {
   }
 }
 
-/**
- * Areas of the triangles; 0 for those that count as lines.
- * @type {(faces: Values, neutral: Values) => Float64Array<ArrayBuffer>}
- */
+// Areas of the triangles; 0 for those that count as lines.
+/** @type {(faces: Values, neutral: Values) => Float64Array<ArrayBuffer>} */
 function neutralAreas(faces, neutral) {
   const areas = new Float64Array(faces.length / 3);
   const corner = (/** @type {number} */ f, /** @type {number} */ k) =>
@@ -422,8 +410,9 @@ function neutralAreas(faces, neutral) {
   return areas;
 }
 
+// Perpendicular unit vectors first and normal (six numbers) of a triangle that is a line, or whose
+// `first` has no length.
 /**
- * Perpendicular unit vectors first and normal (six numbers) of a triangle that is a line, or whose `first` has no length.
  * @param {Vector} first
  * @param {Vector} normal
  * @param {boolean} isShort

@@ -32,7 +32,9 @@ export function program(gl, vertex, fragment) {
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
     const logs = (gl.getAttachedShaders(made) ?? []).map((shader) => gl.getShaderInfoLog(shader));
-    throw new RendererError(`The graphics driver rejects a shader: ${logs.join(' ')} ${gl.getProgramInfoLog(made)}`);
+    throw new RendererError(
+      `The graphics driver rejects a shader: ${logs.join(' ')} ${gl.getProgramInfoLog(made)}`,
+    );
   }
   /** @type {Program['uniforms']} */
   const uniforms = {};
@@ -58,10 +60,8 @@ export function floatTexture(gl, format, values) {
   return made;
 }
 
-/**
- * Replace all of a texture of `floatTexture`.
- * @type {(gl: WebGL2RenderingContext, texture: WebGLTexture, values: Float32Array) => void}
- */
+// Replace all of a texture of `floatTexture`.
+/** @type {(gl: WebGL2RenderingContext, texture: WebGLTexture, values: Float32Array) => void} */
 export function updateTexture(gl, texture, values) {
   gl.activeTexture(gl.TEXTURE0);
   gl.bindTexture(gl.TEXTURE_2D, texture);

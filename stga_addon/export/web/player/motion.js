@@ -4,7 +4,13 @@
 
 /** @import { Data, Performance } from './types.js' */
 
-import { axisAngleOf, matrixFromAxisAngle, multiplied, quaternionOf, slerpAxisAngle } from './vector.js';
+import {
+  axisAngleOf,
+  matrixFromAxisAngle,
+  multiplied,
+  quaternionOf,
+  slerpAxisAngle,
+} from './vector.js';
 
 /** Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded one. */
 export class Motion {
@@ -32,11 +38,9 @@ export class Motion {
     return this.shapes.performance?.fps ?? this.recordedFps;
   }
 
-  /**
-   * Fill coefficients, pose and translation with those of `frame`, between frames on the shortest way. Of a performance,
-   * the head as a whole stays where it is in the first recorded frame.
-   * @param {number} frame
-   */
+  // Fill coefficients, pose and translation with those of `frame`, between frames on the shortest
+  // way. Of a performance, the head as a whole stays where it is in the first recorded frame.
+  /** @param {number} frame */
   sample(frame) {
     const recorded = this.shapes.performance ? 0 : frame;
     const first = Math.min(Math.max(Math.floor(recorded), 0), this.recordedFrames - 1);
@@ -95,8 +99,8 @@ export class Rig {
     this.placed = new Float64Array(3 * joints);
   }
 
+  // Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
   /**
-   * Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
    * @param {ArrayLike<number>} coefficients
    * @param {ArrayLike<number>} pose
    * @param {ArrayLike<number>} translation
@@ -106,7 +110,8 @@ export class Rig {
     this.joints.set(this.jointRest);
     addShapes(this.shaped, this.basis, coefficients);
     addShapes(this.joints, this.jointBasis, coefficients);
-    for (let j = 0; j < this.parents.length; j++) matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
+    for (let j = 0; j < this.parents.length; j++)
+      matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
     // Correctives follow the entries of the rotations of joints 1… minus identity.
     const features = this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
     if (this.correctives.length) addShapes(this.shaped, this.correctives, features);
@@ -129,13 +134,20 @@ export class Rig {
           const from = 12 * parent + 4 * row;
           for (let c = 0; c < 3; c++) {
             const at = 9 * j + c;
-            skin[to + c] = skin[from] * local[at] + skin[from + 1] * local[at + 3] + skin[from + 2] * local[at + 6];
+            skin[to + c] =
+              skin[from] * local[at] +
+              skin[from + 1] * local[at + 3] +
+              skin[from + 2] * local[at + 6];
           }
           let sum = placed[3 * parent + row];
-          for (let c = 0; c < 3; c++) sum += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
+          for (let c = 0; c < 3; c++)
+            sum += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
           placed[3 * j + row] = sum;
         }
-        const turned = skin[to] * joints[3 * j] + skin[to + 1] * joints[3 * j + 1] + skin[to + 2] * joints[3 * j + 2];
+        const turned =
+          skin[to] * joints[3 * j] +
+          skin[to + 1] * joints[3 * j + 1] +
+          skin[to + 2] * joints[3 * j + 2];
         skin[to + 3] = placed[3 * j + row] - turned;
       }
     }
@@ -167,10 +179,9 @@ export class Rig {
   }
 }
 
-/**
- * target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than the sums.
- * @type {(target: Float64Array, shapes: ArrayLike<number>, factors: ArrayLike<number>) => void}
- */
+// target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than
+// the sums.
+/** @type {(target: Float64Array, shapes: ArrayLike<number>, factors: ArrayLike<number>) => void} */
 function addShapes(target, shapes, factors) {
   const size = target.length;
   /** @type {number[]} */
@@ -238,10 +249,8 @@ export class Shapes {
     this.pinned.fill(NaN);
   }
 
-  /**
-   * Replace expressions, jaw and eyes, and turn the neck as the performance does.
-   * @type {(frame: number, coefficients: Float64Array, pose: Float64Array) => void}
-   */
+  // Replace expressions, jaw and eyes, and turn the neck as the performance does.
+  /** @type {(frame: number, coefficients: Float64Array, pose: Float64Array) => void} */
   apply(frame, coefficients, pose) {
     const head = this.sample(frame);
     const { columns, expressions, linear, opens, products, values, weights } = this;
@@ -253,20 +262,21 @@ export class Shapes {
       if (weight === 0) continue;
       for (let k = 0; k < columns; k++) values[k] += weight * linear[shape * columns + k];
       const product = weight * weights[opens];
-      for (let k = 0; k < expressions; k++) values[k] += product * products[shape * expressions + k];
+      for (let k = 0; k < expressions; k++)
+        values[k] += product * products[shape * expressions + k];
     }
     coefficients.fill(0);
     coefficients.set(values.subarray(0, expressions));
     for (const [number, at] of this.joints.entries()) {
-      if (at >= 0) pose.set(values.subarray(expressions + 3 * number, expressions + 3 * number + 3), at);
+      if (at >= 0)
+        pose.set(values.subarray(expressions + 3 * number, expressions + 3 * number + 3), at);
     }
     if (head && this.neck >= 0) pose.set(headTurn(head), this.neck);
   }
 
-  /**
-   * Fill the weights with those of the frame; returns yaw, pitch and roll of the head, where the performance has them.
-   * @type {(frame: number) => number[] | null}
-   */
+  // Fill the weights with those of the frame; returns yaw, pitch and roll of the head, where the
+  // performance has them.
+  /** @type {(frame: number) => number[] | null} */
   sample(frame) {
     const { performance, pinned, weights } = this;
     weights.fill(0);
@@ -281,7 +291,9 @@ export class Shapes {
         if (column >= 0) weights[k] = before[column] + share * (after[column] - before[column]);
       }
       if (performance.head.every((column) => column >= 0)) {
-        head = performance.head.map((column) => before[column] + share * (after[column] - before[column]));
+        head = performance.head.map(
+          (column) => before[column] + share * (after[column] - before[column]),
+        );
       }
     }
     for (let k = 0; k < weights.length; k++) if (!Number.isNaN(pinned[k])) weights[k] = pinned[k];
@@ -289,10 +301,8 @@ export class Shapes {
   }
 }
 
-/**
- * Axis-angle of yaw, pitch and roll: about y, then the turned x, then the turned z.
- * @param {number[]} angles
- */
+// Axis-angle of yaw, pitch and roll: about y, then the turned x, then the turned z.
+/** @param {number[]} angles */
 function headTurn([yaw, pitch, roll]) {
   const turned = multiplied(quaternionOf([0, yaw, 0]), quaternionOf([pitch, 0, 0]));
   return axisAngleOf(multiplied(turned, quaternionOf([0, 0, roll])));

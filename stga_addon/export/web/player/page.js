@@ -13,7 +13,8 @@ import { scaled } from './vector.js';
 
 const fixed = (/** @type {number} */ value) => value.toFixed(2);
 const degrees = (/** @type {number} */ value) => `${Math.round(value)}°`;
-const signed = (/** @type {number} */ value) => `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
+const signed = (/** @type {number} */ value) =>
+  `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
 const PAD_ANGLE = 2.6; // radians from the camera's own direction at the rim of the pad: the light comes from behind
 const DRAGGED = 'dragged';
 /** Label, kinds that have it ("*": all environments), range, first value and format of each slider. */
@@ -25,8 +26,8 @@ const RANGES = {
 };
 
 export class LightControls {
+  // Fill and show `section` for an avatar whose light is known.
   /**
-   * Fill and show `section` for an avatar whose light is known.
    * @param {HTMLElement} section
    * @param {StgaAvatar} avatar
    */
@@ -42,7 +43,11 @@ export class LightControls {
     this.dragged = /** @type {HTMLElement} */ (section.querySelector('#light-dragged'));
     section.hidden = false;
     const environments = Object.entries(ENVIRONMENTS).map(([name, { label }]) => [name, label]);
-    for (const [name, label] of [['recorded', 'As recorded'], [DRAGGED, 'A light to drag'], ...environments]) {
+    for (const [name, label] of [
+      ['recorded', 'As recorded'],
+      [DRAGGED, 'A light to drag'],
+      ...environments,
+    ]) {
       this.select.add(new Option(label, name));
     }
     this.select.addEventListener('change', () => {
@@ -88,7 +93,9 @@ export class LightControls {
     this.dragged.hidden = this.kind !== DRAGGED;
     const isEnvironment = Object.hasOwn(ENVIRONMENTS, this.kind);
     for (const { row, kinds } of this.rows) {
-      row.hidden = !(isEnvironment ? kinds.endsWith('*') : this.kind === DRAGGED && kinds.startsWith(DRAGGED));
+      row.hidden = !(isEnvironment
+        ? kinds.endsWith('*')
+        : this.kind === DRAGGED && kinds.startsWith(DRAGGED));
     }
     this.showDirection();
   }
@@ -100,9 +107,12 @@ export class LightControls {
   /** @returns {Lighting | null} */
   lighting() {
     if (this.kind === 'recorded') return null;
-    const value = Object.fromEntries(this.rows.map(({ name, input }) => [name, Number(input.value)]));
+    const value = Object.fromEntries(
+      this.rows.map(({ name, input }) => [name, Number(input.value)]),
+    );
     const { strength, even, exposure } = value;
-    if (this.kind !== DRAGGED) return { environment: this.kind, turn: (Math.PI / 180) * value.turn, exposure };
+    if (this.kind !== DRAGGED)
+      return { environment: this.kind, turn: (Math.PI / 180) * value.turn, exposure };
     const color = scaled(linearColor(this.color.value), strength);
     return { even: [even, even, even], sun: { toward: this.toward, color }, exposure };
   }
@@ -126,8 +136,8 @@ export class LightControls {
   }
 }
 
+// The direction in the world of a place on the pad, whose middle is where the camera looks from.
 /**
- * The direction in the world of a place on the pad, whose middle is where the camera looks from.
  * @param {Camera | null} camera
  * @param {number} x from -1 to 1, to the right
  * @param {number} y from -1 to 1, down
@@ -138,27 +148,25 @@ function fromPad(camera, x, y) {
   const angle = PAD_ANGLE * Math.min(1, reach);
   const side = reach > 0 ? Math.sin(angle) / reach : 0;
   const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const part = (/** @type {number} */ k) => m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle);
+  const part = (/** @type {number} */ k) =>
+    m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle);
   return [part(0), part(1), part(2)];
 }
 
-/**
- * The reverse, within the pad.
- * @type {(camera: Camera | null, toward: Vector) => number[]}
- */
+// The reverse, within the pad.
+/** @type {(camera: Camera | null, toward: Vector) => number[]} */
 function onPad(camera, toward) {
   const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const along = (/** @type {number} */ k) => m[k] * toward[0] + m[k + 1] * toward[1] + m[k + 2] * toward[2];
+  const along = (/** @type {number} */ k) =>
+    m[k] * toward[0] + m[k + 1] * toward[1] + m[k + 2] * toward[2];
   const [x, y, z] = [along(0), along(4), along(8)];
   const side = Math.hypot(x, y);
   const reach = Math.min(1, Math.atan2(side, -z) / PAD_ANGLE);
   return side > 1e-9 ? [(x / side) * reach, (y / side) * reach] : [0, 0];
 }
 
-/**
- * "#rrggbb" in linear light.
- * @type {(hex: string) => Vector}
- */
+// "#rrggbb" in linear light.
+/** @type {(hex: string) => Vector} */
 function linearColor(hex) {
   const part = (/** @type {number} */ at) => {
     const value = parseInt(hex.slice(at, at + 2), 16) / 255;
@@ -180,7 +188,9 @@ function linearColor(hex) {
 
 const SLIDERS_SHOWN = 8;
 const SHAPES_FIRST = // the last comes first
-  'browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight eyeBlinkLeft mouthClose jawOpen'.split(' ');
+  'browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight eyeBlinkLeft mouthClose jawOpen'.split(
+    ' ',
+  );
 const FACTS_INTERVAL_MS = 500;
 const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
 const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
@@ -355,8 +365,8 @@ function toggleTheme() {
 
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
+// A row with a name, an `output` or a button that shows the value, and the slider itself.
 /**
- * A row with a name, an `output` or a button that shows the value, and the slider itself.
  * @param {HTMLElement} parent
  * @param {'slider' | 'range'} kind the first has the button
  * @param {string} label
@@ -366,9 +376,12 @@ function toggleTheme() {
  */
 function sliderRow(parent, kind, label, low, high) {
   const row = Object.assign(document.createElement('label'), { className: kind });
-  const shown = kind === 'slider' ? '<button class="value" title="Release"></button>' : '<output></output>';
+  const shown =
+    kind === 'slider' ? '<button class="value" title="Release"></button>' : '<output></output>';
   row.innerHTML = `<span></span>${shown}<input type="range" step="any">`;
-  const [name, value, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([...row.children]);
+  const [name, value, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([
+    ...row.children,
+  ]);
   name.textContent = label;
   [input.min, input.max] = [String(low), String(high)];
   parent.append(row);
@@ -406,10 +419,8 @@ function addSlider(parent, { id, label, low, high, read, write, format = fixed }
   return row;
 }
 
-/**
- * "Expression 3" for expr_003.
- * @param {string} name
- */
+// "Expression 3" for expr_003.
+/** @param {string} name */
 function expressionLabel(name) {
   const number = /^expr_(\d+)$/.exec(name);
   return number ? `Expression ${Number(number[1])}` : name;
@@ -432,10 +443,8 @@ function addExpressions() {
   showFirst(rows, byId('more'));
 }
 
-/**
- * Hide all but the first rows until the button is clicked.
- * @type {(rows: HTMLElement[], more: HTMLElement) => void}
- */
+// Hide all but the first rows until the button is clicked.
+/** @type {(rows: HTMLElement[], more: HTMLElement) => void} */
 function showFirst(rows, more) {
   more.hidden = rows.length <= SLIDERS_SHOWN;
   more.textContent = `Show all ${rows.length}`;
@@ -488,13 +497,16 @@ async function playFile(file) {
     avatar.setPerformance(await file.text());
     avatar.play();
   } catch (error) {
-    problem.textContent = error instanceof DataError ? error.message : `The file cannot be read: ${error}`;
+    problem.textContent =
+      error instanceof DataError ? error.message : `The file cannot be read: ${error}`;
     problem.hidden = false;
   }
 }
 
 function addPose() {
-  const known = POSE_SLIDERS.filter(([, joints]) => joints.every((joint) => info().joints.includes(joint)));
+  const known = POSE_SLIDERS.filter(([, joints]) =>
+    joints.every((joint) => info().joints.includes(joint)),
+  );
   const list = element('.sliders', HTMLElement, byId('pose'));
   for (const [label, joints, axis, low, high] of known) {
     addSlider(list, {
@@ -503,7 +515,8 @@ function addPose() {
       low,
       high,
       read: () => avatar.getPose(joints[0])[axis],
-      write: (value) => joints.forEach((joint) => avatar.setPose(joint, replaced(joint, axis, value))),
+      write: (value) =>
+        joints.forEach((joint) => avatar.setPose(joint, replaced(joint, axis, value))),
       format: (value) => degrees((180 / Math.PI) * value),
     });
   }
@@ -549,7 +562,8 @@ const KEYS = {
 /** @param {KeyboardEvent} event */
 function press(event) {
   const isArrow = event.key.startsWith('Arrow');
-  const isTyping = event.target instanceof Element && event.target.matches(isArrow ? 'select, input' : 'select');
+  const isTyping =
+    event.target instanceof Element && event.target.matches(isArrow ? 'select, input' : 'select');
   if (isTyping || event.ctrlKey || event.metaKey || event.altKey || !avatar.info) return;
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const action = /^[1-9]$/.test(key) ? () => showView(Number(key) - 1) : KEYS[key];
@@ -603,7 +617,9 @@ function fail() {
   for (const id of ['heading', 'transport', 'panel', 'open']) byId(id).hidden = true;
 }
 
-document.documentElement.dataset.theme = matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : 'light';
+document.documentElement.dataset.theme = matchMedia('(prefers-color-scheme: dark)').matches
+  ? 'dark'
+  : 'light';
 byId('theme').addEventListener('click', toggleTheme);
 byId('fullscreen').addEventListener('click', toggleFullscreen);
 addEventListener('keydown', press);

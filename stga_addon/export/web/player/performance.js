@@ -15,10 +15,9 @@ const DAY_S = 86400;
 const HEAD = ['headyaw', 'headpitch', 'headroll'];
 const MIN_SHAPES = 10; // of a table that holds a performance
 
-/**
- * The performance in a text, with a column per known shape (-1: it has none). Throws DataError in one sentence.
- * @type {(text: string, names: string[]) => Performance}
- */
+// The performance in a text, with a column per known shape (-1: it has none). Throws DataError in
+// one sentence.
+/** @type {(text: string, names: string[]) => Performance} */
 export function readPerformance(text, names) {
   const lines = text
     .replace(/^\uFEFF/, '')
@@ -28,7 +27,9 @@ export function readPerformance(text, names) {
   const plain = header.map(plainName);
   const columns = names.map((name) => plain.indexOf(name.toLowerCase()));
   if (columns.filter((column) => column >= 0).length < MIN_SHAPES)
-    throw new DataError('This file is no table of face shapes (CSV of Live Link Face or Audio2Face).');
+    throw new DataError(
+      'This file is no table of face shapes (CSV of Live Link Face or Audio2Face).',
+    );
   const counts = header.findIndex((name) => name.toLowerCase() === 'blendshapecount');
   const cells = lines
     .slice(1, MAX_ROWS + 1)
@@ -43,20 +44,16 @@ export function readPerformance(text, names) {
   return evenly({ columns, head, rows, fps: DEFAULT_FPS }, times(header, cells));
 }
 
-/**
- * mouthsmileleft of blendShapes.MouthSmile_L, mouth_smile_left, …
- * @param {string} name
- */
+// mouthsmileleft of blendShapes.MouthSmile_L, mouth_smile_left, …
+/** @param {string} name */
 function plainName(name) {
   const last = name.slice(name.lastIndexOf('.') + 1).toLowerCase();
   const side = /^(.*)[_\- ]([lr])$/.exec(last);
   return (side ? side[1] + (side[2] === 'l' ? 'left' : 'right') : last).replace(/[_\- ]/g, '');
 }
 
-/**
- * Seconds of each row from the first, or null where the table has none.
- * @type {(header: string[], cells: string[][]) => number[] | null}
- */
+// Seconds of each row from the first, or null where the table has none.
+/** @type {(header: string[], cells: string[][]) => number[] | null} */
 function times(header, cells) {
   const names = header.map((name) => name.toLowerCase());
   const at = names.findIndex((name) => ['timecode', 'time', 'timestamp', 'seconds'].includes(name));
@@ -67,10 +64,13 @@ function times(header, cells) {
     const numbers = texts.map(Number);
     return numbers.every(Number.isFinite) ? numbers.map((time) => time - numbers[0]) : null;
   }
-  const seconds = found.map((match) => 3600 * Number(match?.[1]) + 60 * Number(match?.[2]) + Number(match?.[3]));
+  const seconds = found.map(
+    (match) => 3600 * Number(match?.[1]) + 60 * Number(match?.[2]) + Number(match?.[3]),
+  );
   const frames = found.map((match) => Number(match?.[4]) + Number(match?.[5] ?? 0));
   const largest = Math.max(...frames);
-  const spread = (/** @type {number} */ base) => unevenness(seconds.map((second, row) => second + frames[row] / base));
+  const spread = (/** @type {number} */ base) =>
+    unevenness(seconds.map((second, row) => second + frames[row] / base));
   const possible = TIMECODE_BASES.filter((base) => base > largest);
   let base = possible[0] ?? largest + 1;
   if (new Set(seconds).size < 2) base = possible.includes(USUAL_BASE) ? USUAL_BASE : base;
@@ -98,10 +98,8 @@ function median(values) {
   return [...values].sort((one, other) => one - other)[Math.floor(values.length / 2)];
 }
 
-/**
- * The performance at even times, with rows that are missing interpolated.
- * @type {(performance: Performance, seconds: number[] | null) => Performance}
- */
+// The performance at even times, with rows that are missing interpolated.
+/** @type {(performance: Performance, seconds: number[] | null) => Performance} */
 function evenly(performance, seconds) {
   if (!seconds || seconds.length < 2) return performance;
   const steps = seconds.slice(1).map((second, row) => second - seconds[row]);

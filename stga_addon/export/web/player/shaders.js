@@ -25,10 +25,8 @@ ivec2 texel(int index) {
 /** Of degree 1 on, by x, y, z and their squares: what the export writes here. */
 const SH = '{{harmonics}}'.split('; ');
 
-/**
- * Texels a splat needs for its view-dependent and strain-dependent colors.
- * @type {(harmonics: number, strains: number) => number}
- */
+// Texels a splat needs for its view-dependent and strain-dependent colors.
+/** @type {(harmonics: number, strains: number) => number} */
 export function tailTexels(harmonics, strains) {
   return Math.ceil((3 * (harmonics + strains)) / 4);
 }
@@ -38,8 +36,9 @@ function tailTriple(k) {
   return `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map((at) => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
 }
 
+// Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices
+// are slow on many GPUs.
 /**
- * Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices are slow on many GPUs.
  * @param {number} harmonics
  * @param {string} direction
  * @param {string} sum
@@ -56,21 +55,23 @@ function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
   }`;
 }
 
-/**
- * Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain to `byStrain`.
- * @type {(harmonics: number, strains: number, direction: string, byView?: string, byStrain?: string) => string}
- */
+// Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain
+// to `byStrain`.
+/** @type {(harmonics: number, strains: number, direction: string, byView?: string, byStrain?: string) => string} */
 function tailColor(harmonics, strains, direction, byView = 'color', byStrain = 'color') {
   const texels = tailTexels(harmonics, strains);
   const lines = [];
-  for (let t = 0; t < texels; t++) lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
-  if (harmonics) lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
-  for (let k = 0; k < strains; k++) lines.push(`${byStrain} += face.${'xyz'[k]} * ${tailTriple(harmonics + k)};`);
+  for (let t = 0; t < texels; t++)
+    lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
+  if (harmonics)
+    lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
+  for (let k = 0; k < strains; k++)
+    lines.push(`${byStrain} += face.${'xyz'[k]} * ${tailTriple(harmonics + k)};`);
   return lines.join('\n  ');
 }
 
+// The limits and constants are those of the kernels that trained the splats (raster/cpu).
 /**
- * The limits and constants are those of the kernels that trained the splats (raster/cpu).
  * @param {number} harmonics
  * @param {number} strains
  * @param {boolean} [isLit] whether colors come from the light pass
@@ -197,8 +198,8 @@ void main() {
 export const SHADOW_FRAGMENT_SHADER = `#version 300 es
 void main() {}`;
 
+// A texel a splat: its color in sRGB, not clipped.
 /**
- * A texel a splat: its color in sRGB, not clipped.
  * @param {number} harmonics of splats whose color depends on the view
  * @param {number} strains 3 where it depends on strain
  */

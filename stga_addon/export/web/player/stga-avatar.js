@@ -63,15 +63,14 @@ export class StgaAvatar extends HTMLElement {
     if (name === 'background' && value && this.#player) this.background = value;
   }
 
-  /**
-   * Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of one). Rejects, and
-   * says why on the page.
-   * @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>} source
-   */
+  // Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of
+  // one). Rejects, and says why on the page.
+  /** @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>} source */
   async load(source) {
     const loading = ++this.#loading;
     try {
-      const bytes = typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(await source);
+      const bytes =
+        typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(await source);
       const data = await readData(bytes);
       if (loading !== this.#loading) return; // another load has begun
       this.#show(new Player(this.#canvas, data));
@@ -120,10 +119,8 @@ export class StgaAvatar extends HTMLElement {
     this.#changed('pause');
   }
 
-  /**
-   * Replace an expression (its name or component) by a value; null: as recorded.
-   * @type {(name: string | number, value: number | null) => void}
-   */
+  // Replace an expression (its name or component) by a value; null: as recorded.
+  /** @type {(name: string | number, value: number | null) => void} */
   setExpression(name, value) {
     const component = this.#component(name);
     this.#loaded.motion.pinnedCoefficients[component] = value ?? NaN;
@@ -135,10 +132,9 @@ export class StgaAvatar extends HTMLElement {
     return this.#loaded.motion.coefficients[this.#component(name)];
   }
 
-  /**
-   * Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded; null: all parts.
-   * @type {(joint: string, rotation: ArrayLike<number | null> | null) => void}
-   */
+  // Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded;
+  // null: all parts.
+  /** @type {(joint: string, rotation: ArrayLike<number | null> | null) => void} */
   setPose(joint, rotation) {
     const at = 3 * this.#index(this.#loaded.data.header.joints, joint, 'joint');
     const { pinnedPose } = this.#loaded.motion;
@@ -152,11 +148,9 @@ export class StgaAvatar extends HTMLElement {
     return Array.from(this.#loaded.motion.pose.subarray(at, at + 3));
   }
 
-  /**
-   * Replace a shape (one of `info.shapes.names`) by a weight; null: as the performance has it, or 0. While one is
-   * replaced, the shapes move expressions, jaw and eyes instead of the recording.
-   * @type {(name: string, weight: number | null) => void}
-   */
+  // Replace a shape (one of `info.shapes.names`) by a weight; null: as the performance has it, or
+  // 0. While one is replaced, the shapes move expressions, jaw and eyes instead of the recording.
+  /** @type {(name: string, weight: number | null) => void} */
   setShape(name, weight) {
     const { shapes } = this.#loaded.motion;
     shapes.pinned[this.#index(shapes.names, name, 'shape')] = weight ?? NaN;
@@ -169,14 +163,13 @@ export class StgaAvatar extends HTMLElement {
     return weights[this.#index(names, name, 'shape')];
   }
 
-  /**
-   * Play a performance (the text of a CSV file with a column per shape) instead of the recording; null: the recording.
-   * Throws DataError where it is none.
-   * @param {string | null} text
-   */
+  // Play a performance (the text of a CSV file with a column per shape) instead of the recording;
+  // null: the recording. Throws DataError where it is none.
+  /** @param {string | null} text */
   setPerformance(text) {
     const { shapes } = this.#loaded.motion;
-    if (text !== null && !shapes.names.length) throw new DataError('This avatar has no shapes for a performance.');
+    if (text !== null && !shapes.names.length)
+      throw new DataError('This avatar has no shapes for a performance.');
     shapes.performance = text === null ? null : readPerformance(text, shapes.names);
     if (text === null) shapes.weights.fill(0);
     this.#time = 0;
@@ -196,18 +189,15 @@ export class StgaAvatar extends HTMLElement {
     this.#posed();
   }
 
-  /**
-   * { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes, meters).
-   * @returns {Camera | null}
-   */
+  // { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes,
+  // meters).
+  /** @returns {Camera | null} */
   get camera() {
     return this.#player?.camera ?? null;
   }
 
-  /**
-   * A camera as above, or the name of one of the file's views.
-   * @param {Camera | string} value
-   */
+  // A camera as above, or the name of one of the file's views.
+  /** @param {Camera | string} value */
   set camera(value) {
     const player = this.#loaded;
     const { views } = player.data.header;
@@ -240,9 +230,11 @@ export class StgaAvatar extends HTMLElement {
 
   set background(value) {
     const digits = /^#([0-9a-f]{6})$/i.exec(value)?.[1];
-    if (!digits && value !== 'transparent') throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
+    if (!digits && value !== 'transparent')
+      throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
     const part = (/** @type {number} */ at) => parseInt((digits ?? '').slice(at, at + 2), 16) / 255;
-    if (this.#player) this.#player.background = digits ? [part(0), part(2), part(4), 1] : [0, 0, 0, 0];
+    if (this.#player)
+      this.#player.background = digits ? [part(0), part(2), part(4), 1] : [0, 0, 0, 0];
     this.#request ||= requestAnimationFrame((now) => this.#tick(now));
   }
 
@@ -265,10 +257,8 @@ export class StgaAvatar extends HTMLElement {
     return Boolean(this.#player?.data.header.light);
   }
 
-  /**
-   * What lights the avatar (types.d.ts); null: the light that it was recorded in.
-   * @returns {Lighting | null}
-   */
+  // What lights the avatar (types.d.ts); null: the light that it was recorded in.
+  /** @returns {Lighting | null} */
   get lighting() {
     return this.#player?.lighting ?? null;
   }
@@ -290,10 +280,8 @@ export class StgaAvatar extends HTMLElement {
     return this.#player?.milliseconds ?? 0;
   }
 
-  /**
-   * The current frame as a PNG (Blob) from `camera`, by default the current one at its own size.
-   * @type {(camera?: Camera) => Promise<Blob | null>}
-   */
+  // The current frame as a PNG (Blob) from `camera`, by default the current one at its own size.
+  /** @type {(camera?: Camera) => Promise<Blob | null>} */
   async snapshot(camera = this.#loaded.camera) {
     const pixels = this.#loaded.read(camera);
     const picture = document.createElement('canvas');
@@ -313,10 +301,8 @@ export class StgaAvatar extends HTMLElement {
     return this.#player;
   }
 
-  /**
-   * Index of a name among the names of a kind of thing. Throws RangeError where there is none.
-   * @type {(names: (string | number)[], name: string | number, kind: string) => number}
-   */
+  // Index of a name among the names of a kind of thing. Throws RangeError where there is none.
+  /** @type {(names: (string | number)[], name: string | number, kind: string) => number} */
   #index(names, name, kind) {
     const index = names.indexOf(name);
     if (index < 0) throw new RangeError(`There is no ${kind} "${name}".`);
@@ -326,7 +312,9 @@ export class StgaAvatar extends HTMLElement {
   /** @param {string | number} name of an expression, or its component */
   #component(name) {
     const { sliders } = this.#loaded.data.header;
-    const names = sliders.map((slider) => (typeof name === 'string' ? slider.name : slider.component));
+    const names = sliders.map((slider) =>
+      typeof name === 'string' ? slider.name : slider.component,
+    );
     return sliders[this.#index(names, name, 'expression')].component;
   }
 
@@ -347,10 +335,8 @@ export class StgaAvatar extends HTMLElement {
     this.#changed('frame'); // the first one is drawn once, as whoever waited for "load" wants it
   }
 
-  /**
-   * The graphics driver was restarted.
-   * @param {Event} event
-   */
+  // The graphics driver was restarted.
+  /** @param {Event} event */
   #lose(event) {
     event.preventDefault(); // so that it will be given back
     this.#message.textContent = 'The graphics driver was restarted. Waiting for it …';
@@ -419,7 +405,9 @@ export class StgaAvatar extends HTMLElement {
 
   #resize() {
     const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    const [width, height] = [this.clientWidth, this.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    const [width, height] = [this.clientWidth, this.clientHeight].map((side) =>
+      Math.max(1, Math.round(side * ratio)),
+    );
     if (this.#canvas.width === width && this.#canvas.height === height) return;
     this.#canvas.width = width;
     this.#canvas.height = height;

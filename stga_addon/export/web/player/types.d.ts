@@ -47,8 +47,25 @@ export interface Header {
 }
 
 type NeededArrays =
-  | ('xyz' | 'rotation' | 'rotation_largest' | 'log_scale' | 'opacity' | 'color' | 'splats_per_face')
-  | ('faces' | 'neutral' | 'base' | 'basis' | 'correctives' | 'weights' | 'joint_rest' | 'joint_basis')
+  | (
+      | 'xyz'
+      | 'rotation'
+      | 'rotation_largest'
+      | 'log_scale'
+      | 'opacity'
+      | 'color'
+      | 'splats_per_face'
+    )
+  | (
+      | 'faces'
+      | 'neutral'
+      | 'base'
+      | 'basis'
+      | 'correctives'
+      | 'weights'
+      | 'joint_rest'
+      | 'joint_basis'
+    )
   | ('coefficients' | 'pose' | 'translation');
 
 /** Arrays of a data file, checked; what others there are, `checkData` (data.js) lists. */
