@@ -24,7 +24,7 @@ from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Caster, Light, Lighting
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
-from stga_addon.scene.gpu.context import has_gpu_context
+from stga_addon.scene.gpu.renderer import has_gpu_context
 from stga_addon.scene.gpu.packing import View
 from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer, _pixels
 from stga_addon.scene.layers import DisplaySettings, Relit, SceneLayer

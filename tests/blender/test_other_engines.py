@@ -21,7 +21,7 @@ from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import QUADS  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
-from stga_addon.scene.gpu.context import has_gpu_context  # noqa: E402
+from stga_addon.scene.gpu.renderer import has_gpu_context  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .test_engine import camera_at, show, textured, with_light  # noqa: E402

@@ -14,8 +14,8 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.cameras import camera_of, viewport_camera  # noqa: E402
-from stga_addon.scene.render import engine_viewport  # noqa: E402
-from stga_addon.scene.render.engine_viewport import RenderRequest, ViewportRenderer  # noqa: E402
+from stga_addon.scene.render import engine as engine_viewport  # noqa: E402
+from stga_addon.scene.render.engine import RenderRequest, ViewportRenderer  # noqa: E402
 
 CAMERA = Camera(800, 600, 700.0, 700.0, 400.0, 300.0, np.eye(4))
 

@@ -50,7 +50,7 @@ export function frontCamera(points, up) {
   const x = unit(crossed(y, ahead));
   const z = crossed(x, y);
   const eye = difference(middle, scaled(z, distance));
-  const rows = [x, y, z].flatMap((row) => [...row, -dotProduct(row, eye)]);
+  const rows = [x, y, z].flatMap(row => [...row, -dotProduct(row, eye)]);
   const matrix = Float64Array.from([...rows, 0, 0, 0, 1]);
   return { size: [800, 800], focal: [1600, 1600], center: [400, 400], matrix };
 }
@@ -158,15 +158,15 @@ const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
 export function addControls(element, player, changed, lit) {
   /** @type {Map<number, Point>} */
   const pointers = new Map();
-  element.addEventListener('contextmenu', (event) => event.preventDefault());
-  element.addEventListener('pointerdown', (event) => {
+  element.addEventListener('contextmenu', event => event.preventDefault());
+  element.addEventListener('pointerdown', event => {
     element.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
   });
   for (const name of /** @type {const} */ (['pointerup', 'pointercancel'])) {
-    element.addEventListener(name, (event) => pointers.delete(event.pointerId));
+    element.addEventListener(name, event => pointers.delete(event.pointerId));
   }
-  element.addEventListener('pointermove', (event) => {
+  element.addEventListener('pointermove', event => {
     const shown = player();
     if (!pointers.has(event.pointerId) || !shown) return;
     const before = [...pointers.values()];
@@ -206,7 +206,7 @@ export function addControls(element, player, changed, lit) {
   });
   element.addEventListener(
     'wheel',
-    (event) => {
+    event => {
       const shown = player();
       if (!shown) return;
       event.preventDefault();

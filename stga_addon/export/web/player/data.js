@@ -76,7 +76,7 @@ function readArrays(header, payload) {
   let at = 0;
   for (const [name, entry] of Object.entries(header.arrays ?? {})) {
     const shape = list(entry?.shape, `${name}.shape`);
-    require(shape.every((size) => Number.isSafeInteger(size) && size >= 0), `${name}.shape`);
+    require(shape.every(size => Number.isSafeInteger(size) && size >= 0), `${name}.shape`);
     const count = shape.reduce((product, size) => product * size, 1);
     const planes = entry.type === 'float32' ? 4 : entry.planes;
     require(Number.isInteger(planes) && planes >= 1 && planes <= 4, `${name}.planes`);
@@ -184,7 +184,7 @@ function checkData(header, arrays) {
   const limits = { faces: vertices, rotation_largest: 4, splats_per_face: splats + 1 };
   if (header.light) Object.assign(limits, { light_face: faces, light_lash_face: faces });
   for (const [name, past] of Object.entries(limits)) {
-    require(arrays[name].values.every((value) => isIndex(value, past)), name);
+    require(arrays[name].values.every(value => isIndex(value, past)), name);
   }
   require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) ===
     splats, 'splats_per_face');
@@ -206,7 +206,7 @@ function checkHeader(header, joints, shapes) {
     ), 'background');
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
   const names = list(header.joints, 'joints');
-  require(names.length === joints && names.every((name) => typeof name === 'string'), 'joints');
+  require(names.length === joints && names.every(name => typeof name === 'string'), 'joints');
   for (const slider of list(header.sliders, 'sliders')) {
     require(typeof slider?.name === 'string' &&
       Number.isFinite(slider.reach) &&

@@ -79,8 +79,8 @@ function fromUpright(up, turn) {
   const sine = Math.hypot(...axis);
   const angle = Math.atan2(sine, unit(up)[1]);
   matrixFromAxisAngle(sine > 1e-9 ? scaled(axis, angle / sine) : [angle, 0, 0], 0, tilt, 0);
-  const columns = [0, 1, 2].map((k) => turnedVector(spin, [tilt[k], tilt[k + 3], tilt[k + 6]]));
-  return [0, 1, 2].flatMap((row) => columns.map((column) => column[row]));
+  const columns = [0, 1, 2].map(k => turnedVector(spin, [tilt[k], tilt[k + 3], tilt[k + 6]]));
+  return [0, 1, 2].flatMap(row => columns.map(column => column[row]));
 }
 
 /** @type {(values: ArrayLike<number>, count: number, name: string) => void} */
@@ -142,7 +142,7 @@ export function rotatedLight(light, rotation) {
   for (let c = 0; c < 3; c++) {
     const part = (/** @type {number} */ k) => light[3 * k + c];
     const [x, y, z] = turnedVector(rotation, [part(3), part(1), part(2)]);
-    const [xy, yz, xz] = [part(4), part(5), part(7)].map((value) => (MIXED / 2) * value);
+    const [xy, yz, xz] = [part(4), part(5), part(7)].map(value => (MIXED / 2) * value);
     const [up, across] = [UPRIGHT * part(6), CROSSED * part(8)];
     const m = turnedMatrix(rotation, [across - up, xy, xz, xy, -across - up, yz, xz, yz, 2 * up]);
     const square = [
@@ -168,11 +168,9 @@ export function turnedVector(rotation, v) {
 // R · M · Rᵀ of 3×3 matrices, row by row.
 /** @type {(rotation: ArrayLike<number>, m: number[]) => number[]} */
 function turnedMatrix(rotation, m) {
-  const rows = [0, 3, 6].map((k) => turnedVector(rotation, m.slice(k, k + 3))); // (R · row)ᵀ: rows of M · Rᵀ
-  const columns = [0, 1, 2].map((k) =>
-    turnedVector(rotation, [rows[0][k], rows[1][k], rows[2][k]]),
-  );
-  return [0, 1, 2].flatMap((row) => columns.map((column) => column[row]));
+  const rows = [0, 3, 6].map(k => turnedVector(rotation, m.slice(k, k + 3))); // (R · row)ᵀ: rows of M · Rᵀ
+  const columns = [0, 1, 2].map(k => turnedVector(rotation, [rows[0][k], rows[1][k], rows[2][k]]));
+  return [0, 1, 2].flatMap(row => columns.map(column => column[row]));
 }
 
 // Add light of an irradiance from one direction.
@@ -222,7 +220,7 @@ function covariance(from, to, weights) {
   }
   for (let k = 0; k < 9; k++) m[k] -= (sums.to[Math.floor(k / 3)] * sums.from[k % 3]) / sums.weight;
   const norm = Math.hypot(...m) || 1;
-  return m.map((value) => value / norm);
+  return m.map(value => value / norm);
 }
 
 // Irradiance (3·V) of light (harmonics in the head's axes) past the head itself.
@@ -275,7 +273,7 @@ export class Bounce {
       Math.floor((value - low[axis]) / CELL_M) + 1;
     const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);
     for (let v = 0; v < this.cell.length; v++) {
-      const [x, y, z] = [0, 1, 2].map((axis) => place(neutral[3 * v + axis], axis));
+      const [x, y, z] = [0, 1, 2].map(axis => place(neutral[3 * v + axis], axis));
       this.cell[v] = (x * ny + y) * nz + z;
     }
     this.cells = nx * ny * nz;

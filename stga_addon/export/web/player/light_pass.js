@@ -14,7 +14,7 @@ import {
   paddedLength,
   program,
   updateTexture,
-} from './gl.js';
+} from './renderer.js';
 import {
   Bounce,
   HARMONICS,
@@ -57,12 +57,12 @@ export class LightPass {
     this.faces = arrays.faces.values;
     this.neutral = arrays.neutral.values;
     this.transfer = light('transfer');
-    this.rigid = Float64Array.from(light('occlusion'), (share) => share + MIN_RIGID);
+    this.rigid = Float64Array.from(light('occlusion'), share => share + MIN_RIGID);
     this.count = arrays.xyz.shape[0];
     const frames = new FaceFrames({ faces: arrays.faces, neutral: arrays.neutral }, convention);
     frames.placeFrames(Float64Array.from(this.neutral));
     this.bounce = new Bounce(this.neutral, this.faces, frames.neutralArea, light('occlusion'));
-    this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames.world));
+    this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames));
     this.lashCorners = light('lash_corners');
     this.lashes = light('lash_face').length;
     this.lashFrames = new FaceFrames(
@@ -78,7 +78,7 @@ export class LightPass {
       { length: 6 * this.lashes },
       (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 0, 2, 3][k % 6],
     );
-    this.casters = Uint32Array.from([...this.faces, ...cards.map((corner) => vertices + corner)]);
+    this.casters = Uint32Array.from([...this.faces, ...cards.map(corner => vertices + corner)]);
     this.shadows = makeTarget(gl, gl.DEPTH_COMPONENT32F, MAP_SIZE, MAP_SIZE, gl.DEPTH_ATTACHMENT);
     this.vertexArray = gl.createVertexArray();
     this.indexBuffer = gl.createBuffer();
@@ -113,20 +113,20 @@ export class LightPass {
   }
 
   // Follow the posed vertices (3·V) and the light.
-  /** @type {(vertices: Float64Array, light: LitBy) => void} */
-  update(vertices, light) {
+  /** @type {(vertices: Float64Array, sides: Float64Array, light: LitBy) => void} */
+  update(vertices, sides, light) {
     const { gl } = this;
     this.light = light;
-    this.packVertices(vertices, light);
+    this.packVertices(vertices, sides, light);
     updateTexture(gl, this.vertexTexture, this.vertexValues);
     if (!light.sun) return;
     this.view = sunView(vertices, light.sun.toward);
     this.drawShadows();
   }
 
-  /** @type {(vertices: Float64Array, light: LitBy) => void} */
-  packVertices(vertices, { world, sun }) {
-    const normals = vertexNormals(this.faces, vertices);
+  /** @type {(vertices: Float64Array, sides: Float64Array, light: LitBy) => void} */
+  packVertices(vertices, sides, { world, sun }) {
+    const normals = vertexNormals(this.faces, sides, vertices.length);
     const rotation = rigidRotation(vertices, this.neutral, this.rigid);
     const around = Float64Array.from(world);
     if (sun) addPoint(around, sun.toward, sun.color);
@@ -201,7 +201,7 @@ export class LightPass {
     gl.uniform4fv(uniforms.uKept, this.kept);
     gl.uniform4fv(uniforms.uTypical, this.typical);
     const [x, y, z] = [0, 1, 2].map(
-      (k) => -camera[k] * camera[3] - camera[4 + k] * camera[7] - camera[8 + k] * camera[11],
+      k => -camera[k] * camera[3] - camera[4 + k] * camera[7] - camera[8 + k] * camera[11],
     );
     gl.uniform3f(uniforms.uEye, x, y, z);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -250,7 +250,7 @@ function sunView(vertices, toward) {
 // irradiance of the capture, occlusion | corners of the triangle | their weights.
 /**
  * @param {Arrays} arrays
- * @param {Float64Array} frames of the neutral mesh
+ * @param {FaceFrames} frames of the neutral mesh
  */
 function surfaceTexels(arrays, frames) {
   const { faces, neutral, splats_per_face, xyz } = arrays;
@@ -262,7 +262,7 @@ function surfaceTexels(arrays, frames) {
     'occlusion',
     'roughness',
   ].map(light);
-  const normals = vertexNormals(faces.values, neutral.values);
+  const normals = vertexNormals(faces.values, frames.sides, neutral.values.length);
   const least = [0, 0, 0];
   for (let k = 0; k < irradiance.length; k++)
     least[k % 3] += (MIN_IRRADIANCE * 3 * irradiance[k]) / irradiance.length;
@@ -271,10 +271,8 @@ function surfaceTexels(arrays, frames) {
     for (const end = splat + splats_per_face.values[own]; splat < end; splat++) {
       const from = 3 * ((own + face[splat]) % faces.shape[0]);
       const corners = Array.from(faces.values.subarray(from, from + 3));
-      const [a, b, c] = corners.map((vertex) =>
-        neutral.values.subarray(3 * vertex, 3 * vertex + 3),
-      );
-      const weights = nearestWeights(a, b, c, placed(frames, own, xyz.values, splat));
+      const [a, b, c] = corners.map(vertex => neutral.values.subarray(3 * vertex, 3 * vertex + 3));
+      const weights = nearestWeights(a, b, c, placed(frames.world, own, xyz.values, splat));
       const to = 4 * SURFACE_TEXELS * splat;
       for (let k = 0; k < 3; k++) {
         const [vertex, weight] = [corners[k], weights[k]];
@@ -296,7 +294,7 @@ function surfaceTexels(arrays, frames) {
 // The triangles of the lashes, as an array of their own.
 /** @param {Arrays} arrays */
 function lashFaces({ faces, light_lash_face }) {
-  const found = Array.from(light_lash_face?.values ?? [], (face) =>
+  const found = Array.from(light_lash_face?.values ?? [], face =>
     Array.from(faces.values.subarray(3 * face, 3 * face + 3)),
   );
   return { shape: [found.length, 3], values: Int32Array.from(found.flat()) };
@@ -327,35 +325,22 @@ function nearestWeights(a, b, c, point) {
   const area = Math.max(uu * vv - uv * uv, 1e-30);
   const [pu, pv] = [dotProduct(offset, first), dotProduct(offset, second)];
   const [u, v] = [(vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area];
-  const clamped = [1 - u - v, u, v].map((weight) => Math.max(0, Math.min(1, weight)));
+  const clamped = [1 - u - v, u, v].map(weight => Math.max(0, Math.min(1, weight)));
   const sum = clamped[0] + clamped[1] + clamped[2];
-  return clamped.map((weight) => weight / sum);
+  return clamped.map(weight => weight / sum);
 }
 
-// Unit normals (3·V) weighted by the area of triangles; 0 where a vertex has none.
-/** @type {(faces: Values, vertices: ArrayLike<number>) => Float64Array<ArrayBuffer>} */
-function vertexNormals(faces, vertices) {
-  const normals = new Float64Array(vertices.length);
-  for (let f = 0; f < faces.length; f += 3) {
-    const i = 3 * faces[f];
-    const j = 3 * faces[f + 1];
-    const k = 3 * faces[f + 2];
-    const ux = vertices[j] - vertices[i];
-    const uy = vertices[j + 1] - vertices[i + 1];
-    const uz = vertices[j + 2] - vertices[i + 2];
-    const vx = vertices[k] - vertices[i];
-    const vy = vertices[k + 1] - vertices[i + 1];
-    const vz = vertices[k + 2] - vertices[i + 2];
-    const [x, y, z] = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
-    for (const at of [i, j, k]) {
-      normals[at] += x;
-      normals[at + 1] += y;
-      normals[at + 2] += z;
-    }
+// Unit normals (3·V) weighted by the area of triangles, by their sides; 0 where there are none.
+/** @type {(faces: Values, sides: Float64Array, size: number) => Float64Array<ArrayBuffer>} */
+function vertexNormals(faces, sides, size) {
+  const normals = new Float64Array(size);
+  for (let c = 0; c < faces.length; c++) {
+    const from = 9 * Math.floor(c / 3) + 6;
+    for (let k = 0; k < 3; k++) normals[3 * faces[c] + k] += sides[from + k];
   }
-  for (let at = 0; at < normals.length; at += 3) {
-    const length = Math.max(Math.hypot(normals[at], normals[at + 1], normals[at + 2]), 1e-20);
-    for (let k = at; k < at + 3; k++) normals[k] /= length;
+  for (let at = 0; at < size; at += 3) {
+    const length = Math.hypot(normals[at], normals[at + 1], normals[at + 2]);
+    for (let k = at; k < at + 3; k++) normals[k] /= Math.max(length, 1e-20);
   }
   return normals;
 }

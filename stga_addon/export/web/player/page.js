@@ -58,7 +58,7 @@ export class LightControls {
     this.rows = Object.entries(RANGES).map(([name, range]) => this.addRange(section, name, range));
     this.color.addEventListener('input', () => this.apply());
     for (const name of ['pointerdown', 'pointermove']) {
-      this.pad.addEventListener(name, (event) => this.drag(/** @type {PointerEvent} */ (event)));
+      this.pad.addEventListener(name, event => this.drag(/** @type {PointerEvent} */ (event)));
     }
     avatar.addEventListener('camerachange', () => this.showDirection());
     avatar.addEventListener('lightchange', () => {
@@ -409,7 +409,7 @@ function addSlider(parent, { id, label, low, high, read, write, format = fixed }
     write(Number(input.value));
     update();
   });
-  value.addEventListener('click', (event) => {
+  value.addEventListener('click', event => {
     event.preventDefault();
     pin(false);
     write(null);
@@ -436,7 +436,7 @@ function addExpressions() {
       low: -reach,
       high: reach,
       read: () => avatar.getExpression(name),
-      write: (value) => avatar.setExpression(name, value),
+      write: value => avatar.setExpression(name, value),
     }),
   );
   section.hidden = !rows.length;
@@ -462,14 +462,14 @@ function addFaceShapes() {
   byId('shapes').hidden = !names.length;
   names.sort((one, other) => SHAPES_FIRST.indexOf(other) - SHAPES_FIRST.indexOf(one));
   const list = element('.sliders', HTMLElement, byId('shapes'));
-  const rows = names.map((name) =>
+  const rows = names.map(name =>
     addSlider(list, {
       id: name,
       label: name,
       low: 0,
       high: 1,
       read: () => avatar.getShape(name),
-      write: (value) => avatar.setShape(name, value),
+      write: value => avatar.setShape(name, value),
     }),
   );
   showFirst(rows, byId('more-shapes'));
@@ -481,8 +481,8 @@ function addFaceShapes() {
     byId('close-performance').hidden = !avatar.player?.motion.shapes.performance;
     showLength();
   });
-  document.addEventListener('dragover', (event) => event.preventDefault());
-  document.addEventListener('drop', (event) => {
+  document.addEventListener('dragover', event => event.preventDefault());
+  document.addEventListener('drop', event => {
     event.preventDefault();
     playFile(event.dataTransfer?.files[0]);
   });
@@ -505,7 +505,7 @@ async function playFile(file) {
 
 function addPose() {
   const known = POSE_SLIDERS.filter(([, joints]) =>
-    joints.every((joint) => info().joints.includes(joint)),
+    joints.every(joint => info().joints.includes(joint)),
   );
   const list = element('.sliders', HTMLElement, byId('pose'));
   for (const [label, joints, axis, low, high] of known) {
@@ -515,9 +515,8 @@ function addPose() {
       low,
       high,
       read: () => avatar.getPose(joints[0])[axis],
-      write: (value) =>
-        joints.forEach((joint) => avatar.setPose(joint, replaced(joint, axis, value))),
-      format: (value) => degrees((180 / Math.PI) * value),
+      write: value => joints.forEach(joint => avatar.setPose(joint, replaced(joint, axis, value))),
+      format: value => degrees((180 / Math.PI) * value),
     });
   }
   byId('pose').hidden = !known.length;
@@ -631,7 +630,7 @@ async function embeddedData() {
   const text = document.querySelector('#data')?.textContent?.trim();
   if (!text) throw new DataError('This page holds no avatar data.');
   try {
-    return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+    return Uint8Array.from(atob(text), character => character.charCodeAt(0));
   } catch {
     throw new DataError('The avatar data is damaged.');
   }

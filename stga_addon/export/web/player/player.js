@@ -5,11 +5,10 @@
 
 import { cameraOfView, fitted, frontCamera, bounds } from './camera.js';
 import { FaceFrames } from './face_frames.js';
-import { RendererError } from './gl.js';
 import { LightPass } from './light_pass.js';
 import { litBy } from './light.js';
 import { Motion, Rig } from './motion.js';
-import { DepthSort, Renderer } from './renderer.js';
+import { DepthSort, Renderer, RendererError } from './renderer.js';
 
 const TIMING_SHARE = 0.1; // of the newest frame in the running mean
 
@@ -110,8 +109,10 @@ export class Player {
   /** @param {Lighting} lighting */
   litPass(lighting) {
     this.lightPass ??= new LightPass(this.gl, this.data);
-    if (this.lit !== lighting)
-      this.lightPass.update(this.rig.vertices, litBy(lighting, this.data.header.up));
+    if (this.lit !== lighting) {
+      const light = litBy(lighting, this.data.header.up);
+      this.lightPass.update(this.rig.vertices, this.faceFrames.sides, light);
+    }
     this.lit = lighting;
     return this.lightPass;
   }

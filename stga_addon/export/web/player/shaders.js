@@ -33,7 +33,7 @@ export function tailTexels(harmonics, strains) {
 
 /** @param {number} k */
 function tailTriple(k) {
-  return `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map((at) => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
+  return `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map(at => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
 }
 
 // Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices

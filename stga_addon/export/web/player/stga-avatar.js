@@ -5,9 +5,9 @@
 
 import { addControls, cameraOfView } from './camera.js';
 import { DataError, readData } from './data.js';
-import { RendererError } from './gl.js';
+import { RendererError } from './renderer.js';
 import { litBy } from './light.js';
-import { readPerformance } from './performance.js';
+import { readPerformance } from './motion.js';
 import { Player } from './player.js';
 
 const MAX_PIXEL_RATIO = 2;
@@ -50,7 +50,7 @@ export class StgaAvatar extends HTMLElement {
       () => this.#changed('camerachange'),
       () => this.#changed('lightchange'),
     );
-    this.#canvas.addEventListener('webglcontextlost', (event) => this.#lose(event));
+    this.#canvas.addEventListener('webglcontextlost', event => this.#lose(event));
     this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
     new ResizeObserver(() => this.#resize()).observe(this);
   }
@@ -206,7 +206,7 @@ export class StgaAvatar extends HTMLElement {
         ? cameraOfView(
             views[
               this.#index(
-                views.map((view) => view.name),
+                views.map(view => view.name),
                 value,
                 'view',
               )
@@ -235,7 +235,7 @@ export class StgaAvatar extends HTMLElement {
     const part = (/** @type {number} */ at) => parseInt((digits ?? '').slice(at, at + 2), 16) / 255;
     if (this.#player)
       this.#player.background = digits ? [part(0), part(2), part(4), 1] : [0, 0, 0, 0];
-    this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+    this.#request ||= requestAnimationFrame(now => this.#tick(now));
   }
 
   /** Whether splats on triangles that the frame did not train are gray. */
@@ -287,7 +287,7 @@ export class StgaAvatar extends HTMLElement {
     const picture = document.createElement('canvas');
     [picture.width, picture.height] = camera.size;
     picture.getContext('2d')?.putImageData(new ImageData(pixels, ...camera.size), 0, 0);
-    return new Promise((resolve) => picture.toBlob(resolve, 'image/png'));
+    return new Promise(resolve => picture.toBlob(resolve, 'image/png'));
   }
 
   /** The player, for what this interface leaves out. */
@@ -312,7 +312,7 @@ export class StgaAvatar extends HTMLElement {
   /** @param {string | number} name of an expression, or its component */
   #component(name) {
     const { sliders } = this.#loaded.data.header;
-    const names = sliders.map((slider) =>
+    const names = sliders.map(slider =>
       typeof name === 'string' ? slider.name : slider.component,
     );
     return sliders[this.#index(names, name, 'expression')].component;
@@ -376,7 +376,7 @@ export class StgaAvatar extends HTMLElement {
 
   /** @param {string} event */
   #changed(event) {
-    if (this.#player) this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+    if (this.#player) this.#request ||= requestAnimationFrame(now => this.#tick(now));
     this.#player?.motion.sample(this.#time); // what listeners ask for is that of the new frame
     this.dispatchEvent(new CustomEvent(event));
   }
@@ -405,7 +405,7 @@ export class StgaAvatar extends HTMLElement {
 
   #resize() {
     const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    const [width, height] = [this.clientWidth, this.clientHeight].map((side) =>
+    const [width, height] = [this.clientWidth, this.clientHeight].map(side =>
       Math.max(1, Math.round(side * ratio)),
     );
     if (this.#canvas.width === width && this.#canvas.height === height) return;
@@ -418,7 +418,7 @@ export class StgaAvatar extends HTMLElement {
 /** @param {number[]} color red, green, blue from 0 to 1 */
 export function hexOf(color) {
   return `#${color
-    .map((part) =>
+    .map(part =>
       Math.round(255 * part)
         .toString(16)
         .padStart(2, '0'),

@@ -70,7 +70,7 @@ export function slerpAxisAngle(a, b, share) {
   let q = quaternionOf(b);
   let cosine = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
   if (cosine < 0) {
-    q = q.map((part) => -part);
+    q = q.map(part => -part);
     cosine = -cosine;
   }
   const angle = Math.acos(Math.min(1, cosine));
