@@ -73,8 +73,7 @@ def test_a_head_in_edit_mode_is_named():
 def test_failed_render_is_an_error_and_an_empty_image(
     stage, raised, message, tmp_path, monkeypatch
 ):
-    """Catches an image without passes, which Blender cannot save or crashes over, and a failure
-    saved as an image."""
+    """Catches an image without passes, and a failure saved as an image."""
 
     def fail(*_: object) -> None:
         raise raised
@@ -112,8 +111,7 @@ def test_panels_drop_the_engine_on_unregister():
 
 
 def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
-    """Catches preferences, which belong to the main thread, read from a render thread, and an error
-    that is lost."""
+    """Catches preferences read from a render thread, and an error that is lost."""
     monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
     answers, callers = [StgaError("no environment"), "python"], []
 

@@ -1,5 +1,4 @@
-"""The built zip, installed as a user installs it: into a new Blender profile, in its own
-process."""
+"""The built zip, installed as users do: in a new Blender profile and process."""
 
 import json
 import os
@@ -71,8 +70,7 @@ def test_same_files_as_blenders_own_build(zip_file, tmp_path):
 
 
 def test_zip_holds_what_the_extension_runs(zip_file):
-    """Catches tests, docs, the benchmark, the demo or the photo studio in the zip, and a module
-    left out."""
+    """Catches tests, docs or development in the zip, and a module left out."""
     names = set(zipfile.ZipFile(zip_file).namelist())
     left_out = ("tests/", "docs/", "benchmarks/", "stga_addon/development/", ".")
     assert not [name for name in names if name.startswith(left_out) or name.endswith(".pyc")]
@@ -164,8 +162,7 @@ print("RESULT " + json.dumps(result))
 
 
 def test_install_use_and_uninstall(zip_file, shared_data, tmp_path):
-    """Catches absolute imports, files left out of the zip, and packages that enabling, importing or
-    showing needs."""
+    """Catches absolute imports, files left out, and packages needed too early."""
     folder = shared_data / "studio_head"
     capture = open_capture(folder)
     splats = lattice_splats(capture.neutral, capture.faces, order=0, sh_degree=0)

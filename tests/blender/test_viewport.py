@@ -27,8 +27,7 @@ def request(x: float = 0.0, layers=(), background=None) -> RenderRequest:
 
 
 class Recorder:
-    """A renderer whose images are empty; records the requests, and lets the thread go on one image
-    per `go`."""
+    """A renderer of empty images that records requests; one image per `go`."""
 
     def __init__(self, error: Exception | None = None, waits: bool = False) -> None:
         self.rendered: list[tuple[RenderRequest, float]] = []
@@ -133,8 +132,7 @@ def poll_until_idle() -> None:
 
 
 def test_viewports_are_redrawn_from_the_main_thread():
-    """Catches bpy called from the render thread, a last image that is never shown, and a timer that
-    runs when idle."""
+    """Catches bpy in the render thread, a lost last image, and an idle timer."""
     recorder, engine = Recorder(waits=True), Engine()
     recorder.renderer.request(request())
     engine_viewport.redraw_when_rendered(recorder.renderer, engine)
