@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -157,8 +158,8 @@ def read_vertices(path: Path) -> np.ndarray:
             file.seek(offset if is_ascii else offset + skipped)
             if not is_ascii or not count:
                 return np.fromfile(file, dtype, count)
-            rows = {"skiprows": skipped, "max_rows": count, "ndmin": 2}
-            table = np.loadtxt(file, np.float64, comments=None, **rows)
+            lines = islice(file, skipped, skipped + count)
+            table = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
@@ -166,7 +167,7 @@ def read_vertices(path: Path) -> np.ndarray:
     if table.shape != (count, len(names)):
         expected = count, len(names)
         raise StgaError(f"{path}: has vertices of shape {table.shape}, expected {expected}")
-    return unstructured_to_structured(table, dtype)
+    return np.asarray(unstructured_to_structured(table, dtype))
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dtype]:

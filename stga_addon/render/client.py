@@ -92,7 +92,8 @@ class RenderClient:
             ) from error
         self._sent, self.failure = layers, str(reply.get("failure", ""))
         if "error" in reply:
-            raise StgaError(f"{python}: the render server could not render ({reply['error']})")
+            reason = f"could not render the image ({reply['error']})"
+            raise StgaError(f"{python}: the render server {reason}")
         return ComposedImage(reply["rgb"], reply["alpha"], reply["depth"] if with_depth else None)
 
     def _python(self) -> str:

@@ -148,8 +148,8 @@ class Composer:
             except Exception as error:  # a driver raises what it likes
                 if self.requested != "auto":
                     raise
-                known = isinstance(error, DeviceError)
-                cause = error.cause if known else f"{self.device}: {first_line(error)}"
+                cause = f"{self.device}: {first_line(error)}"
+                cause = error.cause if isinstance(error, DeviceError) else cause
                 self.device, self.failure = "cpu", one_line(f"{cause}; the CPU renders instead")
                 logging.getLogger(__name__).warning(self.failure)
         from ..raster.cpu import compose as cpu

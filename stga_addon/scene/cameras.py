@@ -232,7 +232,7 @@ def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
         if evaluated.matrix_world.determinant() < 0:
             raise StgaError(f"{thing.name}: is mirrored by a negative scale; apply the scale")
         size = thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
-        camera = render_camera(evaluated, depsgraph, *map(int, size))
+        camera = render_camera(evaluated, depsgraph, int(size[0]), int(size[1]))
         pose = Z_UP_TO_Y_UP @ camera.camera_to_world_gl
         entry = {"file_path": f"{thing.name}.png", "camera_id": thing.name}
         entry |= {"w": camera.width, "h": camera.height, "transform_matrix": pose.tolist()}

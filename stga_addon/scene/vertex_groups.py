@@ -63,8 +63,11 @@ def read_selection(head: Any) -> dict[int, np.ndarray]:
     group; a timestep without a group selects nothing.
     """
     head.update_from_editmode()
-    groups = {tags.group_timestep(group.name): group.index for group in head.vertex_groups}
-    groups.pop(None, None)
+    groups = {
+        timestep: group.index
+        for group in head.vertex_groups
+        if (timestep := tags.group_timestep(group.name)) is not None
+    }
     timesteps = {int(timestep) for timestep in head.get(tags.TIMESTEPS, ())} | set(groups)
     selected = dict(zip(groups, _read_faces(head, list(groups.values())), strict=True))
     faces = len(head.data.polygons)

@@ -130,8 +130,8 @@ def test_render_of_the_open_head(stga, here, tmp_path):
     cameras = folder / "transforms_val.json"
     assert here("render", "--cameras", cameras, "--out", tmp_path / "here") == 0
     assert stga("render", "--cameras", cameras, "--out", tmp_path / "there") == 0
-    assert stga("render", tmp_path / "a.npz", "--capture", folder, "--flame", model, "--cameras", cameras,
-                "--out", tmp_path / "tracked") == 0  # fmt: skip
+    given = ("--capture", folder, "--flame", model, "--cameras", cameras)
+    assert stga("render", tmp_path / "a.npz", *given, "--out", tmp_path / "tracked") == 0
     pictures, there, tracked = (
         [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))]
         for name in ("here", "there", "tracked")

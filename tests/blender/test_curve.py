@@ -97,7 +97,8 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     painted = np.array(curve._previews[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
     np.testing.assert_allclose(painted, curve_image(lines())[0], atol=1 / 255)
     file.write_text(
-        '{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n'
+        '{"iteration": 1, "seconds": "x", "psnr": 1}\n'
+        '{"iteration": 2, "seconds": 2, "psnr": null}\n'
     )
     assert draw() == []
     assert len(bpy.data.images) == 0

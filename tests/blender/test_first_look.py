@@ -30,7 +30,10 @@ def head(extension, tmp_path):
 
 def viewports() -> list:
     return [
-        area.spaces.active for screen in bpy.data.screens for area in screen.areas if area.type == "VIEW_3D"
+        area.spaces.active
+        for screen in bpy.data.screens
+        for area in screen.areas
+        if area.type == "VIEW_3D"
     ]  # fmt: skip
 
 

@@ -97,9 +97,13 @@ def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
         "rotated and scaled": ([layer(avatar(3), TURNED)], near),
         "orthographic": ([layer(avatar(3))], far),
         "inside": ([layer(avatar(2))], inside),
-        "two and world": ([layer(avatar(3)), layer(avatar(0, True), TURNED), unembedded(avatar(2))], near),
+        "two and world": (
+            [layer(avatar(3)), layer(avatar(0, True), TURNED), unembedded(avatar(2))], near,
+        ),
         "display settings": ([layer(avatar(2, True), settings=display, frozen=frozen)], near),
-        "selected only": ([layer(avatar(0), settings=DisplaySettings(selected_only=True), frozen=frozen)], near),
+        "selected only": (
+            [layer(avatar(0), settings=DisplaySettings(selected_only=True), frozen=frozen)], near,
+        ),
     }  # fmt: skip
 
 
@@ -126,7 +130,8 @@ def psnr_db(found: np.ndarray, expected: np.ndarray) -> float:
 def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact: bool) -> None:
     expected = render(layers, camera, exact)
     print(
-        f"{psnr_db(found.rgb, expected.rgb):.1f} dB, alpha {psnr_db(found.alpha, expected.alpha):.1f} dB"
+        f"{psnr_db(found.rgb, expected.rgb):.1f} dB, "
+        f"alpha {psnr_db(found.alpha, expected.alpha):.1f} dB"
     )
     assert psnr_db(found.rgb, expected.rgb) >= MIN_PSNR_DB
     assert psnr_db(found.alpha, expected.alpha) >= MIN_PSNR_DB

@@ -135,11 +135,17 @@ def baked_irradiance(shown, head) -> np.ndarray:
 LAMPS = {
     "sun": ("SUN", (1.0, -0.5, 2.0), 3.0, {"angle": 0.02}),
     "point": ("POINT", (0.9, -0.6, 0.9), 20.0, {"shadow_soft_size": 0.01}),
-    "spot": ("SPOT", (0.9, -0.6, 0.9), 80.0, {"spot_size": 0.4, "spot_blend": 0.6, "shadow_soft_size": 0.01}),
+    "spot": (
+        "SPOT", (0.9, -0.6, 0.9), 80.0,
+        {"spot_size": 0.4, "spot_blend": 0.6, "shadow_soft_size": 0.01},
+    ),
     "area": ("AREA", (0.4, -1.0, 0.8), 10.0, {"shape": "RECTANGLE", "size": 0.3, "size_y": 0.1}),
-    "disk, exposed": ("AREA", (1.2, 0.6, 0.8), 4.0, {"shape": "DISK", "size": 0.2, "exposure": 1.5}),
+    "disk, exposed": (
+        "AREA", (1.2, 0.6, 0.8), 4.0, {"shape": "DISK", "size": 0.2, "exposure": 1.5},
+    ),
     "per area, warm": (
-        "AREA", (0.4, -1.0, 0.8), 90.0, {"size": 0.2, "normalize": False, "use_temperature": True, "temperature": 3e3}
+        "AREA", (0.4, -1.0, 0.8), 90.0,
+        {"size": 0.2, "normalize": False, "use_temperature": True, "temperature": 3e3},
     ),
 }  # fmt: skip
 
@@ -238,7 +244,8 @@ def test_edges_of_shadows_are_those_of_cycles(kind, energy, tmp_path):
     one, other = apart.min(0), apart.min(1)
     most = [float(np.quantile(distance, 0.95)) for distance in (one, other)]
     print(
-        f"{kind}: {len(theirs)} pixels of edges; mean {one.mean():.2f}, {other.mean():.2f}, 95 % {most} px"
+        f"{kind}: {len(theirs)} pixels of edges; "
+        f"mean {one.mean():.2f}, {other.mean():.2f}, 95 % {most} px"
     )
     assert max(most) < 2
 

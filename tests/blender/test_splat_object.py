@@ -505,7 +505,8 @@ def test_trees_and_materials_are_built_once(tmp_path: Path):
 
 
 TREES = [
-    ("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False), ("stga", 0, False, ("strain_position",)),
+    ("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False),
+    ("stga", 0, False, ("strain_position",)),
     ("gaussian_avatars", 3, True, ("strain_position",)),
 ]  # fmt: skip
 

@@ -11,8 +11,10 @@ from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply, write_ply
 
 NAMES = {
-    "i1": ("char", "int8"), "u1": ("uchar", "uint8"), "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
-    "i4": ("int", "int32"), "u4": ("uint", "uint32"), "f4": ("float", "float32"), "f8": ("double", "float64"),
+    "i1": ("char", "int8"), "u1": ("uchar", "uint8"),
+    "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
+    "i4": ("int", "int32"), "u4": ("uint", "uint32"),
+    "f4": ("float", "float32"), "f8": ("double", "float64"),
 }  # fmt: skip
 CODES = {name: code for code, names in NAMES.items() for name in names}
 """Scalar types of PLY by both of their names: Turk's description of the format, and those of newer

@@ -273,7 +273,7 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
         if name not in OFFSET_STEPS_M:
             raise ValueError(f"the web player has no driven offset {name}")
         arrays[name] = FixedPoint(coefficients.reshape(rows), OFFSET_STEPS_M[name] / unit)
-    header = {
+    header: dict[str, Any] = {
         "title": playback.title,
         "convention": avatar.convention,
         "antialiased": avatar.antialiased,

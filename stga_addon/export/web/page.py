@@ -89,9 +89,9 @@ def write_web(
               the posed `meshes` (V, 3) meters are baked, of which there is one at least
     Raises StgaError where there is no pose, or a file cannot be written.
     """
-    is_baked = playback.motion_only or sequence is None
+    motion = None if playback.motion_only else sequence
     try:
-        rig = baked_rig(list(meshes)) if is_baked else flame_rig(sequence)
+        rig = baked_rig(list(meshes)) if motion is None else flame_rig(motion)
         data = data_file(avatar, rig, playback)
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error

@@ -87,7 +87,8 @@ class _Formula:
 
 def _band(degree: int, nodes: Nodes, direction: Any) -> Any:
     """Sum of the coefficients of one degree times their harmonics in a unit direction."""
-    axes = (_Formula(lambda axis=axis: axis, nodes) for axis in nodes.components(direction))
+    x, y, z = nodes.components(direction)
+    axes = _Formula(lambda: x, nodes), _Formula(lambda: y, nodes), _Formula(lambda: z, nodes)
     total, terms = (0, 0, 0), harmonics(*axes)
     for index in range(degree**2, (degree + 1) ** 2):
         coefficient = nodes.attribute(SH.format(index), "FLOAT_VECTOR")

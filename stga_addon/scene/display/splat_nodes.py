@@ -129,8 +129,8 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
     fraction = {"default_value": 0.0, "min_value": 0.0, "max_value": 1.0}
     add(OPACITY_THRESHOLD, "Float", "Hide splats with a lower opacity", **fraction)
     percentage = {"default_value": 100.0, "min_value": 0.0, "max_value": 100.0}
-    percentage["subtype"] = "PERCENTAGE"
-    add(PERCENTAGE, "Float", "Show only a random part of the splats", **percentage)
+    description = "Show only a random part of the splats"
+    add(PERCENTAGE, "Float", description, subtype="PERCENTAGE", **percentage)
     if degree > 0:
         description = "Colors as the scene's active camera sees them; off: their constant part"
         add(VIEW_DEPENDENT, "Bool", description, default_value=True)
