@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -158,8 +157,7 @@ def read_vertices(path: Path) -> np.ndarray:
             file.seek(offset if is_ascii else offset + skipped)
             if not is_ascii or not count:
                 return np.fromfile(file, dtype, count)
-            lines = islice(file, skipped, skipped + count)
-            table = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
+            table = np.loadtxt(file, np.float64, None, skiprows=skipped, max_rows=count, ndmin=2)
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:

@@ -1,5 +1,6 @@
 // @ts-check
-// Pinhole cameras (OpenCV axes: x right, y down, z ahead), and how mouse, pen and touch move one around a point.
+// Pinhole cameras (OpenCV axes: x right, y down, z ahead), and how mouse, pen and touch move one
+// around a point.
 
 /**
  * @import { Player } from './player.js'

@@ -89,7 +89,10 @@ function readArrays(header, payload) {
   return arrays;
 }
 
-/** @type {(name: string, entry: any, block: Uint8Array, count: number) => Float32Array | Int32Array} */
+/**
+ * @type {(name: string, entry: any, block: Uint8Array, count: number) => Float32Array |
+ *   Int32Array}
+ */
 function decoded(name, entry, block, count) {
   if (entry.type === 'float32') return new Float32Array(block.slice().buffer);
   const step = entry.type === 'fixed' ? entry.step : 1;

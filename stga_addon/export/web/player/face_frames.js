@@ -1,6 +1,6 @@
 // @ts-check
-// Local frames of the triangles, in which splats are stored, and what these follow: strain against the neutral mesh.
-// The rules are those of STGA for Blender's embedding.py and strain.py.
+// Local frames of the triangles, in which splats are stored, and what these follow: strain against
+// the neutral mesh. The rules are those of STGA for Blender's embedding.py and strain.py.
 
 /** @import { Arrays, Values, Vector } from './types.js' */
 
@@ -218,7 +218,10 @@ function edgesOf(faces) {
 }
 
 // Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
-/** @type {(a: ArrayLike<number>, b: ArrayLike<number>, factor: number, out: Float32Array, at: number) => void} */
+/**
+ * @type {(a: ArrayLike<number>, b: ArrayLike<number>, factor: number, out: Float32Array, at:
+ *   number) => void}
+ */
 function symmetricProduct(a, b, factor, out, at) {
   for (let k = 0; k < 3; k++) {
     const next = (k + 1) % 3;
@@ -227,13 +230,15 @@ function symmetricProduct(a, b, factor, out, at) {
   }
 }
 
-/** By the name of their coefficients in a data file (faces, 3·components); of the strain, which is updated first. */
+// By the name of their coefficients in a data file (faces, 3·components); of the strain, which is
+// updated first.
 export const SIGNALS = { strain_position: SmoothedStrain };
 
 const MIN_DIVISOR = 1e-30;
 const MIN_AREA_RATIO = 1e-4; // of a triangle that counts as a line, to its longest edge's square
 const UPRIGHT_COSINE = 0.8;
-export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of matrix | origin, then strain | selected
+// Of a triangle in the texture: three rows of matrix | origin, then strain | selected.
+export const FACE_FLOATS = 16;
 
 export class FaceFrames {
   // Arrays of the data file, and the convention of the embedding; strain is computed where splats
@@ -248,7 +253,8 @@ export class FaceFrames {
     this.faces = faces;
     this.count = faces.length / 3;
     this.isStga = convention === 'stga';
-    this.world = new Float64Array(12 * this.count); // rotation · scale and origin, rows of a 3×4 matrix
+    // Rotation · scale and origin, rows of a 3×4 matrix.
+    this.world = new Float64Array(12 * this.count);
     this.sides = sidesOf(faces, neutral); // of the triangles as last placed
     this.neutralArea = neutralAreas(this.sides);
     const offsets = Object.entries(SIGNALS).filter(([name]) => arrays[name]);
@@ -394,7 +400,9 @@ function neutralAreas(sides) {
 
 // Make first and normal of a triangle that is a line, or whose `first` has no length, perpendicular
 // unit vectors.
-/** @type {(first: Float64Array, normal: Float64Array, isShort: boolean, isLine: boolean) => void} */
+/**
+ * @type {(first: Float64Array, normal: Float64Array, isShort: boolean, isLine: boolean) => void}
+ */
 function substitute(first, normal, isShort, isLine) {
   const x = isShort ? [1, 0, 0] : unit(first);
   const isUpright = Math.abs(x[2]) > UPRIGHT_COSINE;

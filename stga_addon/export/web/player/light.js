@@ -1,6 +1,7 @@
 // @ts-check
-// Distant light: as it is asked for, as the player computes with it, and how a head receives and reflects it. Axes are
-// those of the data file's meshes; the rules are those of STGA for Blender's light/.
+// Distant light: as it is asked for, as the player computes with it, and how a head receives and
+// reflects it. Axes are those of the data file's meshes; the rules are those of STGA for Blender's
+// light/.
 
 /** @import { Environment, Lighting, LitBy, Values, Vector } from './types.js' */
 
@@ -59,7 +60,10 @@ export function litBy(lighting, up) {
 }
 
 // Add an environment whose axes a rotation takes to those of the head; returns its sun.
-/** @type {(world: Float64Array, name: string, rotation: ArrayLike<number>) => { toward: Vector; color: Vector; } | null} */
+/**
+ * @type {(world: Float64Array, name: string, rotation: ArrayLike<number>) => { toward: Vector;
+ *   color: Vector; } | null}
+ */
 function addEnvironment(world, name, rotation) {
   if (!Object.hasOwn(ENVIRONMENTS, name))
     throw new RangeError(`There is no environment "${name}".`);
@@ -92,7 +96,8 @@ function check(values, count, name) {
   }
 }
 
-// Spherical harmonics of degree 2, in which distant light is kept: nine coefficients of red, green and blue each.
+// Spherical harmonics of degree 2, in which distant light is kept: nine coefficients of red, green
+// and blue each.
 
 export const HARMONICS = 9;
 const DEGREE_0 = 0.28209479177387814;
@@ -100,7 +105,8 @@ const DEGREE_1 = 0.4886025119029199;
 const MIXED = 1.0925484305920792; // xy, yz, xz
 const UPRIGHT = 0.31539156525252005; // 3z² − 1
 const CROSSED = 0.5462742152960396; // x² − y²
-/** Of each coefficient in a lobe max(0, cosine), over its value in the lobe's direction (Ramamoorthi and Hanrahan). */
+// Of each coefficient in a lobe max(0, cosine), over its value in the lobe's direction (Ramamoorthi
+// and Hanrahan).
 export const COSINE_LOBE = [
   Math.PI,
   ...Array(3).fill((2 * Math.PI) / 3),
@@ -168,7 +174,8 @@ export function turnedVector(rotation, v) {
 // R · M · Rᵀ of 3×3 matrices, row by row.
 /** @type {(rotation: ArrayLike<number>, m: number[]) => number[]} */
 function turnedMatrix(rotation, m) {
-  const rows = [0, 3, 6].map(k => turnedVector(rotation, m.slice(k, k + 3))); // (R · row)ᵀ: rows of M · Rᵀ
+  // (R · row)ᵀ: rows of M · Rᵀ.
+  const rows = [0, 3, 6].map(k => turnedVector(rotation, m.slice(k, k + 3)));
   const columns = [0, 1, 2].map(k => turnedVector(rotation, [rows[0][k], rows[1][k], rows[2][k]]));
   return [0, 1, 2].flatMap(row => columns.map(column => column[row]));
 }
@@ -196,7 +203,8 @@ export function rigidRotation(from, to, weights) {
     const [r0, r1, r2] = [m.slice(0, 3), m.slice(3, 6), m.slice(6, 9)];
     const cofactors = [crossed(r1, r2), crossed(r2, r0), crossed(r0, r1)].flat();
     const determinant = dotProduct(r0, cofactors);
-    if (!(Math.abs(determinant) > 1e-300)) return [1, 0, 0, 0, 1, 0, 0, 0, 1]; // a mesh without an extent
+    // A mesh without an extent.
+    if (!(Math.abs(determinant) > 1e-300)) return [1, 0, 0, 0, 1, 0, 0, 0, 1];
     const next = m.map((value, at) => (value + cofactors[at] / determinant) / 2);
     const change = next.reduce((most, value, at) => Math.max(most, Math.abs(value - m[at])), 0);
     m = next;
@@ -206,7 +214,10 @@ export function rigidRotation(from, to, weights) {
 }
 
 // Σ weight · to · fromᵀ about the weighted means, over its norm.
-/** @type {(from: ArrayLike<number>, to: ArrayLike<number>, weights: ArrayLike<number>) => number[]} */
+/**
+ * @type {(from: ArrayLike<number>, to: ArrayLike<number>, weights: ArrayLike<number>) =>
+ *   number[]}
+ */
 function covariance(from, to, weights) {
   const sums = { from: [0, 0, 0], to: [0, 0, 0], weight: 0 };
   const m = Array(9).fill(0);
@@ -314,7 +325,7 @@ export class Bounce {
   }
 }
 
-/** Difference between two lights from which on nothing is kept, as a share of the capture's light. */
+// Difference between two lights from which on nothing is kept, as a share of the capture's light.
 const UNLIKE_LIGHT = 0.2;
 
 // Gain of red, green and blue, and share, by the light of the capture and the one that is shown (27

@@ -1,6 +1,7 @@
 // @ts-check
-// Colors of the splats under the light of a scene: a texel a splat, computed again where pose, light or eye have changed.
-// What depends on the avatar alone is in the data file (STGA for Blender's light/surface.py and light/relight.py).
+// Colors of the splats under the light of a scene: a texel a splat, computed again where pose,
+// light or eye have changed. What depends on the avatar alone is in the data file (STGA for
+// Blender's light/surface.py and light/relight.py).
 
 /** @import { Arrays, Data, LitBy, Program, Target, Values, Vector } from './types.js' */
 
@@ -37,7 +38,8 @@ import {
 } from './shaders.js';
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
-/** Of each harmonic in the mean radiance around the direction that skin mirrors (light/harmonics.py, GLOSSY). */
+// Of each harmonic in the mean radiance around the direction that skin mirrors (light/harmonics.py,
+// GLOSSY).
 const GLOSSY = [1, 0.85, 0.85, 0.85, 0.62, 0.62, 0.62, 0.62, 0.62];
 const MIN_RIGID = 1e-3; // weight of covered vertices where the turn of the head is found
 const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
@@ -175,7 +177,10 @@ export class LightPass {
 
   // Compute the colors seen from a camera (world to camera, row-major); returns their texture.
   // Textures are the renderer's, and the framebuffer and viewport are others afterwards.
-  /** @type {(camera: ArrayLike<number>, splats: WebGLTexture, tail: WebGLTexture, frames: WebGLTexture) => WebGLTexture} */
+  /**
+   * @type {(camera: ArrayLike<number>, splats: WebGLTexture, tail: WebGLTexture, frames:
+   *   WebGLTexture) => WebGLTexture}
+   */
   draw(camera, splats, tail, frames) {
     const { gl, colors, view, light } = this;
     const { program, uniforms } = this.program;
@@ -316,7 +321,10 @@ function placed(world, face, xyz, splat) {
 }
 
 // Barycentric coordinates of a point in the plane of a triangle, clamped to it.
-/** @type {(a: ArrayLike<number>, b: ArrayLike<number>, c: ArrayLike<number>, point: Vector) => number[]} */
+/**
+ * @type {(a: ArrayLike<number>, b: ArrayLike<number>, c: ArrayLike<number>, point: Vector) =>
+ *   number[]}
+ */
 function nearestWeights(a, b, c, point) {
   const [first, second, offset] = [difference(b, a), difference(c, a), difference(point, a)];
   const uu = dotProduct(first, first);

@@ -1,6 +1,6 @@
 // @ts-check
-// The recorded motion, ARKit's shapes and the values by which a person or a program replaces parts of it; and the mesh of a
-// pose.
+// The recorded motion, ARKit's shapes and the values by which a person or a program replaces parts
+// of it; and the mesh of a pose.
 
 /** @import { Data, Performance } from './types.js' */
 
@@ -13,7 +13,8 @@ import {
   slerpAxisAngle,
 } from './vector.js';
 
-/** Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded one. */
+// Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded
+// one.
 export class Motion {
   /** @param {Data} data */
   constructor(data) {
@@ -67,7 +68,10 @@ export class Motion {
   }
 }
 
-/** @type {(values: ArrayLike<number>, first: number, second: number, share: number, out: Float64Array) => void} */
+/**
+ * @type {(values: ArrayLike<number>, first: number, second: number, share: number, out:
+ *   Float64Array) => void}
+ */
 function blend(values, first, second, share, out) {
   const size = out.length;
   for (let k = 0; k < size; k++) {
@@ -96,7 +100,8 @@ export class Rig {
     this.vertices = new Float64Array(this.base.length);
     this.joints = new Float64Array(3 * joints);
     this.local = new Float64Array(9 * joints);
-    this.skin = new Float64Array(12 * joints); // per joint: rotation and offset, rows of a 3×4 matrix
+    // Per joint: rotation and offset, rows of a 3×4 matrix.
+    this.skin = new Float64Array(12 * joints);
     this.placed = new Float64Array(3 * joints);
   }
 

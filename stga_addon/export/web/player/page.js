@@ -15,9 +15,10 @@ const fixed = (/** @type {number} */ value) => value.toFixed(2);
 const degrees = (/** @type {number} */ value) => `${Math.round(value)}°`;
 const signed = (/** @type {number} */ value) =>
   `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
-const PAD_ANGLE = 2.6; // radians from the camera's own direction at the rim of the pad: the light comes from behind
+// Radians from the camera's own direction at the rim of the pad: the light comes from behind.
+const PAD_ANGLE = 2.6;
 const DRAGGED = 'dragged';
-/** Label, kinds that have it ("*": all environments), range, first value and format of each slider. */
+// Label, kinds that have it ("*": all environments), range, first value and format of each slider.
 const RANGES = {
   strength: { label: 'Strength', kinds: DRAGGED, low: 0, high: 8, value: 3, format: fixed },
   even: { label: 'Even light', kinds: DRAGGED, low: 0, high: 1, value: 0.15, format: fixed },
@@ -63,7 +64,8 @@ export class LightControls {
     avatar.addEventListener('camerachange', () => this.showDirection());
     avatar.addEventListener('lightchange', () => {
       const sun = avatar.lighting?.sun;
-      if (sun && this.kind === DRAGGED) this.toward = sun.toward; // it may have been dragged over the head
+      // It may have been dragged over the head.
+      if (sun && this.kind === DRAGGED) this.toward = sun.toward;
       this.showDirection();
     });
     this.showKind();
@@ -187,10 +189,9 @@ function linearColor(hex) {
  */
 
 const SLIDERS_SHOWN = 8;
-const SHAPES_FIRST = // the last comes first
-  'browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight eyeBlinkLeft mouthClose jawOpen'.split(
-    ' ',
-  );
+// The last comes first.
+const SHAPES_FIRST = `browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight
+  eyeBlinkLeft mouthClose jawOpen`.split(/\s+/);
 const FACTS_INTERVAL_MS = 500;
 const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
 const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
@@ -586,7 +587,8 @@ function showFacts() {
   const splats = avatar.splatCount.toLocaleString('en');
   const rate = avatar.frameCount > 1 ? ` · ${Number(avatar.fps.toFixed(2))} fps` : '';
   byId('facts').innerHTML =
-    `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms of JavaScript a frame</span>`;
+    `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms ` +
+    'of JavaScript a frame</span>';
 }
 
 function start() {
@@ -625,7 +627,7 @@ addEventListener('keydown', press);
 avatar.addEventListener('load', start, { once: true });
 avatar.addEventListener('error', fail);
 
-/** The data file that the page holds as base64. Throws DataError where it was cut off or altered. */
+// The data file that the page holds as base64. Throws DataError where it was cut off or altered.
 async function embeddedData() {
   const text = document.querySelector('#data')?.textContent?.trim();
   if (!text) throw new DataError('This page holds no avatar data.');

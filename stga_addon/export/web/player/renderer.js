@@ -1,5 +1,6 @@
 // @ts-check
-// Splats on a WebGL2 canvas: sorted, blended back to front into a float target, then over the background.
+// Splats on a WebGL2 canvas: sorted, blended back to front into a float target, then over the
+// background.
 
 /**
  * @import { LightPass } from './light_pass.js'
@@ -380,7 +381,8 @@ export class DepthSort {
     low.fill(0);
     high.fill(0);
     for (let i = 0; i < key.length; i++) {
-      // From 0 for the farthest to MAX_KEY for the nearest and those behind the camera; below 0 only by rounding.
+      // From 0 for the farthest to MAX_KEY for the nearest and those behind the camera; below 0
+      // only by rounding.
       const steps = (far - depth[i]) * scale;
       key[i] = steps < MAX_KEY ? Math.max(steps, 0) : MAX_KEY;
       low[key[i] & (DIGITS - 1)]++;

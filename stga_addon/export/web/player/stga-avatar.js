@@ -1,5 +1,6 @@
 // @ts-check
-// <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element (docs/web.md).
+// <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element
+// (docs/web.md).
 
 /** @import { Camera, Lighting } from './types.js' */
 
@@ -15,9 +16,11 @@ const MAX_STEP_S = 0.25; // of playback time between two frames: a hidden tab re
 
 const STYLE = `
 :host { display: block; position: relative; overflow: hidden; contain: content; }
-canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab; outline: none; }
+canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab;
+  outline: none; }
 canvas:active { cursor: grabbing; }
-p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 30em; padding: 1em; text-align: center;
+p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 30em; padding: 1em;
+  text-align: center;
   font: 16px/1.5 system-ui, sans-serif; }
 [hidden] { display: none; }`;
 
@@ -65,7 +68,10 @@ export class StgaAvatar extends HTMLElement {
 
   // Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of
   // one). Rejects, and says why on the page.
-  /** @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>} source */
+  /**
+   * @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>}
+   *   source
+   */
   async load(source) {
     const loading = ++this.#loading;
     try {
@@ -80,7 +86,8 @@ export class StgaAvatar extends HTMLElement {
     }
   }
 
-  /** What the data file says of itself: title, fps, views, sliders, joints, …; null before it is loaded. */
+  // What the data file says of itself: title, fps, views, sliders, joints, …; null before it is
+  // loaded.
   get info() {
     return this.#player?.data.header ?? null;
   }

@@ -1,5 +1,6 @@
 // @ts-check
-// Vectors of three numbers, and rotations as axis-angle vectors, unit quaternions (w, x, y, z) and 3×3 matrices, row by row.
+// Vectors of three numbers, and rotations as axis-angle vectors, unit quaternions (w, x, y, z) and
+// 3×3 matrices, row by row.
 
 /** @import { Values, Vector } from './types.js' */
 
