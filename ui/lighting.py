@@ -10,7 +10,7 @@ from ..operators import ids
 from ..operators.common import scene_settings
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.display.splat_object import shows_nodes, stored_light
-from ..stga_addon.scene.light.lights import world_light
+from ..stga_addon.scene.light.scene_light import world_light
 from ..stga_addon.scene.light.settings import lighting_settings
 from ..stga_addon.scene.render.scene_splats import light_hint
 from .request import draw_running

@@ -6,7 +6,7 @@ import bpy
 
 from ..operators.training_python import has_training_python
 from ..stga_addon.render.client import missing_packages
-from ..stga_addon.scene.gpu.context import has_gpu_context
+from ..stga_addon.scene.gpu.renderer import has_gpu_context
 from ..stga_addon.scene.render.engine import ENGINE
 
 

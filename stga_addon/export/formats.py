@@ -1,5 +1,4 @@
-"""The table of export formats, what their writers are given, and export of an avatar in one of
-them."""
+"""Export formats: a table of their writers, and export of an avatar in one of them."""
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -105,9 +104,12 @@ FORMATS = {
         (".usdc", ".usdz"),
         "range",
         lambda path, content: write_usd(
-            path, content.frames(path), content.playback.fps, _has_moving_color(content.avatar)
+            path,
+            content.frames(path),
+            content.playback.fps,
+            content.avatar.splats.strain_color.size > 0,
         ),
-        lambda avatar, frames: usd_bytes(avatar.splats, frames, _has_moving_color(avatar)),
+        lambda avatar, frames: usd_bytes(avatar.splats, frames),
         has_rate=True,
     ),
     "web": Format(
@@ -146,14 +148,10 @@ FORMATS = {
 
 
 def export_avatar(
-    path: Path,
-    avatar: Avatar,
-    format: str,
-    meshes: Meshes = (),
-    sequence: FlameSequence | None = None,
-    fps: float = DEFAULT_FPS,
+    path: Path, avatar: Avatar, format: str, meshes: Meshes = (),
+    sequence: FlameSequence | None = None, fps: float = DEFAULT_FPS,
     playback: Playback | None = None,
-) -> list[Path]:
+) -> list[Path]:  # fmt: skip
     """Write an avatar in one of FORMATS, all of its files or none; returns the files written.
 
     path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its
@@ -181,15 +179,9 @@ def check_suffix(path: Path, format: str) -> None:
 
 
 def check_free_space(path: Path, size: int) -> None:
-    """Raise StgaError where the disk that `path` is to be written to has less than `size` bytes
-    free."""
+    """Raise StgaError where the disk that `path` is on has less than `size` bytes free."""
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     free = shutil.disk_usage(folder).free
     if size > free:
-        raise StgaError(
-            f"{path}: needs {format_bytes(size)}, but {format_bytes(free)} are free there; choose fewer frames"
-        )
-
-
-def _has_moving_color(avatar: Avatar) -> bool:
-    return avatar.splats.strain_color.shape[1] > 0
+        needed, found = format_bytes(size), format_bytes(free)
+        raise StgaError(f"{path}: needs {needed}, but {found} are free there; choose fewer frames")

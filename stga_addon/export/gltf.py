@@ -1,6 +1,7 @@
 """Writing of world-space splats as binary glTF with the extension KHR_gaussian_splatting."""
 
 import json
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,24 @@ def write_gltf(path: Path, world: Splats) -> None:
     extension shows.
     Source: Khronos, KHR_gaussian_splatting.
     """
-    attributes = _attributes(world)
+    opacity = world.opacities()
+    fallback = srgb_to_linear(np.clip(0.5 + SH_C0 * world.sh[:, 0], 0, 1))
+    # Semantic -> values, (N,) or (N, 3 or 4), each row a multiple of four bytes.
+    attributes = {
+        "POSITION": world.xyz,
+        "COLOR_0": np.round(np.column_stack([fallback, opacity]) * 255).astype(np.uint8),
+        f"{EXTENSION}:ROTATION": world.unit_rotations()[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": world.scales(),
+        f"{EXTENSION}:OPACITY": opacity,
+    }
+    for k in range(world.sh.shape[1]):
+        degree = math.isqrt(k)
+        name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
+        attributes[name] = world.sh[:, k]
     views, accessors, offset = [], list[dict[str, Any]](), 0
     for name, array in attributes.items():
-        views.append(
-            {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": _VERTICES}
-        )
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
+        views.append(view | {"target": _VERTICES})
         accessor: dict[str, Any] = {"bufferView": len(views) - 1, "count": len(array)}
         accessor["componentType"] = _COMPONENTS[array.dtype.name]
         accessor["type"] = _TYPES[array.shape[1] if array.ndim > 1 else 1]
@@ -71,22 +84,3 @@ def write_gltf(path: Path, world: Splats) -> None:
         out.write(struct.pack("<I", offset) + _BINARY_CHUNK)
         for array in attributes.values():
             out.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
-
-
-def _attributes(world: Splats) -> dict[str, np.ndarray]:
-    """Semantic -> values, (N,) or (N, 3 or 4), each row a multiple of four bytes."""
-    opacity = world.opacities()
-    fallback = srgb_to_linear(np.clip(0.5 + SH_C0 * world.sh[:, 0], 0, 1))
-    attributes = {
-        "POSITION": world.xyz,
-        "COLOR_0": np.round(np.column_stack([fallback, opacity]) * 255).astype(np.uint8),
-        f"{EXTENSION}:ROTATION": world.unit_rotations()[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": world.scales(),
-        f"{EXTENSION}:OPACITY": opacity,
-    }
-    for degree in range(world.sh_degree + 1):
-        for index in range(2 * degree + 1):
-            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"] = world.sh[
-                :, degree**2 + index
-            ]
-    return {name: np.ascontiguousarray(array) for name, array in attributes.items()}

@@ -1,5 +1,4 @@
-"""How an exported avatar plays: frames per second, cameras, selection, and whether its rig goes
-along."""
+"""How an exported avatar plays: rate, cameras, selection, and whether its rig goes along."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -79,8 +78,7 @@ def playback_fps(
 
 
 def check_rate(path: Path, fps: float) -> None:
-    """Raise StgaError where `fps` is not from MIN_FPS to MAX_FPS, which the file at `path` could
-    not hold."""
+    """Raise StgaError naming `path` unless `fps` is from MIN_FPS to MAX_FPS."""
     if not MIN_FPS <= fps <= MAX_FPS:
         raise StgaError(
             f"{path}: the frame rate (--fps) must be from {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}"

@@ -1,5 +1,4 @@
-"""3D Gaussians as PLY files, and GaussianAvatars' pair of files: splats bound to triangles, and the
-FLAME motion."""
+"""3D Gaussians as PLY files, and GaussianAvatars' pair of bound splats and FLAME motion."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -8,8 +7,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.lib.recfunctions import unstructured_to_structured
 
-from ..avatar.embedding import face_frames, strained_sh, to_local, to_world
+from ..avatar.embedding import FaceFrames, face_frames, strained_sh, to_local, to_world
 from ..avatar.file import Avatar
 from ..avatar.splats import MAX_SH_DEGREE, Splats, no_strain_color
 from ..errors import StgaError
@@ -26,23 +26,10 @@ PROPERTIES = (
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 _DTYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "float64": "f8",
-}
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
@@ -129,14 +116,11 @@ def splat_columns(splats: Splats) -> np.ndarray:
 
 
 def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """(N, len(names)) float32 of the named properties. Raises StgaError where one is missing or not
-    finite."""
+    """(N, len(names)) float32. Raises StgaError where one is missing or not finite."""
     columns = np.empty((len(vertices), len(names)), np.float32)
     for i, name in enumerate(names):
         if name not in (vertices.dtype.names or ()):
-            raise StgaError(
-                f"{path}: has no property {name!r}, which a 3D Gaussian Splatting PLY must have"
-            )
+            raise StgaError(f"{path}: has no property {name!r}, as a PLY of 3D Gaussians must")
         columns[:, i] = vertices[name]
     if not np.isfinite(columns).all():
         bad = names[int(np.argmin(np.isfinite(columns).all(axis=0)))]
@@ -145,8 +129,7 @@ def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.
 
 
 def save_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
-    """Write (N, len(names)) float32 as the vertices of a binary little-endian PLY, not atomically.
-    Raises OSError."""
+    """Write (N, len(names)) float32 as a binary PLY, not atomically. Raises OSError."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns)}"]
     lines += [f"property float {name}" for name in names]
     with path.open("wb") as out:
@@ -166,36 +149,27 @@ def read_vertices(path: Path) -> np.ndarray:
             is_ascii, offset, skipped, count, dtype = _read_header(path, file)
             names = dtype.names or ()
             # An ASCII number takes at least two bytes with its separator.
-            need = (
-                2 * (count * len(names) + skipped) - 1
-                if is_ascii
-                else count * dtype.itemsize + skipped
-            )
+            need = count * dtype.itemsize + skipped
+            if is_ascii:
+                need = 2 * (count * len(names) + skipped) - 1
             if size < offset + need:
                 raise StgaError(f"{path}: is truncated: {size} bytes cannot hold {count} vertices")
             file.seek(offset if is_ascii else offset + skipped)
             if not is_ascii or not count:
                 return np.fromfile(file, dtype, count)
-            table = np.loadtxt(
-                file, np.float64, skiprows=skipped, max_rows=count, ndmin=2, comments=None
-            )
+            table = np.loadtxt(file, np.float64, None, skiprows=skipped, max_rows=count, ndmin=2)
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
         raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
     if table.shape != (count, len(names)):
-        raise StgaError(
-            f"{path}: has vertices of shape {table.shape}, its header announces {(count, len(names))}"
-        )
-    vertices = np.empty(count, dtype)
-    for i, name in enumerate(names):
-        vertices[name] = table[:, i]
-    return vertices
+        expected = count, len(names)
+        raise StgaError(f"{path}: has vertices of shape {table.shape}, expected {expected}")
+    return np.asarray(unstructured_to_structured(table, dtype))
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dtype]:
-    """Whether ASCII; where the data starts; bytes (rows if ASCII) before the vertices; their number
-    and type."""
+    """Whether ASCII; start of the data; bytes (or rows) before vertices; their count and type."""
     start = file.read(MAX_HEADER_BYTES)
     end = start.find(b"\nend_header")
     newline = start.find(b"\n", end + 1)
@@ -228,7 +202,8 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dt
             break
         if "list" in properties.values():
             raise StgaError(
-                f"{path}: PLY element {name!r} has a list property before the vertices end, not supported"
+                f"{path}: PLY element {name!r} has a list property before the vertices end, "
+                "not supported"
             )
         dtype = np.dtype(list(properties.items()))
         if name == "vertex":
@@ -254,9 +229,7 @@ def write_gaussian_avatars(
     StgaError without a sequence, or where its mesh is not the avatar's.
     """
     if sequence is None:
-        raise StgaError(
-            f"{folder}: the GaussianAvatars format needs the FLAME parameters of a FLAME capture"
-        )
+        raise StgaError(f"{folder}: GaussianAvatars needs the FLAME parameters of a FLAME capture")
     if not np.array_equal(sequence.model.faces, avatar.faces):
         raise StgaError(
             f"{folder}: the avatar's mesh ({len(avatar.faces)} triangles) is not the FLAME model's "
@@ -286,11 +259,9 @@ def in_convention(avatar: Avatar, convention: str) -> Splats:
         splats = replace(splats, sh=sh, strain_color=no_strain_color(len(sh)))
     if convention == avatar.convention:
         return splats
-    here, there = (
-        replace(frames, origin=np.zeros_like(frames.origin))
-        for frames in (
-            face_frames(avatar.neutral, avatar.faces, avatar.neutral, name)
-            for name in (avatar.convention, convention)
-        )
-    )
-    return to_local(to_world(splats, here), there, splats.face)
+
+    def frames(name: str) -> FaceFrames:
+        found = face_frames(avatar.neutral, avatar.faces, avatar.neutral, name)
+        return replace(found, origin=np.zeros_like(found.origin))
+
+    return to_local(to_world(splats, frames(avatar.convention)), frames(convention), splats.face)

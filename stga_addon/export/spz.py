@@ -11,8 +11,7 @@ from ..avatar.splats import Splats
 from ..files import replacing
 
 MAGIC, VERSION = b"NGSP", 3
-"""Version 3 is the last one packed by gzip; version 4 needs Zstandard, which Blender's Python
-lacks."""
+"""The last packed by gzip: version 4 needs Zstandard, which Blender's Python lacks."""
 ANTIALIASED = 1
 MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""

@@ -14,6 +14,7 @@ from ..errors import StgaError
 from ..files import replacing
 
 PRIM_TYPE = "ParticleField3DGaussianSplat"
+COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 EXTENT_DEVIATIONS = 3.0
 """Standard deviations that count as a splat's extent, as for USD's Gaussian kernel."""
 
@@ -44,44 +45,32 @@ def write_usd(
         raise StgaError(
             f"{path}: USD files need the package usd-core, which this Python lacks"
         ) from error
+    is_package = path.suffix.lower() == ".usdz"
     with replacing(path) as partial:
+        layer = partial.with_name(f".layer{partial.name}") if is_package else partial
         try:
-            if path.suffix.lower() == ".usdz":
-                _write_package(usd, partial, f"{path.stem}.usdc", frames, fps, moving_color)
-            else:
-                _write_layer(usd, partial, frames, fps, moving_color)
+            _write_layer(usd, layer, frames, fps, moving_color)
+            if is_package:
+                # there before USD 26
+                writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter
+                with writer.CreateNew(str(partial)) as archive:
+                    archive.AddFile(str(layer), f"{path.stem}.usdc")
+                if not zipfile.is_zipfile(partial):  # no error is reported on a full disk
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except usd.Tf.ErrorException as error:
             # "Error occurred writing file: No space left on device"
             raise OSError(error.args[0].commentary.rpartition(": ")[2]) from error
+        finally:
+            if is_package:
+                layer.unlink(missing_ok=True)
 
 
-def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
-    """Size of the binary file: positions, rotations and scales per frame, opacities and constant
-    colors once."""
+def usd_bytes(splats: Splats, frames: int) -> int:
+    """Size of the binary file: poses, and colors that follow them, per frame, the rest once."""
     coefficients = 3 * splats.sh.shape[1]
-    once, each = (4, 40 + 2 * coefficients) if moving_color else (4 + 4 * coefficients, 40)
+    moving = splats.strain_color.shape[1] > 0
+    once, each = (4, 40 + 2 * coefficients) if moving else (4 + 4 * coefficients, 40)
     return len(splats) * (once + each * frames)
-
-
-def _write_package(
-    usd: Any,
-    file: Path,
-    name: str,
-    frames: Iterable[tuple[int, Splats]],
-    fps: float,
-    moving_color: bool,
-) -> None:
-    layer = file.with_name(f".layer{file.name}")
-    try:
-        _write_layer(usd, layer, frames, fps, moving_color)
-        # there before USD 26
-        writer = getattr(usd.Sdf, "ZipFileWriter", None) or usd.Usd.ZipFileWriter
-        with writer.CreateNew(str(file)) as archive:
-            archive.AddFile(str(layer), name)
-        if not zipfile.is_zipfile(file):  # the writer reports no error where the disk is full
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    finally:
-        layer.unlink(missing_ok=True)
 
 
 def _write_layer(
@@ -116,14 +105,11 @@ def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
         ("radiance:sphericalHarmonicsDegree", types.Int, first.sh_degree),
     ):
         prim.CreateAttribute(name, kind, False, uniform).Set(value)
-    prim.CreateAttribute("opacities", types.FloatArray, False).Set(
-        usd.Vt.FloatArray.FromNumpy(first.opacities())
-    )
+    opacities = usd.Vt.FloatArray.FromNumpy(first.opacities())
+    prim.CreateAttribute("opacities", types.FloatArray, False).Set(opacities)
     if not moving_color:
         coefficients = usd.Vt.Vec3fArray.FromNumpy(_rows(first.sh))
-        prim.CreateAttribute(
-            "radiance:sphericalHarmonicsCoefficients", types.Float3Array, False
-        ).Set(coefficients)
+        prim.CreateAttribute(COEFFICIENTS, types.Float3Array, False).Set(coefficients)
     return prim
 
 
@@ -132,20 +118,16 @@ def _write_sample(usd: Any, prim: Any, time: int, world: Splats, moving_color: b
     scales = world.scales()
     reach = EXTENT_DEVIATIONS * scales.max(axis=1, keepdims=True)
     extent = np.stack([(world.xyz - reach).min(axis=0), (world.xyz + reach).max(axis=0)])
+    xyzw = _rows(world.unit_rotations()[:, [1, 2, 3, 0]])  # as FromNumpy takes them
     values = [
         ("extent", types.Float3Array, vt.Vec3fArray.FromNumpy(extent)),
         ("positions", types.Point3fArray, vt.Vec3fArray.FromNumpy(_rows(world.xyz))),
         ("scales", types.Float3Array, vt.Vec3fArray.FromNumpy(_rows(scales))),
-        # FromNumpy takes xyzw
-        (
-            "orientations",
-            types.QuatfArray,
-            vt.QuatfArray.FromNumpy(_rows(world.unit_rotations()[:, [1, 2, 3, 0]])),
-        ),
+        ("orientations", types.QuatfArray, vt.QuatfArray.FromNumpy(xyzw)),
     ]
     if moving_color:
         half = vt.Vec3hArray.FromNumpy(_rows(world.sh).astype(np.float16))
-        values.append(("radiance:sphericalHarmonicsCoefficientsh", types.Half3Array, half))
+        values.append((f"{COEFFICIENTS}h", types.Half3Array, half))
     for name, kind, value in values:
         prim.CreateAttribute(name, kind, False).Set(value, time)
 

@@ -46,8 +46,7 @@ class RenderClient:
     def compose(
         self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
     ) -> ComposedImage:
-        """`Composer.compose`, in this process or by the server. Raises StgaError where neither can
-        render."""
+        """`Composer.compose`, here or by the server. Raises StgaError where neither can render."""
         with self._lock:
             device = self._find_device()
             if missing_packages():
@@ -93,9 +92,8 @@ class RenderClient:
             ) from error
         self._sent, self.failure = layers, str(reply.get("failure", ""))
         if "error" in reply:
-            raise StgaError(
-                f"{python}: the render server could not render the image ({reply['error']})"
-            )
+            reason = f"could not render the image ({reply['error']})"
+            raise StgaError(f"{python}: the render server {reason}")
         return ComposedImage(reply["rgb"], reply["alpha"], reply["depth"] if with_depth else None)
 
     def _python(self) -> str:
@@ -104,8 +102,9 @@ class RenderClient:
         except StgaError as error:
             this = f"{sys.executable}, {sys.version.split()[0]}"
             raise StgaError(
-                f"Rendering splats needs {' and '.join(missing_packages())} in Blender's own Python ({this}), "
-                "or another Python with them, which is chosen in the add-on's preferences"
+                f"Rendering splats needs {' and '.join(missing_packages())} in Blender's own "
+                f"Python ({this}), or another Python with them, which is chosen in the add-on's "
+                "preferences"
             ) from error
 
 

@@ -1,5 +1,4 @@
-"""The device that trains or renders, the GPU where it is right and faster, else the CPU; and
-pictures made there."""
+"""The device that trains or renders, the GPU where it is right and faster; pictures made there."""
 
 import logging
 from collections.abc import Sequence
@@ -24,11 +23,8 @@ MAX_DEVICE_LENGTH = 255
 
 def is_device(value: Any) -> bool:
     """Whether a value is one of DEVICES or "gpu:" and a name."""
-    if not isinstance(value, str):
-        return False
-    return value in DEVICES or (
-        value.startswith(GPU) and len(GPU) < len(value) <= MAX_DEVICE_LENGTH
-    )
+    is_named = isinstance(value, str) and value.startswith(GPU)
+    return value in DEVICES or (is_named and len(GPU) < len(value) <= MAX_DEVICE_LENGTH)
 
 
 def choose_device(requested: str, task: str = "Training") -> tuple[str, str]:
@@ -47,14 +43,14 @@ def choose_device(requested: str, task: str = "Training") -> tuple[str, str]:
     trial = _trial(adapter)
     if not trial.is_right:
         raise StgaError(
-            f"--device {requested}: {_wrong(adapter, trial)}; choose another adapter, or give --device cpu"
+            f"--device {requested}: {_wrong(adapter, trial)}; choose another adapter, "
+            "or give --device cpu"
         )
     return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
 
 
 def adapter_names(software: bool = True) -> list[str]:
-    """The adapters that `choose_device` knows, real GPUs first. Raises StgaError if there is
-    none."""
+    """The adapters of `choose_device`, real GPUs first. Raises StgaError if there is none."""
     if find_spec("wgpu") is None:
         raise StgaError("--device gpu: the package wgpu (WebGPU) is not installed")
     from ..raster.gpu.adapters import adapters, is_software
@@ -67,8 +63,7 @@ def adapter_names(software: bool = True) -> list[str]:
 
 
 def adapter_name(device: str) -> str:
-    """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError where there is none, or
-    several."""
+    """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError unless there is just one."""
     names, part = adapter_names(), device.removeprefix(GPU)
     if device == "gpu" or part in names:
         return names[0] if device == "gpu" else part
@@ -94,9 +89,8 @@ def _fastest(task: str) -> tuple[str, str]:
             continue
         if trial.is_right and trial.device_s < trial.cpu_s:
             return GPU + adapter, f"{task} on {adapter}, {_comparison(trial)}"
-        reasons.append(
-            f"{adapter} is {_comparison(trial)}" if trial.is_right else _wrong(adapter, trial)
-        )
+        is_slow = f"{adapter} is {_comparison(trial)}"
+        reasons.append(is_slow if trial.is_right else _wrong(adapter, trial))
     return "cpu", f"{task} on the CPU: {'; '.join(reasons)}"
 
 
@@ -137,8 +131,7 @@ class Composer:
         self.requested, self.device, self.failure = requested, "", ""
 
     def choose(self) -> str:
-        """The device of the next image. Raises StgaError where the one that is asked for by name
-        does not work."""
+        """The device of the next image. Raises StgaError where one asked for by name fails."""
         if not self.device:
             self.device, _ = choose_device(self.requested, "Rendering")
         return self.device
@@ -146,8 +139,7 @@ class Composer:
     def compose(
         self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
     ) -> ComposedImage:
-        """See `cpu.compose.compose`. Raises StgaError where a device that is asked for by name
-        cannot render."""
+        """See `cpu.compose.compose`. Raises StgaError where a device asked for by name fails."""
         if self.choose() != "cpu":
             from ..raster.gpu import compose as gpu
 
@@ -156,11 +148,8 @@ class Composer:
             except Exception as error:  # a driver raises what it likes
                 if self.requested != "auto":
                     raise
-                cause = (
-                    error.cause
-                    if isinstance(error, DeviceError)
-                    else f"{self.device}: {first_line(error)}"
-                )
+                cause = f"{self.device}: {first_line(error)}"
+                cause = error.cause if isinstance(error, DeviceError) else cause
                 self.device, self.failure = "cpu", one_line(f"{cause}; the CPU renders instead")
                 logging.getLogger(__name__).warning(self.failure)
         from ..raster.cpu import compose as cpu

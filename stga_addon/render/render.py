@@ -32,14 +32,10 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 def render(
-    splats: Splats,
-    camera: Camera,
-    background: tuple[float, float, float] = WHITE,
-    frames: FaceFrames = WORLD,
-    antialiased: bool = False,
-    composer: Composer | None = None,
+    splats: Splats, camera: Camera, background: tuple[float, float, float] = WHITE,
+    frames: FaceFrames = WORLD, antialiased: bool = False, composer: Composer | None = None,
     behind: Splats | None = None,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
 
     splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH
@@ -57,9 +53,8 @@ def render(
         composed = (composer or Composer("cpu")).compose(layers, camera)
         rest = (1 - composed.alpha) * np.array(background, np.float32)[:, None, None]
         return np.clip(composed.rgb + rest, 0, 1)
-    parameters = Parameters(
-        *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
-    )
+    values = (np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
+    parameters = Parameters(*values)
     output = render_forward(
         parameters, splats.face, frames_in_camera(frames, camera), splats.sh_degree,
         np.array(background, np.float32), antialiased=antialiased,
@@ -68,36 +63,24 @@ def render(
 
 
 def render_avatar(
-    avatar: Avatar,
-    mesh: np.ndarray,
-    camera: Camera,
-    background: tuple[float, float, float] = WHITE,
-    composer: Composer | None = None,
+    avatar: Avatar, mesh: np.ndarray, camera: Camera,
+    background: tuple[float, float, float] = WHITE, composer: Composer | None = None,
     behind: Splats | None = None,
-) -> np.ndarray:
-    """Render an avatar that follows a mesh (V, 3) in world meters; the result is that of
-    `render`."""
-    return render(
-        avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer, behind
-    )
+) -> np.ndarray:  # fmt: skip
+    """`render` of an avatar that follows a mesh (V, 3) in world meters."""
+    pose = avatar.frames(mesh), avatar.antialiased
+    return render(avatar.splats, camera, background, *pose, composer, behind)
 
 
 def render_colors(
-    avatar: Avatar,
-    mesh: np.ndarray,
-    camera: Camera,
-    colors: np.ndarray,
-    background: tuple[float, float, float] = WHITE,
-    composer: Composer | None = None,
+    avatar: Avatar, mesh: np.ndarray, camera: Camera, colors: np.ndarray,
+    background: tuple[float, float, float] = WHITE, composer: Composer | None = None,
     behind: Splats | None = None,
-) -> np.ndarray:
-    """`render_avatar` with sRGB colors (N, 3) of the splats, as `light.relight` finds them, instead
-    of their own."""
+) -> np.ndarray:  # fmt: skip
+    """`render_avatar` with sRGB colors (N, 3), as `light.relight` finds them, not its own."""
     sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
     splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))
-    return render(
-        splats, camera, background, avatar.frames(mesh), avatar.antialiased, composer, behind
-    )
+    return render_avatar(replace(avatar, splats=splats), mesh, camera, background, composer, behind)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

@@ -32,15 +32,21 @@ def send(stream: BinaryIO, arrays: Mapping[str, Any]) -> None:
 
 
 def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
-    """Read one message. Raises EOFError at the end of the stream, ValueError for what is no
-    message."""
-    mark, size = (
-        _read_exactly(stream, len(MARK)),
-        int.from_bytes(_read_exactly(stream, 8), "little"),
-    )
+    """Read one message. Raises EOFError at the stream's end, ValueError for anything else."""
+
+    def read(size: int) -> bytes:
+        parts = []
+        while size:
+            parts.append(stream.read(size))
+            if not parts[-1]:
+                raise EOFError
+            size -= len(parts[-1])
+        return b"".join(parts)
+
+    mark, size = read(len(MARK)), int.from_bytes(read(8), "little")
     if mark != MARK:
         raise ValueError(f"a message begins with {MARK!r}, got {mark!r}")
-    with np.load(io.BytesIO(_read_exactly(stream, size)), allow_pickle=False) as arrays:
+    with np.load(io.BytesIO(read(size)), allow_pickle=False) as arrays:
         return dict(arrays)
 
 
@@ -59,14 +65,17 @@ def unpack_camera(arrays: Mapping[str, np.ndarray]) -> Camera:
 def pack_layers(
     layers: Sequence[PosedSplats], before: Sequence[PosedSplats] = ()
 ) -> dict[str, Any]:
-    """Layers as named arrays; without the splats of those that have the same as the layer `before`
-    at their index."""
+    """Layers as named arrays, less splats that the layer `before` at their index has."""
     arrays: dict[str, Any] = {"layers": len(layers)}
     for index, layer in enumerate(layers):
-        if index >= len(before) or not _same_splats(layer.splats, before[index].splats):
-            arrays |= {
-                f"{index} splats {name}": getattr(layer.splats, name) for name in SPLAT_FIELDS
-            }
+        splats = {name: getattr(layer.splats, name) for name in SPLAT_FIELDS}
+        known = before[index].splats if index < len(before) else None
+        is_same = known is layer.splats or (
+            known is not None
+            and all(np.array_equal(values, getattr(known, name)) for name, values in splats.items())
+        )
+        if not is_same:
+            arrays |= {f"{index} splats {name}": values for name, values in splats.items()}
         arrays |= {f"{index} frames {name}": getattr(layer.frames, name) for name in FRAME_FIELDS}
         arrays |= {f"{index} to_world": layer.to_world, f"{index} antialiased": layer.antialiased}
     return arrays
@@ -75,44 +84,17 @@ def pack_layers(
 def unpack_layers(
     arrays: Mapping[str, np.ndarray], before: Sequence[PosedSplats] = ()
 ) -> list[PosedSplats]:
-    """The inverse of `pack_layers`. Raises KeyError where splats are missing from the arrays and
-    from `before`."""
-    names = [
-        [f"{index} splats {name}" for name in SPLAT_FIELDS]
-        for index in range(int(arrays["layers"]))
-    ]
-    splats = [
-        Splats(**{field: arrays[name] for field, name in zip(SPLAT_FIELDS, stored, strict=True)})
-        if stored[0] in arrays or index >= len(before)
-        else before[index].splats
-        for index, stored in enumerate(names)
-    ]
-    return [
-        PosedSplats(
-            splats[index],
-            FaceFrames(**{name: arrays[f"{index} frames {name}"] for name in FRAME_FIELDS}),
-            arrays[f"{index} to_world"],
-            bool(arrays[f"{index} antialiased"]),
-        )
-        for index in range(len(splats))
-    ]
-
-
-def _same_splats(one: Splats, other: Splats) -> bool:
-    return one is other or all(
-        np.array_equal(getattr(one, name), getattr(other, name)) for name in SPLAT_FIELDS
-    )
-
-
-def _read_exactly(stream: BinaryIO, size: int) -> bytes:
-    parts = []
-    while size:
-        part = stream.read(size)
-        if not part:
-            raise EOFError
-        parts.append(part)
-        size -= len(part)
-    return b"".join(parts)
+    """The inverse of `pack_layers`. Raises KeyError where splats are in neither."""
+    layers = []
+    for index in range(int(arrays["layers"])):
+        if f"{index} splats {SPLAT_FIELDS[0]}" in arrays or index >= len(before):
+            splats = Splats(*(arrays[f"{index} splats {name}"] for name in SPLAT_FIELDS))
+        else:
+            splats = before[index].splats
+        frames = FaceFrames(*(arrays[f"{index} frames {name}"] for name in FRAME_FIELDS))
+        antialiased = bool(arrays[f"{index} antialiased"])
+        layers.append(PosedSplats(splats, frames, arrays[f"{index} to_world"], antialiased))
+    return layers
 
 
 def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
@@ -121,7 +103,6 @@ def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
     device: as `Composer` takes it.
     """
     from ..errors import StgaError
-    from ..raster.posed_splats import PosedSplats
     from .device import Composer
 
     layers: list[PosedSplats] = []
@@ -139,11 +120,8 @@ def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
             kind = "" if isinstance(error, StgaError) else f"{type(error).__name__}: "
             send(replies, {"error": f"{kind}{error}"})
         else:
-            depth = {} if image.depth is None else {"depth": image.depth}
-            send(
-                replies,
-                {"rgb": image.rgb, "alpha": image.alpha, "failure": composer.failure, **depth},
-            )
+            reply = {"rgb": image.rgb, "alpha": image.alpha, "failure": composer.failure}
+            send(replies, reply if image.depth is None else reply | {"depth": image.depth})
 
 
 if __name__ == "__main__":

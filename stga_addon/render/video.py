@@ -1,5 +1,4 @@
-"""Videos: recordings of what each image shows, and MP4 files or numbered PNGs, written image by
-image."""
+"""Videos: recordings of what images show, and MP4 files or PNGs, written image by image."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -24,8 +23,7 @@ CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
 QUALITY = {"crf": "16", "preset": "medium"}
 """Constant rate factor of x264: 18 is called visually lossless, lower is better."""
 BT709, LIMITED_RANGE = 1, 1
-"""Values of FFmpeg's AVCOL_* enumerations: what players assume of untagged high-definition
-video."""
+"""Of FFmpeg's AVCOL_* enumerations: what players assume of untagged HD video."""
 IMAGE_NAME = re.compile(r"\d{4,}\.png", re.IGNORECASE)
 """Name of an image of a sequence: 0012.png."""
 
@@ -44,17 +42,15 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
     import av
 
     with replacing(path) as partial:
+        options = {"movflags": "faststart"}
         try:
-            with av.open(
-                str(partial), "w", format="mp4", options={"movflags": "faststart"}
-            ) as container:
+            with av.open(str(partial), "w", format="mp4", options=options) as container:
                 append, finish = _encoder(container, Fraction(fps).limit_denominator(1001))
                 yield append
                 finish()
         except av.error.FFmpegError as error:
-            raise StgaError(
-                f"{path}: the video cannot be written ({error.strerror or error})"
-            ) from error
+            reason = error.strerror or error
+            raise StgaError(f"{path}: the video cannot be written ({reason})") from error
 
 
 @contextmanager
@@ -98,15 +94,12 @@ def _encoder(container: Any, rate: Fraction) -> tuple[WriteImage, Callable[[], N
     def append(image: np.ndarray) -> None:
         nonlocal is_empty
         odd = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
-        frame = VideoFrame.from_ndarray(
-            np.ascontiguousarray(np.pad(image, odd, mode="edge")), format="rgb24"
-        )
+        pixels = np.ascontiguousarray(np.pad(image, odd, mode="edge"))
+        frame = VideoFrame.from_ndarray(pixels, format="rgb24")
         if is_empty:
             stream.width, stream.height, is_empty = frame.width, frame.height, False
-        frame = frame.reformat(
-            format=PIXEL_FORMAT, dst_colorspace=BT709, dst_color_range=LIMITED_RANGE
-        )
-        container.mux(stream.encode(frame))
+        colors = {"dst_colorspace": BT709, "dst_color_range": LIMITED_RANGE}
+        container.mux(stream.encode(frame.reformat(format=PIXEL_FORMAT, **colors)))
 
     return append, lambda: container.mux(stream.encode())
 
@@ -121,8 +114,7 @@ def is_video(output: Path) -> bool:
 
 
 def check_output(output: Path) -> None:
-    """Raise StgaError where a video, or the PNGs of a folder, cannot be written, or others' images
-    are there."""
+    """Raise StgaError where the output cannot be written, or others' images are there."""
     check_writable(output if is_video(output) else output / FIRST_IMAGE)
     if not is_video(output):
         NumberedFiles(output, IMAGE_NAME)
@@ -155,9 +147,8 @@ class Recorder:
         try:
             yield
         except OSError as error:
-            raise StgaError(
-                f"{self.path}: cannot be written ({error.strerror or error})"
-            ) from error
+            reason = error.strerror or error
+            raise StgaError(f"{self.path}: cannot be written ({reason})") from error
 
 
 def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[ComposedImage]:
@@ -170,21 +161,18 @@ def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[Comp
                 layers = unpack_layers(message, layers)
                 yield composer.compose(layers, unpack_camera(message))
     except (OSError, EOFError, KeyError, ValueError) as error:
-        raise StgaError(
-            f"{path}: cannot be read as the images of a video ({type(error).__name__})"
-        ) from error
+        kind = type(error).__name__
+        raise StgaError(f"{path}: cannot be read as the images of a video ({kind})") from error
 
 
 def finished(
     image: ComposedImage, background: tuple[float, float, float] | None, opaque: bool
 ) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB over the background, or (H, W, 4) with straight alpha where it is None
-    and not `opaque`."""
+    """(H, W, 3) uint8 sRGB over the background; if that is None, straight alpha or `opaque`."""
     color, alpha = image.rgb.transpose(1, 2, 0), image.alpha[..., None]
     if background is None and not opaque:
-        pixels = np.concatenate(
-            [color / np.maximum(alpha, np.finfo(np.float32).tiny), alpha], axis=2
-        )
+        straight = color / np.maximum(alpha, np.finfo(np.float32).tiny)
+        pixels = np.concatenate([straight, alpha], axis=2)
     else:
         pixels = color + (1 - alpha) * np.array(background or (0, 0, 0), np.float32)
     return np.asarray(np.rint(np.clip(pixels, 0, 1) * 255), np.uint8)

@@ -1,9 +1,12 @@
-"""Bulk reads and writes of Blender's meshes as numpy arrays."""
+"""Bulk reads and writes of meshes and f-curves as numpy arrays, and drivers."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bpy
 import numpy as np
+
+from .compat import action_curves
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From Blender's axes to those of captures: (x, y, z) is (x, z, -y)."""
@@ -50,8 +53,7 @@ def evaluated_vertices(obj: Any) -> np.ndarray:
 
 
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """A smooth-shaded mesh of vertices (V, 3) and triangles (F, 3); order and vertex order of the
-    faces are kept."""
+    """A smooth-shaded mesh of vertices (V, 3) and triangles (F, 3), in their order."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))
     mesh.vertices.foreach_set("co", flat_floats(vertices))
@@ -61,3 +63,64 @@ def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
     mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
     mesh.update(calc_edges=True)
     return mesh
+
+
+def key_points(key: Any) -> np.ndarray:
+    """(V, 3) float64 positions of a shape key's points."""
+    return read_values(key.points, "co", 3).astype(np.float64)
+
+
+def write_curve(
+    curves: Any, data_path: str, index: int, frames: Any, values: Any, interpolation: str = "LINEAR"
+) -> None:
+    """Add one f-curve with all its keyframes at once.
+
+    curves: from `action_curves`; index: of the array element, 0 for a scalar; frames, values (K,),
+    frames ascending.
+    """
+    points = curves.new(data_path, index=index).keyframe_points
+    points.add(len(frames))
+    points.foreach_set("co", np.column_stack([frames, values]).astype(np.float32).ravel())
+    mode = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items[interpolation].value
+    points.foreach_set("interpolation", np.full(len(frames), mode, np.int32))
+
+
+def write_curves(curves: Any, data_path: str, frames: Any, values: np.ndarray) -> None:
+    """Add an f-curve for each of the C elements of an array by values (K, C), as `write_curve`."""
+    for index, column in enumerate(values.T):
+        write_curve(curves, data_path, index, frames, column)
+
+
+def write_triangle_curves(
+    owner: Any, paths: Sequence[str], timesteps: Sequence[float], interpolation: str = "LINEAR"
+) -> None:
+    """Animate values (T) of `owner`: each is 1 at its timestep and 0 at others, ascending."""
+    curves, frames = action_curves(owner), np.asarray(timesteps, np.float64)
+    for row, path in enumerate(paths):
+        near = np.arange(max(row - 1, 0), min(row + 2, len(frames)))
+        write_curve(curves, path, 0, frames[near], near == row, interpolation)
+
+
+def add_driver(
+    owner: Any, path: str, index: int, expression: str, variables: Mapping[str, tuple[Any, str]]
+) -> None:
+    """Drive one value of the data-block `owner` by an expression of other data-blocks' properties.
+
+    index: of the array element, -1 for a scalar; variables: name -> (data-block, data path).
+    Expressions of at most 255 characters with arithmetic only are evaluated without Python, so they
+    work where scripts are not trusted.
+    """
+    curve = owner.driver_add(path, index)
+    # A new driver has keyframes at 0 and 1, to which Blender snaps results closer than 1e-4.
+    curve.keyframe_points.clear()
+    driver = curve.driver
+    driver.type = "SCRIPTED"
+    for name, (source, source_path) in variables.items():
+        variable = driver.variables.new()
+        variable.name = name
+        target = variable.targets[0]
+        if source.id_type != target.id_type:
+            target.id_type = source.id_type
+        target.id = source
+        target.data_path = source_path
+    driver.expression = expression

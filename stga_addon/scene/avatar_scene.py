@@ -85,8 +85,7 @@ WORLD_NAME = "World splats"
 
 
 def set_up_head(capture: Capture) -> Any:
-    """Bring the capture's head and cameras into the open file's empty scene; returns the head.
-    Raises StgaError."""
+    """Import the capture's head and cameras into the empty scene; the head. Raises StgaError."""
     head = import_head(capture)
     model = capture.flame_file
     # so that Train works in the saved file
@@ -115,9 +114,8 @@ def show_world(avatar_file: Path, head: Any) -> Any:
     hidden until they are wanted. Returns them; None where there are none, or the scene has them
     already. Raises StgaError."""
     path = avatar_file.with_name(WORLD_FILE).resolve()
-    if not path.is_file() or any(
-        thing.get(tags.WORLD) == str(path) for thing in current_scene().objects
-    ):
+    known = [thing.get(tags.WORLD) for thing in current_scene().objects]
+    if not path.is_file() or str(path) in known:
         return None
     world = show_world_splats(read_ply(path), WORLD_NAME)
     world.parent = head.parent

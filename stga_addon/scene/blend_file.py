@@ -55,8 +55,7 @@ def frames_per_second(scene: Any) -> float:
 
 
 def set_frames_per_second(scene: Any, rate: float) -> None:
-    """Let the scene play at the rate; Blender holds a whole number and a divisor, such as 30 and
-    1.001."""
+    """Let the scene play at the rate, which Blender holds as an integer and a divisor."""
     whole = max(1, round(rate))
     scene.render.fps, scene.render.fps_base = whole, whole / rate
 
@@ -68,8 +67,7 @@ def go_to_frame(frame: int) -> None:
 
 
 def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
-    """Set each frame of the scene in turn, with progress at the mouse pointer; restore the current
-    frame at the end."""
+    """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
     scene, manager, numbers = bpy.context.scene, bpy.context.window_manager, list(numbers)
     frame, subframe = scene.frame_current, scene.frame_subframe
     manager.progress_begin(0, max(len(numbers), 1))

@@ -1,9 +1,8 @@
-"""Blender's cameras: imported from captures with their images, exported, and as calibrated
-cameras."""
+"""Blender's cameras: imported from captures, exported, and as calibrated cameras."""
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,17 @@ from ..capture.camera import Camera, camera_from_gl, covered_angles, most_centra
 from ..capture.model import Capture, View
 from ..errors import StgaError
 from ..files import write_json
-from . import compat, tags
-from .animation import write_curve
-from .arrays import Z_UP_TO_Y_UP, evaluated_vertices, mesh_vertices
+from ..flame.quaternions import continuous, from_matrices
+from . import tags
+from .arrays import (
+    Z_UP_TO_Y_UP,
+    evaluated_vertices,
+    mesh_vertices,
+    write_curves,
+    write_triangle_curves,
+)
 from .blend_file import set_frames_per_second
+from .compat import action_curves
 from .objects import Warn, log_warning, place, remove
 
 UP = (0.0, 0.0, 1.0)
@@ -53,18 +59,13 @@ def render_camera(
             f"{camera.name}: is not a perspective camera; STGA Splats renders through no other type"
         )
     render = depsgraph.scene.render
-    projection = camera.calc_matrix_camera(
-        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
-    )
-    whole = camera_of(
-        np.array(camera.matrix_world.normalized(), np.float64), projection, width, height
-    )
-    if border is None:
-        return whole
-    x, y, columns, rows = border
-    return replace(
-        whole, width=columns, height=rows, cx=whole.cx - x, cy=whole.cy - (height - y - rows)
-    )
+    aspect = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
+    projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, **aspect)
+    pose = np.array(camera.matrix_world.normalized(), np.float64)
+    whole = camera_of(pose, projection, width, height)
+    x, y, columns, rows = border or (0, 0, width, height)
+    cx, cy = whole.cx - x, whole.cy - (height - y - rows)
+    return replace(whole, width=columns, height=rows, cx=cx, cy=cy)
 
 
 def viewport_camera(region: Any, width: int, height: int) -> Camera:
@@ -81,24 +82,18 @@ def viewport_camera(region: Any, width: int, height: int) -> Camera:
 
 
 def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Camera:
-    """Camera from a camera-to-world matrix with OpenGL axes and an OpenGL perspective projection,
-    both (4, 4)."""
+    """Camera from OpenGL's camera-to-world and perspective projection matrices, both (4, 4)."""
     p = np.array(projection, np.float64)
-    return camera_from_gl(
-        pose,
-        width,
-        height,
-        fl_x=p[0, 0] * width / 2,
-        fl_y=p[1, 1] * height / 2,
-        cx=(1 - p[0, 2]) * width / 2,
-        cy=(1 + p[1, 2]) * height / 2,
-    )
+    focal = p[0, 0] * width / 2, p[1, 1] * height / 2
+    center = (1 - p[0, 2]) * width / 2, (1 + p[1, 2]) * height / 2
+    return camera_from_gl(pose, width, height, *focal, *center)
 
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
 CLIP_START = 0.01  # meters
 DISPLAY_SIZE = 0.05  # meters; Blender's default of one meter would cover the head with cameras
 POSE_TOLERANCE = 1e-9  # of matrix entries
+INTRINSICS = ("width", "height", "fl_x", "fl_y", "cx", "cy")
 INTRINSICS_TOLERANCE = 1e-6  # pixels
 
 
@@ -114,8 +109,26 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
     """
     cameras = []
     old = {camera[tags.CAMERA_INDEX]: camera for camera in tags.find(tags.CAMERA, capture.root)}
-    for index, views in _views_by_camera(capture).items():
-        cameras.append(_place_camera(root, index, views, old.pop(index, None), warn))
+    by_index: dict[int, dict[int, View]] = {}
+    for view in chain(*capture.views.values()):
+        by_index.setdefault(view.camera_index, {}).setdefault(view.timestep, view)
+    for index, by_timestep in sorted(by_index.items()):
+        views = [by_timestep[timestep] for timestep in sorted(by_timestep)]
+        first, title = views[0].camera, f"{root.name} camera {index:02d}"
+        data = bpy.data.cameras.new(title)
+        set_intrinsics(data, first)
+        data.clip_start, data.display_size = CLIP_START, DISPLAY_SIZE
+        camera = place(root, tags.CAMERA, title, data, old.pop(index, None))
+        camera[tags.CAMERA_INDEX] = index
+        camera[tags.IMAGE_SIZE] = [first.width, first.height]
+        camera[tags.PIXEL_ASPECT] = first.fl_x / first.fl_y
+        intrinsics = np.array([[getattr(v.camera, name) for name in INTRINSICS] for v in views])
+        if np.abs(intrinsics - intrinsics[0]).max() > INTRINSICS_TOLERANCE:
+            used = views[0].timestep
+            warn(f"{title}: its intrinsics change; those of timestep {used} are used for all")
+        _set_pose(camera, views)
+        _set_backgrounds(data, views, warn)
+        cameras.append(camera)
     remove(old.values())
     return cameras
 
@@ -146,49 +159,18 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
         same_size = tuple(other[tags.IMAGE_SIZE]) == (width, height)
         if not same_size or abs(other[tags.PIXEL_ASPECT] - aspect) > INTRINSICS_TOLERANCE:
             warn(
-                f"{other.name}: its images have another size or pixel aspect than the scene, set from {camera.name}"
+                f"{other.name}: its images have another size or pixel aspect than the scene, "
+                f"set from {camera.name}"
             )
 
 
 def central(cameras: list[Any]) -> Any:
-    """The camera object, of `import_cameras`, that sees the face (`capture.camera.central_camera`);
-    None of none."""
+    """Of cameras of `import_cameras`, the one that sees the face; None of none."""
     if not cameras:
         return None
     bpy.context.view_layer.update()  # world matrices
     forward = np.array([-np.array(camera.matrix_world.col[2][:3]) for camera in cameras])
     return cameras[most_central(forward)]
-
-
-def _views_by_camera(capture: Capture) -> dict[int, list[View]]:
-    """camera index -> its views of all splits, one per timestep, ascending."""
-    cameras: dict[int, dict[int, View]] = {}
-    for views in capture.views.values():
-        for view in views:
-            cameras.setdefault(view.camera_index, {}).setdefault(view.timestep, view)
-    return {
-        index: [cameras[index][timestep] for timestep in sorted(cameras[index])]
-        for index in sorted(cameras)
-    }
-
-
-def _place_camera(root: Any, index: int, views: list[View], old: Any, warn: Warn) -> Any:
-    first = views[0].camera
-    title = f"{root.name} camera {index:02d}"
-    data = bpy.data.cameras.new(title)
-    set_intrinsics(data, first)
-    data.clip_start, data.display_size = CLIP_START, DISPLAY_SIZE
-    camera = place(root, tags.CAMERA, title, data, old)
-    camera[tags.CAMERA_INDEX] = index
-    camera[tags.IMAGE_SIZE] = [first.width, first.height]
-    camera[tags.PIXEL_ASPECT] = first.fl_x / first.fl_y
-    if any(not _same_intrinsics(view.camera, first) for view in views):
-        warn(
-            f"{title}: its intrinsics change with the timestep; those of timestep {views[0].timestep} are used"
-        )
-    _set_pose(camera, views)
-    _set_backgrounds(data, views, warn)
-    return camera
 
 
 def set_intrinsics(data: Any, camera: Camera) -> None:
@@ -204,39 +186,24 @@ def set_intrinsics(data: Any, camera: Camera) -> None:
     data.shift_y = (camera.cy - camera.height / 2) / camera.width * camera.fl_x / camera.fl_y
 
 
-def _same_intrinsics(one: Camera, other: Camera) -> bool:
-    values = np.array([(c.width, c.height, c.fl_x, c.fl_y, c.cx, c.cy) for c in (one, other)])
-    return bool(np.abs(values[0] - values[1]).max() <= INTRINSICS_TOLERANCE)
-
-
 def _set_pose(camera: Any, views: list[View]) -> None:
     poses = np.stack([view.camera.camera_to_world_gl for view in views])
     camera.rotation_mode = "QUATERNION"
     camera.matrix_basis = Matrix(poses[0].tolist())
     if np.abs(poses - poses[0]).max() <= POSE_TOLERANCE:
         return
-    curves = compat.action_curves(camera)
-    frames = np.array([view.timestep for view in views])
-    for axis in range(3):
-        write_curve(curves, "location", axis, frames, poses[:, axis, 3])
-    quaternions = [Matrix(pose[:3, :3].tolist()).to_quaternion() for pose in poses]
-    for last, quaternion in pairwise(quaternions):
-        quaternion.make_compatible(last)
-    for element, values in enumerate(np.array(quaternions).T):
-        write_curve(curves, "rotation_quaternion", element, frames, values)
+    curves, frames = action_curves(camera), [view.timestep for view in views]
+    write_curves(curves, "location", frames, poses[:, :3, 3])
+    write_curves(curves, "rotation_quaternion", frames, continuous(from_matrices(poses[:, :3, :3])))
 
 
 def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
     found = [view for view in views if view.image.is_file()]
-    if len(found) < len(views):
-        missing = next(view.image for view in views if not view.image.is_file())
-        warn(
-            f"{missing}: is missing, and {len(views) - len(found) - 1} other images of {data.name}"
-        )
+    missing = [view.image for view in views if not view.image.is_file()]
+    if missing:
+        warn(f"{missing[0]}: is missing, and {len(missing) - 1} other images of {data.name}")
     if not found:
         return
-    curves = compat.action_curves(data)
-    frames = np.array([view.timestep for view in found])
     for row, view in enumerate(found):
         background = data.background_images.new()
         try:
@@ -244,11 +211,9 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
         except RuntimeError as error:
             raise StgaError(f"{view.image}: cannot be read as an image") from error
         background.show_background_image = row == 0
-        # Visible from its own frame until the next image's; the first also before, the last also
-        # after.
-        near = np.arange(max(row - 1, 0), min(row + 2, len(found)))
-        path = f"background_images[{row}].show_background_image"
-        write_curve(curves, path, 0, frames[near], (near == row).astype(float), "CONSTANT")
+    # Each is visible from its frame until the next one's; the first also before, the last after.
+    paths = [f"background_images[{row}].show_background_image" for row in range(len(found))]
+    write_triangle_curves(data, paths, [view.timestep for view in found], "CONSTANT")
     data.show_background_images = True
 
 
@@ -263,23 +228,15 @@ def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
     """
     entries = []
     for thing in cameras:
-        if np.linalg.det(np.array(thing.evaluated_get(depsgraph).matrix_world.to_3x3())) < 0:
+        evaluated = thing.evaluated_get(depsgraph)
+        if evaluated.matrix_world.determinant() < 0:
             raise StgaError(f"{thing.name}: is mirrored by a negative scale; apply the scale")
-        width, height = (
-            int(n) for n in thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
-        )
-        camera = render_camera(thing.evaluated_get(depsgraph), depsgraph, width, height)
-        intrinsics = {"fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy}
-        entries.append(
-            {
-                "file_path": f"{thing.name}.png",
-                "camera_id": thing.name,
-                "w": width,
-                "h": height,
-                **{key: float(value) for key, value in intrinsics.items()},
-                "transform_matrix": (Z_UP_TO_Y_UP @ camera.camera_to_world_gl).tolist(),
-            }
-        )
+        size = thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
+        camera = render_camera(evaluated, depsgraph, int(size[0]), int(size[1]))
+        pose = Z_UP_TO_Y_UP @ camera.camera_to_world_gl
+        entry = {"file_path": f"{thing.name}.png", "camera_id": thing.name}
+        entry |= {"w": camera.width, "h": camera.height, "transform_matrix": pose.tolist()}
+        entries.append(entry | {name: float(getattr(camera, name)) for name in INTRINSICS[2:]})
     if not entries:
         raise StgaError("No cameras to export; add them, or select some")
     write_json(path, {"camera_model": "PINHOLE", "world": "keep", "frames": entries})
@@ -287,8 +244,7 @@ def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
 
 
 def scene_camera(depsgraph: Any) -> Camera:
-    """The scene's camera at the depsgraph's frame, for a whole image. Raises StgaError unless it is
-    perspective."""
+    """The scene's camera now, for a whole image. Raises StgaError unless it is perspective."""
     scene = depsgraph.scene
     camera = scene.camera.evaluated_get(depsgraph) if scene.camera else None
     return render_camera(camera, depsgraph, *image_size(scene.render))
@@ -309,14 +265,12 @@ def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) ->
     center = matrix[:3, :3] @ middle + matrix[:3, 3]
     angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)
     # The cameras of the capture that it belongs to, for their positions.
-    children = () if subject.parent is None else subject.parent.children_recursive
-    poses = [
-        np.array(child.matrix_world, np.float64)
+    children = () if angle or subject.parent is None else subject.parent.children_recursive
+    sensors = [
+        camera_from_gl(np.array(child.matrix_world, np.float64), 1, 1, 1, 1, 0, 0)
         for child in children
         if child.get(tags.KIND) == tags.CAMERA
     ]
-    if not angle and poses:
-        angles = covered_angles(
-            [camera_from_gl(pose, 1, 1, 1, 1, 0, 0) for pose in poses], start, center, UP
-        )
+    if sensors:
+        angles = covered_angles(sensors, start, center, UP)
     return turntable(start, center, count, angles, UP)

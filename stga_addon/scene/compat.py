@@ -59,8 +59,7 @@ def copy_action(owner: Any, name: str) -> Any:
 
 
 def push_down_action(owner: Any, extrapolation: str = "HOLD") -> None:
-    """Turn the action that animates `owner`, if any, into a strip of its own on top of the NLA
-    tracks."""
+    """Turn the action that animates `owner`, if any, into a strip on top of the NLA tracks."""
     animation = owner.animation_data
     if animation is None or animation.action is None:
         return
@@ -76,16 +75,14 @@ def push_down_action(owner: Any, extrapolation: str = "HOLD") -> None:
 
 
 def select_bones(rig: Any, names: set[str]) -> None:
-    """Select these bones of an armature object and no others; from Blender 5.0 on the pose has the
-    selection."""
+    """Select these bones of an armature object only; from 5.0 on the pose has the selection."""
     owners = rig.pose.bones if bpy.app.version >= (5, 0, 0) else rig.data.bones
     for bone in owners:
         bone.select = bone.name in names
 
 
 def set_modifier_input(modifier: Any, identifier: str, value: Any) -> None:
-    """Set a geometry nodes modifier's input by its socket identifier ("Socket_2"); a menu's by its
-    item's name."""
+    """Set a geometry nodes modifier's input by identifier ("Socket_2"), a menu's by its item."""
     if MODIFIER_INPUT_PROPERTIES:
         getattr(modifier.properties.inputs, identifier).value = value
     elif isinstance(value, str) and isinstance(modifier[identifier], int):
@@ -97,8 +94,7 @@ def set_modifier_input(modifier: Any, identifier: str, value: Any) -> None:
 
 
 def modifier_input(modifier: Any, identifier: str) -> Any:
-    """The value of a geometry nodes modifier's input by its socket identifier; a menu's is a number
-    before 5.2."""
+    """A geometry nodes modifier's input by identifier; a menu's is a number before 5.2."""
     if MODIFIER_INPUT_PROPERTIES:
         return getattr(modifier.properties.inputs, identifier).value
     return modifier[identifier]
@@ -114,8 +110,7 @@ def modifier_menu(modifier: Any, identifier: str) -> str:
 
 
 def modifier_input_owner(modifier: Any, identifier: str) -> tuple[Any, str]:
-    """What `UILayout.prop` needs to draw a geometry nodes modifier's input: the owner and the
-    property's name."""
+    """What `UILayout.prop` draws a geometry nodes modifier's input with: owner and property."""
     if MODIFIER_INPUT_PROPERTIES:
         return getattr(modifier.properties.inputs, identifier), "value"
     return modifier, f'["{identifier}"]'
@@ -129,14 +124,12 @@ def enable_nodes(owner: Any) -> Any:
 
 
 def world_nodes(world: Any) -> Any:
-    """The node tree that a world uses; None where it is a plain color, which is possible before
-    Blender 5."""
+    """A world's node tree; None where it is a plain color, possible before Blender 5."""
     return world.node_tree if bpy.app.version >= (5, 0, 0) or world.use_nodes else None
 
 
 def native_splats(tree: Any, points: Any) -> Any:
-    """Add a node that makes points (a geometry socket) Blender's native splats; its output, None if
-    it has no such type."""
+    """Add a node that makes points native splats; its output, None if it has no such type."""
     node = tree.nodes.new("GeometryNodePointsSetType")
     for name in ("3D Gaussian Splat", "3D Gaussian Splats"):  # as builds of 5.3 named it
         with suppress(TypeError):  # there is no such item
@@ -154,22 +147,17 @@ def allow_depth_write(shader: Any) -> None:
 
 
 def working_space() -> str:
-    """The name of the color space that is "scene-linear" in the open file; always `REC709` before
-    Blender 5.0."""
+    """The color space that is scene-linear in the open file; `REC709` before Blender 5.0."""
     spaces = getattr(bpy.data, "colorspace", None)
     return str(spaces.working_space) if spaces else REC709
 
 
 def choose_image_file(settings: Any, file_format: str, color_mode: str, color_depth: str) -> None:
-    """Choose the format of a scene's images (ImageFormatSettings), also where it was set to
-    videos."""
+    """Choose the format of a scene's images, also where it was set to videos."""
     if hasattr(settings, "media_type"):  # from Blender 5.0 on
         settings.media_type = "IMAGE"
-    settings.file_format, settings.color_mode, settings.color_depth = (
-        file_format,
-        color_mode,
-        color_depth,
-    )
+    settings.file_format = file_format
+    settings.color_mode, settings.color_depth = color_mode, color_depth
 
 
 def choose_video_file(render: Any) -> None:
@@ -188,21 +176,15 @@ def sequencer_strips(scene: Any) -> Any:
 
 
 def light_strength(light: Any) -> np.ndarray:
-    """(3,) linear: a light's color times its energy, exposure (from 4.5 on) and color temperature
-    (from 4.5 on)."""
-    color = (
-        np.array(light.color, np.float64) * light.energy * 2.0 ** getattr(light, "exposure", 0.0)
-    )
-    return (
-        color * np.array(light.temperature_color)
-        if getattr(light, "use_temperature", False)
-        else color
-    )
+    """(3,) linear: a light's color times energy, and from 4.5 on exposure and temperature."""
+    stops = getattr(light, "exposure", 0.0)
+    color = np.array(light.color, np.float64) * light.energy * 2.0**stops
+    has_temperature = getattr(light, "use_temperature", False)
+    return color * np.array(light.temperature_color) if has_temperature else color
 
 
 def is_normalized(light: Any) -> bool:
-    """Whether a light's energy is that of its whole area, as always before 4.5; else it is per
-    square meter."""
+    """Whether a light's energy is that of its whole area, as before 4.5; else per square meter."""
     return bool(getattr(light, "normalize", True))
 
 

@@ -1,5 +1,4 @@
-"""Visible splat objects as plain values: what both renderers, GPU and CPU, are given; numpy
-only."""
+"""Visible splat objects as plain values, which both renderers are given; numpy only."""
 
 from dataclasses import dataclass, replace
 
@@ -18,8 +17,7 @@ FROZEN_COLOR_SRGB = tuple(float(channel) for channel in linear_to_srgb(np.array(
 
 @dataclass(frozen=True)
 class DisplaySettings:
-    """A splat object's display settings, as the inputs of its modifier of the same names
-    (`display.splat_nodes`)."""
+    """A splat object's display settings, inputs of its modifier (`display.splat_nodes`)."""
 
     size: float = 1.0
     opacity_threshold: float = 0.0
@@ -31,8 +29,7 @@ class DisplaySettings:
 
 @dataclass(frozen=True, eq=False)
 class Relit:
-    """How a scene lights an avatar: its mesh (V, 3) as posed, light and casters, all in the
-    avatar's space."""
+    """How a scene lights an avatar: posed mesh (V, 3), light and casters in its space."""
 
     relighter: Relighter
     mesh: np.ndarray
@@ -40,8 +37,7 @@ class Relit:
     casters: tuple[Caster, ...] = ()
 
     def splats(self, eye: np.ndarray) -> Splats:
-        """The avatar's splats in the colors of this light, seen from eye (3,) in the avatar's
-        space."""
+        """The avatar's splats in the colors of this light, seen from eye (3,) in its space."""
         splats = self.relighter.avatar.splats
         color = self.relighter.colors(self.mesh, eye, self.lighting, self.casters)
         sh = ((color - np.float32(0.5)) / np.float32(SH_C0))[:, None]
@@ -66,8 +62,7 @@ class SceneLayer:
     relit: Relit | None = None
 
     def posed(self, eye: np.ndarray | None = None) -> PosedSplats:
-        """The same with the settings applied to the splats; eye (3,): the camera in the scene,
-        which relit splats need."""
+        """The splats as the settings show them; eye (3,): camera in the scene, where relit."""
         splats, settings = self.splats, self.settings
         if self.relit is not None:
             assert eye is not None
@@ -86,9 +81,8 @@ class SceneLayer:
             splats = replace(splats, sh=splats.sh[:, :1])
         if settings.size != 1:
             visible &= settings.size > 0
-            splats = replace(
-                splats, log_scale=splats.log_scale + np.float32(np.log(max(settings.size, 1e-6)))
-            )
+            factor = np.float32(np.log(max(settings.size, 1e-6)))
+            splats = replace(splats, log_scale=splats.log_scale + factor)
         splats = splats if visible.all() else splats.rows(visible)
         return PosedSplats(splats, self.frames, self.to_world, self.antialiased)
 
@@ -98,6 +92,5 @@ class SceneLayer:
 
 
 def random_percentage(count: int) -> np.ndarray:
-    """(N,) in 0…100, the same in every call: a splat is shown where it is less than
-    `DisplaySettings.percentage`."""
+    """(N,) in 0…100, always the same: a splat is shown where it is less than the percentage."""
     return np.random.default_rng(0).random(count) * 100

@@ -50,8 +50,7 @@ def collection_of(root: Any, kind: str) -> Any:
 
 
 def show_kind(root: Any, kind: str, view_layer: Any, show: bool) -> None:
-    """Show or hide the root's objects of this kind in viewports; renders and animation stay as they
-    are."""
+    """Show or hide the root's objects of this kind in viewports only."""
     for layer in layers_of(root, kind, view_layer):
         layer.hide_viewport = not show
 
@@ -125,19 +124,11 @@ def _action(owner: Any) -> Any:
 
 def _purge(datas: Iterable[Any], actions: Iterable[Any]) -> None:
     """Delete unused data-blocks, and the actions and background images that only they used."""
-    left = [action for action in actions if action is not None]
+    left = list(actions)
     for data in datas:
         if data is None or data.users:
             continue
-        left += [
-            action
-            for action in (_action(data), _action(getattr(data, "shape_keys", None)))
-            if action
-        ]
-        left += [
-            background.image
-            for background in getattr(data, "background_images", ())
-            if background.image
-        ]
+        left += [_action(data), _action(getattr(data, "shape_keys", None))]
+        left += [background.image for background in getattr(data, "background_images", ())]
         bpy.data.batch_remove([data])
-    bpy.data.batch_remove({block for block in left if not block.users})
+    bpy.data.batch_remove({block for block in left if block is not None and not block.users})

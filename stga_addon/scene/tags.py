@@ -42,8 +42,7 @@ GROUP_PREFIX = "stga_"
 
 
 def group_name(timestep: int) -> str:
-    """Vertex group of a timestep's selection; unpadded, so that nodes can build the name from the
-    frame."""
+    """Vertex group of a timestep; unpadded, so that nodes can build the name."""
     return f"{GROUP_PREFIX}{timestep}"
 
 

@@ -39,30 +39,19 @@ def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
     for group in reversed(list(head.vertex_groups)):
         if tags.group_timestep(group.name) is not None:
             head.vertex_groups.remove(group)
-    vertices = {timestep: np.unique(faces[selection[timestep]]) for timestep in sorted(selection)}
-    groups = {
-        head.vertex_groups.new(name=tags.group_name(each)).index: vertices[each]
-        for each in vertices
-        if len(vertices[each])
-    }
-    _fill_groups(head.data, groups)
-
-
-def _fill_groups(mesh: Any, groups: Mapping[int, np.ndarray]) -> None:
-    """Give the vertices of each group, by its index, a weight of 1.
-
-    For every vertex, `VertexGroup.add` looks for the group in the list of all: seconds for 1,000
-    groups.
-    """
+    # For each vertex, `VertexGroup.add` would look for the group among all: seconds for 1,000.
     whole = bmesh.new()
     try:
-        whole.from_mesh(mesh, face_normals=False, vertex_normals=False)
+        whole.from_mesh(head.data, face_normals=False, vertex_normals=False)
         layer = whole.verts.layers.deform.verify()
         weights = [vertex[layer] for vertex in whole.verts]
-        for index, vertices in groups.items():
-            for vertex in vertices.tolist():
+        for timestep in sorted(selection):
+            vertices = np.unique(faces[selection[timestep]]).tolist()
+            if vertices:
+                index = head.vertex_groups.new(name=tags.group_name(timestep)).index
+            for vertex in vertices:
                 weights[vertex][index] = 1.0
-        whole.to_mesh(mesh)
+        whole.to_mesh(head.data)
     finally:
         whole.free()
 
@@ -74,37 +63,29 @@ def read_selection(head: Any) -> dict[int, np.ndarray]:
     group; a timestep without a group selects nothing.
     """
     head.update_from_editmode()
-    by_timestep = {
+    groups = {
         timestep: group.index
         for group in head.vertex_groups
         if (timestep := tags.group_timestep(group.name)) is not None
     }
-    faces = mesh_triangles(head.data)
-    timesteps = {int(timestep) for timestep in head.get(tags.TIMESTEPS, ())} | set(by_timestep)
-    selection = {timestep: np.zeros(len(faces), bool) for timestep in sorted(timesteps)}
-    selection.update(zip(by_timestep, _read_faces(head, list(by_timestep.values())), strict=True))
-    return selection
+    timesteps = {int(timestep) for timestep in head.get(tags.TIMESTEPS, ())} | set(groups)
+    selected = dict(zip(groups, _read_faces(head, list(groups.values())), strict=True))
+    faces = len(head.data.polygons)
+    return {each: selected.get(each, np.zeros(faces, bool)) for each in sorted(timesteps)}
 
 
 def training_selection(head: Any) -> dict[int, np.ndarray] | None:
-    """`read_selection` for training; None where the head has no selection group, so that the
-    trainer selects itself."""
+    """`read_selection`, or None without a selection group: the trainer selects itself."""
     if any(tags.group_timestep(group.name) is not None for group in head.vertex_groups):
         return read_selection(head)
     return None
 
 
 def read_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """name -> (F,) bool of vertex groups of the head: the triangles whose corners all have a weight
-    of 0.5 or more."""
+    """name -> (F,) bool of vertex groups: triangles whose corners have a weight of 0.5 or more."""
     head.update_from_editmode()
-    return dict(
-        zip(
-            names,
-            _read_faces(head, [head.vertex_groups[name].index for name in names]),
-            strict=True,
-        )
-    )
+    groups = [head.vertex_groups[name].index for name in names]
+    return dict(zip(names, _read_faces(head, groups), strict=True))
 
 
 def read_triangle_weights(head: Any, name: str) -> np.ndarray:
@@ -133,8 +114,7 @@ def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
 
 
 def splats_per_face(splat_object: Any, head: Any) -> np.ndarray | None:
-    """(F,) how many splats of the object each triangle of the head carries; None where it shows no
-    avatar."""
+    """(F,) splats of the object on each triangle of the head; None without an avatar."""
     attribute = splat_object.data.attributes.get(FACE) if splat_object is not None else None
     if attribute is None:
         return None
@@ -144,19 +124,8 @@ def splats_per_face(splat_object: Any, head: Any) -> np.ndarray | None:
 
 
 def _read_faces(head: Any, groups: list[int]) -> list[np.ndarray]:
-    """(F,) bool per group index: the triangles whose three vertices have the weight of a selected
-    one."""
-    faces = mesh_triangles(head.data)
-    return [
-        vertices[faces].all(1)
-        for vertices in _read_vertices(head.data, len(head.vertex_groups), groups)
-    ]
-
-
-def _read_vertices(mesh: Any, group_count: int, groups: list[int]) -> np.ndarray:
-    """(len(groups), V) bool: which vertices have the weight of a selected one in the groups of
-    these indices."""
-    members = [vertex.groups for vertex in mesh.vertices]
+    """(F,) bool per group index: triangles with three selected vertices."""
+    members = [vertex.groups for vertex in head.data.vertices]
     counts = np.array([len(each) for each in members], np.int64)
     indices, weights = np.empty(counts.sum(), np.int32), np.empty(counts.sum(), np.float32)
     ends = np.cumsum(counts)
@@ -164,10 +133,10 @@ def _read_vertices(mesh: Any, group_count: int, groups: list[int]) -> np.ndarray
         if begin < end:
             each.foreach_get("group", indices[begin:end])
             each.foreach_get("weight", weights[begin:end])
-    row_of = np.full(group_count, -1)
+    row_of = np.full(len(head.vertex_groups), -1)
     row_of[groups] = np.arange(len(groups))
     rows, vertices = row_of[indices], np.repeat(np.arange(len(members)), counts)
     selected = (rows >= 0) & (weights >= SELECTED_WEIGHT)
     in_group = np.zeros((len(groups), len(members)), bool)
     in_group[rows[selected], vertices[selected]] = True
-    return in_group
+    return list(in_group[:, mesh_triangles(head.data)].all(2))

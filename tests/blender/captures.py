@@ -1,5 +1,4 @@
-"""Captures and FLAME sequences made by hand, without files, so that the scene is tested and not the
-readers."""
+"""Captures and FLAME sequences made by hand, so that the scene is tested, not readers."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,8 +18,7 @@ def strip(vertices: int) -> np.ndarray:
 
 
 def closure(selected: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: the triangles (F, 3) whose three vertices all belong to a selected triangle (F,)
-    bool."""
+    """(F,) bool: triangles (F, 3) whose vertices all belong to a selected triangle."""
     return np.isin(faces, faces[selected]).all(axis=1)
 
 
@@ -54,8 +52,7 @@ def mesh_capture(
 def flame_model(
     vertices: int = 80, components: int = 40, identity: int = 10, seed: int = 0
 ) -> FlameModel:
-    """A random model with enough expressions that a joint depends on more terms than one driver
-    holds."""
+    """A random model whose joints depend on more terms than one driver holds."""
     rng = np.random.default_rng(seed)
     weights = rng.random((vertices, 5)) ** 4
     regressor = rng.random((5, vertices)) * (rng.random((5, vertices)) < 0.3)

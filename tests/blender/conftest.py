@@ -24,8 +24,7 @@ def _factory_settings():
 
 @pytest.fixture(autouse=True)
 def empty_scene(_factory_settings):
-    """As after factory settings, in a fifth of the time: Blender's own add-ons are not registered
-    anew."""
+    """As after factory settings, in a fifth of the time: Blender's add-ons stay registered."""
     import bpy
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
@@ -67,8 +66,7 @@ def zip_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A capture that holds its FLAME file, in place of the demo in a zip of the complete
-    edition."""
+    """A capture with its FLAME file, in place of the demo of the complete edition."""
     folder, model = write_flame_capture(tmp_path_factory.mktemp("demo") / "capture")
     model.rename(folder / OWN_MODELS[0])
     return folder

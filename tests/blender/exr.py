@@ -9,8 +9,7 @@ MULTI_PART = 0x1000
 
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Channel name -> (H, W) float32, top row first, of scanlines without compression, in one part
-    or in several."""
+    """Channel name -> (H, W) float32, top row first, of scanlines without compression."""
     data = path.read_bytes()
     magic, version = struct.unpack_from("<2i", data)
     assert magic == 20000630

@@ -130,7 +130,8 @@ def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
     some 64 kB."""
     rows = {"effect": "jaw", "choice": "auto", "on": True, "reason": "x" * 200_000, "cost": ""}
     analyze(
-        f"sys.stderr.write('warning ' * 100_000); answer(kind='Analyzed', plan=[{rows}], seconds={{}})"
+        "sys.stderr.write('warning ' * 100_000); "
+        f"answer(kind='Analyzed', plan=[{rows}], seconds={{}})"
     )
     assert not bpy.ops.stga.analyze_capture.poll()
     tick_until_done(extension)

@@ -85,8 +85,7 @@ def show_avatar(folder: Path, scene: Reenacted) -> Avatar:
 
 
 def test_a_file_from_a_start_frame(scene):
-    """Catches the other's identity, a shifted frame, and a scene that stops playing before the
-    motion ends."""
+    """Catches the other's identity, a shifted frame, and a scene that stops too early."""
     assert bpy.ops.stga.apply_motion(filepath=str(scene.file), start=10) == {"FINISHED"}
     for row in range(5):
         np.testing.assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
@@ -101,8 +100,7 @@ def write_refined(folder: Path, capture: Capture, rng: np.random.Generator) -> N
 
 
 def test_a_runs_refined_tracking(scene, tmp_path):
-    """Catches a head that does not get to where its avatar was trained: timesteps 0, 1 and 3,
-    refined."""
+    """Catches a head that misses where its avatar was trained: timesteps 0, 1, 3, refined."""
     capture = open_capture(scene.folder, scene.model_file)
     write_refined(tmp_path, capture, np.random.default_rng(0))
     shown = with_refined_tracking(capture, tmp_path)
@@ -116,8 +114,7 @@ def test_a_runs_refined_tracking(scene, tmp_path):
 
 @pytest.mark.parametrize("place", ["action", "strip"])
 def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
-    """Catches a head that loses what was tracked beside the parameters, also where another motion
-    had exchanged it."""
+    """Catches what was tracked beside parameters lost, also after another motion."""
     rng = np.random.default_rng(7)
     folder, model = write_flame_capture(tmp_path / "own")
     for path in (folder / "flame_param").glob("*.npz"):
@@ -139,8 +136,7 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
 
 
 def test_tooltips_say_whose_motion(extension):
-    """Catches two buttons that do different things and explain themselves alike, or an empty
-    tooltip."""
+    """Catches two buttons that differ but explain themselves alike, or not at all."""
     operator = extension.operators.apply_motion.ApplyMotion
     refined_tracking = operator.description(bpy.context, SimpleNamespace(own_offsets=True))
     assert "refined by training" in refined_tracking
@@ -185,8 +181,7 @@ def test_recorded_at_another_rate(scene):
 
 
 def test_a_capture_and_another_head(scene, tmp_path):
-    """Catches a folder that is not taken as a motion, and a head whose hand-made animation is not
-    what is applied."""
+    """Catches a folder not taken as a motion, and a hand-made animation that is not applied."""
     folder, model = write_flame_capture(tmp_path / "second", timesteps=(0, 1, 2))
     name = the_head().name
     bpy.ops.stga.apply_motion(filepath=str(folder), start=20)
@@ -251,8 +246,7 @@ def test_heads_without_a_rig_are_told_what_is_needed(tmp_path):
 
 
 def test_splats_follow_what_is_keyframed_by_hand(scene, tmp_path):
-    """Catches splats that know tracked frames only: sliders, bones and identity must move them at
-    once."""
+    """Catches splats that sliders, bones and identity do not move at once."""
     avatar = show_avatar(tmp_path, scene)
     rig, keys = rig_of(the_head()), the_head().data.shape_keys.key_blocks
     rig.animation_data.action = the_head().data.shape_keys.animation_data.action = None

@@ -1,5 +1,4 @@
-"""Face performances in Blender: Apply Motion, ARKit controls, and heads with shape keys of ARKit's
-names."""
+"""Face performances: Apply Motion, ARKit controls, and heads with ARKit's shape keys."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,8 +30,7 @@ RNG = np.random.default_rng(4)
 
 @pytest.fixture
 def scene(tmp_path: Path) -> SimpleNamespace:
-    """The small head of another identity, imported from its own short motion; a performance of 7
-    rows at 30 Hz."""
+    """The small head of another identity with its own motion; a performance of 7 rows, 30 Hz."""
     model = small_head(0)
     write_flame(model, tmp_path / "flame.npz")
     shape = np.linspace(-0.5, 0.5, model.n_identity)
@@ -141,8 +139,7 @@ def test_curves_come_back_from_an_action(scene, tmp_path):
 
 
 def test_a_head_with_shape_keys(scene, tmp_path):
-    """Catches a head of another model that has ARKit's shapes, in its own spelling, and cannot be
-    driven."""
+    """Catches a head with ARKit's shapes in its own spelling that cannot be driven."""
     from capture.factory import write_mesh_capture
 
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "ball")))

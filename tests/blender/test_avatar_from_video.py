@@ -1,5 +1,4 @@
-"""Avatar from Video: its request, the folder that it proposes, and its way from a video to splats
-on a head."""
+"""Avatar from Video: its request, its folder, and its way to splats on a head."""
 
 import sys
 from importlib import import_module
@@ -81,8 +80,7 @@ def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
 
 
 def test_what_was_begun_is_continued_by_its_folder(asked, video, tmp_path):
-    """Catches a Continue in the panel that asks for the video again, or continues as with other
-    options."""
+    """Catches a Continue that asks for the video again, or has other options."""
     assert bpy.ops.stga.avatar_from_video(filepath=str(video), focal=900.0) == {"FINISHED"}
     begin(asked)
     assert bpy.ops.stga.avatar_from_video(
@@ -106,8 +104,7 @@ def test_the_panel_is_opened(extension, asked, video, monkeypatch):
 
 
 def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
-    """Catches a worker that is started for nothing, and the request of another video in a
-    folder."""
+    """Catches a worker started for nothing, and another video's request in a folder."""
     with pytest.raises(RuntimeError, match=r"gone\.mp4: is not a file; expected a video"):
         bpy.ops.stga.avatar_from_video(filepath=str(tmp_path / "gone.mp4"))
     (tmp_path / "out/capture").mkdir(parents=True)

@@ -48,8 +48,7 @@ def scene_with_cameras():
 
 
 def test_points_project_as_in_blender(tmp_path):
-    """Catches lens shift, sensor fit, resolution percentage or a scaled parent lost on the way to
-    the footage."""
+    """Catches lens shift, sensor fit, resolution or a scaled parent lost on the way."""
     scene_with_cameras()
     assert bpy.ops.stga.export_cameras(filepath=str(tmp_path / "transforms.json")) == {"FINISHED"}
     for name in ("left", "Camera.001", "on rail"):

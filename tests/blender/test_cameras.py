@@ -26,8 +26,7 @@ from .captures import mesh_capture  # noqa: E402
 
 
 def pose(seed: int) -> np.ndarray:
-    """Camera-to-world (4, 4), OpenGL axes: about a meter from the origin, roughly looking at it,
-    rolled."""
+    """Camera-to-world (4, 4), OpenGL axes: a meter from the origin, looking at it, rolled."""
     rng = np.random.default_rng(seed)
     back = rng.normal(size=3)
     back /= np.linalg.norm(back)
@@ -60,8 +59,7 @@ def capture_of(root: Path, cameras: dict[int, list[Camera]]) -> Capture:
 
 
 def pixels_in_blender(camera_object, points: np.ndarray) -> np.ndarray:
-    """(N, 2) pixels from the top-left corner where the scene's render puts the capture's points (N,
-    3)."""
+    """(N, 2) pixels where the scene's render puts the capture's points (N, 3)."""
     scene = bpy.context.scene
     render = scene.render
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -94,8 +92,7 @@ def assert_projects(camera_object, one: Camera) -> None:
 @pytest.mark.parametrize("fl_y", [2050.0, 1900.0, 2300.0])
 @pytest.mark.parametrize(("width", "height"), [(550, 802), (802, 550)])
 def test_projection_equals_the_capture_s(tmp_path, width, height, fl_y):
-    """Fails when a shift has the wrong sign or unit, the sensor fits the wrong side, or pixels'
-    aspect is lost."""
+    """Fails when a shift's sign or unit, the sensor's fit, or pixels' aspect is wrong."""
     one = camera(1, width, height, fl_y)
     capture = capture_of(tmp_path, {0: [one]})
     (imported,) = import_cameras(capture, capture_root(tmp_path))
@@ -105,8 +102,7 @@ def test_projection_equals_the_capture_s(tmp_path, width, height, fl_y):
 
 @pytest.mark.parametrize("fps", [None, 60.0, 30000 / 1001, 12.5, 0.4])
 def test_the_scene_plays_at_the_rate_of_the_capture(tmp_path, fps):
-    """Catches footage of 60 frames a second that plays 2.5 times too slowly, and rates rounded to
-    whole numbers."""
+    """Catches footage of 60 frames a second played too slowly, and rounded rates."""
     capture = replace(capture_of(tmp_path, {0: [camera(1)]}), fps=fps)
     (imported,) = import_cameras(capture, capture_root(tmp_path))
     bpy.context.scene.render.fps, bpy.context.scene.render.fps_base = 24, 1.0
@@ -115,8 +111,7 @@ def test_the_scene_plays_at_the_rate_of_the_capture(tmp_path, fps):
 
 
 def test_a_moving_camera_is_keyframed(tmp_path):
-    """Fails when only the first pose is imported, or quaternions flip so that the camera tumbles
-    between frames."""
+    """Fails when only the first pose is imported, or the camera tumbles between frames."""
     row = [camera(seed) for seed in (1, 2, 3)]
     capture = capture_of(tmp_path, {0: row})
     (imported,) = import_cameras(capture, capture_root(tmp_path))
@@ -133,8 +128,7 @@ def test_a_moving_camera_is_keyframed(tmp_path):
 
 
 def test_studio_head_projects_into_its_masks(shared_data):
-    """Fails when meshes and cameras of a real capture do not meet in Blender as they do in the
-    images."""
+    """Fails when meshes and cameras do not meet in Blender as in the images."""
     capture = open_capture(shared_data / "studio_head")
     cameras = import_cameras(capture, capture_root(capture.root))
     assert len(cameras) == 16
@@ -152,8 +146,7 @@ def test_studio_head_projects_into_its_masks(shared_data):
 
 
 def test_background_images_follow_the_frame(tmp_path):
-    """Fails when backgrounds are numbered by camera as Blender's image sequences would, or two are
-    visible at once."""
+    """Fails when backgrounds are numbered by camera, or two are visible at once."""
     capture = capture_of(tmp_path, {5: [camera(0)] * 3, 8: [camera(1)] * 3})
     cameras = import_cameras(capture, capture_root(tmp_path))
     for frame, timestep in ((1, 3), (3, 3), (4, 4), (5, 5), (9, 5)):
@@ -180,8 +173,7 @@ def test_missing_images_are_reported(tmp_path):
 
 
 def test_second_import_replaces_the_first(tmp_path):
-    """Fails when a second import duplicates cameras or images, or keeps a camera that the capture
-    lost."""
+    """Fails when a second import duplicates cameras or images, or keeps lost ones."""
     root = capture_root(tmp_path)
     first = import_cameras(
         capture_of(tmp_path, {0: [camera(0), camera(4)], 1: [camera(1)] * 2}), root
@@ -241,8 +233,7 @@ def test_other_cameras_are_refused(tmp_path):
 
 
 def test_bones_and_cameras_are_in_collections_of_their_own(tmp_path):
-    """Catches an import that covers the head with cameras, or hides the head or the scene's camera
-    along with them."""
+    """Catches a head covered by cameras, or hidden with them, or a hidden scene camera."""
     capture = open_capture(write_mesh_capture(tmp_path / "capture", range(2), range(3)))
     head = import_head(capture)
     cameras = import_cameras(capture, capture_root(capture.root))
@@ -260,8 +251,7 @@ def test_bones_and_cameras_are_in_collections_of_their_own(tmp_path):
 
 
 def test_the_central_camera_sees_the_face(tmp_path):
-    """Catches the first camera in place of the central one, as before world matrices are
-    computed."""
+    """Catches the first camera in place of the central one, before world matrices."""
     turned = [
         look_at((np.sin(a), 0.0, np.cos(a)), (0, 0, 0), 40, 60, 80.0) for a in (0.9, -0.8, 0.1)
     ]

@@ -62,8 +62,7 @@ def test_without_a_head_everything_is_named(stga, folder, capsys):
 
 
 def test_the_open_head_stands_in_for_the_capture(stga, folder, tmp_path, capfd):
-    """Catches a command that works on nothing, or on the open head although another capture is
-    named."""
+    """Catches a command on nothing, or on the open head although another is named."""
     bpy.ops.stga.import_capture(directory=str(folder))
     save_and_open(tmp_path / "head.blend")
     assert stga("select", "--threshold", 0.0005) == 0
@@ -119,8 +118,7 @@ def here(extension):
 
 @pytest.mark.slow
 def test_render_of_the_open_head(stga, here, tmp_path):
-    """Catches a render verb that cannot find avatar or capture in the file, or draws another
-    motion."""
+    """Catches a render verb that misses avatar or capture, or draws another motion."""
     pytest.importorskip("numba")
     folder, model = write_flame_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
@@ -132,8 +130,8 @@ def test_render_of_the_open_head(stga, here, tmp_path):
     cameras = folder / "transforms_val.json"
     assert here("render", "--cameras", cameras, "--out", tmp_path / "here") == 0
     assert stga("render", "--cameras", cameras, "--out", tmp_path / "there") == 0
-    assert stga("render", tmp_path / "a.npz", "--capture", folder, "--flame", model, "--cameras", cameras,
-                "--out", tmp_path / "tracked") == 0  # fmt: skip
+    given = ("--capture", folder, "--flame", model, "--cameras", cameras)
+    assert stga("render", tmp_path / "a.npz", *given, "--out", tmp_path / "tracked") == 0
     pictures, there, tracked = (
         [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))]
         for name in ("here", "there", "tracked")
@@ -158,8 +156,7 @@ def test_missing_training_python(stga, extension, folder, monkeypatch, capsys):
 
 @pytest.mark.parametrize("command", ["train", "track", "avatar"])
 def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monkeypatch, command):
-    """Catches a command in Blender's own Python, which can train but perhaps not track, although
-    another was chosen."""
+    """Catches a command in Blender's Python although another was chosen."""
     chosen = tmp_path / "python"
     chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
     chosen.chmod(0o755)
@@ -215,8 +212,7 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
 
 
 def test_a_farms_python_comes_first(extension, monkeypatch):
-    """Catches a farm's variable that Blender ignores, or that overrules the Python an operator was
-    given."""
+    """Catches a farm's variable that is ignored, or overrules an operator's Python."""
     operators, worker = (
         extension.operators.training_python,
         extension.stga_addon.worker.training_python,
@@ -228,8 +224,7 @@ def test_a_farms_python_comes_first(extension, monkeypatch):
 
 @pytest.mark.slow
 def test_an_avatar_from_footage(stga, take, tmp_path, capfd):
-    """Catches a .blend file that is missing because the Python that trains has no Blender, or one
-    without links."""
+    """Catches a missing .blend file where the training Python has no Blender, or no links."""
     given = [take / "footage", "--model", take / "head.npz", "--landmarks", take / "points"]
     more = ["--iterations", "4", "--effect", "tracking=on"]
     assert stga("avatar", *given, "--out", tmp_path / "out", *more) == 0

@@ -28,7 +28,8 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
 
 OWN_PACKAGES = (
-    "bpy", "numpy", "numpy.libs", "zstandard", "requests", "urllib3", "idna", "certifi", "charset_normalizer",
+    "bpy", "numpy", "numpy.libs", "zstandard", "requests", "urllib3", "idna", "certifi",
+    "charset_normalizer",
 )  # fmt: skip
 """What a Blender's Python has of its own."""
 OFFLINE = ["unshare", "-rn"]
@@ -39,8 +40,10 @@ import json, sys, time
 from pathlib import Path
 import bpy
 archive, home, video = sys.argv[1], Path(sys.argv[2]), sys.argv[4]
-result = {"before": [name for name in ("torch", "numba", "scipy") if __import__("importlib.util").util.find_spec(name)]}
-bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=False)
+from importlib.util import find_spec
+result = {"before": [name for name in ("torch", "numba", "scipy") if find_spec(name)]}
+install = bpy.ops.extensions.package_install_files
+install(filepath=archive, repo="user_default", enable_on_install=False)
 bpy.ops.wm.read_factory_settings(use_empty=True)
 module = "bl_ext.user_default.stga"
 begin = time.perf_counter()
@@ -50,7 +53,8 @@ result["heavy"] = sorted({"torch", "numba"} & set(sys.modules))
 bpy.ops.stga.open_demo()
 settings = bpy.context.scene.stga
 result["run"], result["minutes"] = settings.run_folder, settings.minutes
-bpy.ops.stga.train(directory=settings.run_folder, iterations=int(sys.argv[3]), python=sys.executable)
+folder, count = settings.run_folder, int(sys.argv[3])
+bpy.ops.stga.train(directory=folder, iterations=count, python=sys.executable)
 bpy.ops.stga.show_avatar(filepath=settings.avatar)
 bpy.ops.stga.open_demo()
 result["next run"] = settings.run_folder
@@ -58,14 +62,16 @@ result["log"] = (Path(result["run"]) / "job/worker.log").read_text()
 bpy.ops.stga.test_python()
 result["check"] = sys.modules[module + ".operators.training_python"].test.found.line
 bpy.ops.stga.avatar_from_video(filepath=video, folder=str(home / "avatar"), minutes=0.05)
-result["made"] = [settings.head["stga_capture"], settings.splats["stga_run"], len(settings.splats.data.vertices)]
+splats = settings.splats
+result["made"] = [settings.head["stga_capture"], splats["stga_run"], len(splats.data.vertices)]
 run = sys.modules[module + ".operators.command_line"]._run
 result["codes"] = [
     run(["track", video, "--stop", "3", "--out", str(home / "tracked")]),
     run(["avatar", video, "--out", str(home / "avatar"), "--budget", "3s"]),
 ]
 bpy.ops.preferences.addon_disable(module=module)
-index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
+repos = bpy.context.preferences.extensions.repos
+index = next(i for i, repo in enumerate(repos) if repo.module == "user_default")
 bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
 installed = Path(bpy.context.preferences.extensions.repos[index].directory)
 found = [*installed.parent.rglob("*torch*"), *installed.glob("stga*")]

@@ -26,8 +26,7 @@ def lines(count: int = 6, forecast: bool = True) -> list[dict[str, object]]:
 
 
 def test_curve_agrees_with_its_axes():
-    """Catches a curve upside down, mirrored or stretched, and a forecast that is not drawn, or not
-    after the curve."""
+    """Catches a curve upside down, mirrored or stretched, and a misplaced forecast."""
     pixels, axes, detail = curve_image(lines())
     assert detail == ""
     low, high = map(float, re.fullmatch(r"(\S+) to (\S+) dB, 0 to 1.7 min", axes).groups())
@@ -54,8 +53,7 @@ def test_short_and_constant_curves():
 
 
 def test_detail_difference_is_drawn_with_the_best_at_the_top():
-    """Catches the measure by which the avatar is kept left out, upside down, or with another range
-    than its text."""
+    """Catches the measure that keeps avatars left out, upside down, or out of range."""
     measured = [
         {**line, "detail_difference": 0.08 - 0.01 * row}
         for row, line in enumerate(lines(forecast=False))
@@ -83,8 +81,7 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     )
 
     def draw() -> list[str]:
-        """Read the run's evaluations as the training monitor does, and draw; the texts below the
-        picture."""
+        """Read evaluations as the training monitor does, and draw; the texts below."""
         drawn.clear()
         monitor._curves[tmp_path] = monitor._read_curve(tmp_path)
         curve.draw_curve(layout, tmp_path)
@@ -100,7 +97,8 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     painted = np.array(curve._previews[str(tmp_path)].image_pixels_float[:]).reshape(SIZE, SIZE, 4)
     np.testing.assert_allclose(painted, curve_image(lines())[0], atol=1 / 255)
     file.write_text(
-        '{"iteration": 1, "seconds": "x", "psnr": 1}\n{"iteration": 2, "seconds": 2, "psnr": null}\n'
+        '{"iteration": 1, "seconds": "x", "psnr": 1}\n'
+        '{"iteration": 2, "seconds": 2, "psnr": null}\n'
     )
     assert draw() == []
     assert len(bpy.data.images) == 0

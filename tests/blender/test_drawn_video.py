@@ -38,8 +38,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch, video: DrawnVideo, shades: list[float
 
 @pytest.mark.slow
 def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
-    """Catches a view transform, an order, a size or a rate of the encoded video that is not that of
-    the images."""
+    """Catches colors, an order, a size or a rate in the video that is not the images'."""
     scenes = len(bpy.data.scenes)
     (tmp_path / "drawn").mkdir()
     video = DrawnVideo(tmp_path / "drawn", tmp_path / "out.mp4", None)

@@ -1,5 +1,4 @@
-"""Driving a head live in Blender: what a source sends on the head, and what stays when it is
-stopped."""
+"""Driving a head live: what a source sends on the head, and what stays afterwards."""
 
 import gc
 import socket
@@ -92,8 +91,7 @@ def half(seed: int) -> dict[str, float]:
 
 
 def test_the_head_follows_and_comes_back(live):
-    """Catches a pose that is another than a file's, keyframes that nobody asked for, and a head
-    that stays posed."""
+    """Catches a pose that is not a file's, unwanted keyframes, and a head that stays posed."""
     bpy.context.scene.frame_set(1)
     before, actions = mesh(), sorted(bpy.data.actions.keys())
     assert bpy.ops.stga.drive_live() == {"FINISHED"}
@@ -114,8 +112,7 @@ def test_the_head_follows_and_comes_back(live):
 
 
 def test_a_rendered_animation_keeps_its_own_pose(live):
-    """Catches an animation rendered while the head is driven, each frame of which shows the last
-    live pose."""
+    """Catches an animation rendered while driving that shows the last live pose."""
     rendered = {}
 
     class Recorder(bpy.types.RenderEngine):
@@ -198,8 +195,7 @@ def test_stopped_in_the_middle_of_a_recording(live):
 
 
 def test_the_trained_range(live):
-    """Catches a meter that says inside where nobody trained, and a live pose that is not led
-    back."""
+    """Catches a meter that says inside where nobody trained, and poses not led back."""
     bpy.context.scene.frame_set(2)
     bpy.ops.stga.measure_range()
     from stga_addon.scene.rig.motion import outside_now, stored_range

@@ -1,5 +1,4 @@
-"""Files dropped into the viewport: which operator a handler calls, and what that makes of the
-file."""
+"""Files dropped into the viewport: which operator a handler calls, and the result."""
 
 import numpy as np
 import pytest
@@ -31,8 +30,7 @@ def head(tmp_path):
 
 @pytest.mark.parametrize("name", HANDLERS)
 def test_handlers_call_operators_that_take_a_file(name):
-    """Catches a handler whose operator does not exist, or has no property for the path that Blender
-    passes."""
+    """Catches a handler whose operator is missing, or has no property for the path."""
     handler = getattr(bpy.types, name)
     extensions, operator = HANDLERS[name]
     assert (handler.bl_file_extensions, handler.bl_import_operator) == (extensions, operator)
@@ -67,8 +65,7 @@ def test_transforms_file_stands_for_its_capture(tmp_path):
 
 
 def test_avatar_is_shown(head, tmp_path):
-    """Catches an avatar that is taken for a motion: both are .npz files with an array
-    `rotation`."""
+    """Catches an avatar taken for a motion: both are .npz with an array `rotation`."""
     assert bpy.ops.stga.open_npz(filepath=str(ball_avatar(tmp_path / "a.npz"))) == {"FINISHED"}
     assert bpy.context.scene.stga.splats is not None
 
@@ -95,8 +92,7 @@ def test_avatar_without_a_head_is_a_sentence(tmp_path):
 
 
 def test_other_files_are_refused(tmp_path):
-    """Catches a traceback, or an error about FLAME, for a file that is neither avatar nor
-    motion."""
+    """Catches a traceback, or an error on FLAME, for neither avatar nor motion."""
     np.savez(tmp_path / "other.npz", values=np.zeros(3))
     (tmp_path / "noise.npz").write_bytes(b"no archive")
     for name, sentence in (

@@ -27,7 +27,9 @@ sys.meta_path.insert(0, Refuse())
 root = sys.argv[1]
 sys.path[:] = [folder for folder in sys.path if folder not in ("", root)]
 begin = time.process_time()
-spec = importlib.util.spec_from_file_location("stga", f"{root}/__init__.py", submodule_search_locations=[root])
+spec = importlib.util.spec_from_file_location(
+    "stga", f"{root}/__init__.py", submodule_search_locations=[root]
+)
 module = sys.modules["stga"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
 module.register()

@@ -134,8 +134,7 @@ def displayed(passes: dict[str, np.ndarray], background: float) -> np.ndarray:
 def expected_camera(
     camera, shown, width: int = WIDTH, height: int = HEIGHT, focal: float | None = None
 ) -> Camera:
-    """The expected camera, in the space of the splats: focal length in pixels, shift in sensor
-    widths."""
+    """The expected camera in the splats' space: focal length in pixels, shift in widths."""
     bpy.context.view_layer.update()
     data = camera.data
     across = (
@@ -297,8 +296,7 @@ def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
 )
 @pytest.mark.parametrize("portrait", [False, True])
 def test_camera_settings_are_applied(changes, portrait, tmp_path):
-    """Catches a wrong sensor fit, shifts of the wrong sign or unit, and the resolution's
-    percentage."""
+    """Catches a wrong sensor fit, shifts' sign or unit, and the percentage."""
     scene = bpy.context.scene
     width, height = (HEIGHT, WIDTH) if portrait else (WIDTH, HEIGHT)
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = (
@@ -332,8 +330,7 @@ def test_render_region(crop, tmp_path):
 
 
 def test_world_color_is_the_background(tmp_path):
-    """Catches a background that is blended in linear light although the splats were trained in
-    sRGB."""
+    """Catches a background blended in linear light: splats were trained in sRGB."""
     scene = bpy.context.scene
     scene.render.film_transparent = False
     scene.world = bpy.data.worlds.new("world")
@@ -371,8 +368,7 @@ def test_depth_in_meters(tmp_path):
 
 
 def test_objects_are_sorted_together(tmp_path):
-    """Catches objects composited one after the other, and wrong directions or sizes of a
-    transformed object."""
+    """Catches objects composited one by one, and wrong directions or sizes when moved."""
     rng = np.random.default_rng(6)
     scans = []
     for seed, count in ((0, 300), (1, 200)):
@@ -399,8 +395,7 @@ def test_objects_are_sorted_together(tmp_path):
 
 
 def _merged(scans, spaces, eye):
-    """World splats of several sets, with colors for one camera position: constant coefficients
-    only."""
+    """World splats of several sets, with constant colors for one camera position."""
     parts = []
     for splats, space in zip(scans, spaces, strict=True):
         turn = space[:3, :3]
@@ -503,8 +498,7 @@ def test_only_visible_objects_are_rendered(tmp_path):
 
 
 def test_keyframes_of_visibility_count_in_animations(tmp_path):
-    """Catches a keyframed *Disable in Renders* that is read before the frame's animation, of splats
-    and instances."""
+    """Catches a keyframed *Disable in Renders* read too early, of splats and instances."""
     splats = replace(
         random_splats(1, 50),
         xyz=np.zeros((50, 3), np.float32),
@@ -549,8 +543,7 @@ def _png(path: Path) -> np.ndarray:
 
 @pytest.mark.needs("adapter")
 def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
-    """Catches F12 that renders on the CPU where the preferences say GPU, another picture, and a
-    silent failure."""
+    """Catches F12 on the CPU where preferences say GPU, and a silent failure."""
     from raster import gpu_device
 
     from stga_addon.raster.gpu import compose as on_gpu

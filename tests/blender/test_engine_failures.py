@@ -10,7 +10,7 @@ pytest.importorskip("numba")
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input  # noqa: E402
-from stga_addon.scene.render import engine, engine_viewport  # noqa: E402
+from stga_addon.scene.render import engine  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
@@ -73,8 +73,7 @@ def test_a_head_in_edit_mode_is_named():
 def test_failed_render_is_an_error_and_an_empty_image(
     stage, raised, message, tmp_path, monkeypatch
 ):
-    """Catches an image without passes, which Blender cannot save or crashes over, and a failure
-    saved as an image."""
+    """Catches an image without passes, and a failure saved as an image."""
 
     def fail(*_: object) -> None:
         raise raised
@@ -112,9 +111,8 @@ def test_panels_drop_the_engine_on_unregister():
 
 
 def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
-    """Catches preferences, which belong to the main thread, read from a render thread, and an error
-    that is lost."""
-    monkeypatch.setattr(engine_viewport, "missing_packages", lambda: ["numba"])
+    """Catches preferences read from a render thread, and an error that is lost."""
+    monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
     answers, callers = [StgaError("no environment"), "python"], []
 
     def find() -> str:
@@ -124,7 +122,7 @@ def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
             raise answer
         return answer
 
-    environment = engine_viewport.Rasterizer(find, lambda: "cpu")
+    environment = engine.Rasterizer(find, lambda: "cpu")
     environment.update()
     with pytest.raises(StgaError, match="no environment"):
         environment.python()

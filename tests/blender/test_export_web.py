@@ -49,8 +49,7 @@ def exported(folder: Path, **options) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 def test_timeline_and_camera(demo_head, tmp_path):
-    """Catches the capture's motion where the scene plays another, frames outside its range, and
-    another camera."""
+    """Catches the capture's motion, frames or camera where the scene has others."""
     scene = bpy.context.scene
     head = scene.stga.head
     jaw = rig_of(head).pose.bones["jaw"]
@@ -75,8 +74,7 @@ def test_timeline_and_camera(demo_head, tmp_path):
 
 
 def test_sliders_are_flames(demo_head, tmp_path):
-    """Catches a slider that moves another blend shape, and correctives or joints that do not
-    follow."""
+    """Catches a slider of another shape, and correctives or joints that do not follow."""
     header, arrays = exported(tmp_path)
     flame = demo_head.flame
     assert sorted(slider["name"] for slider in header["sliders"]) == [
@@ -101,8 +99,7 @@ def test_sliders_are_flames(demo_head, tmp_path):
 
 
 def test_motion_only_leaves_flame_out(demo_head, tmp_path):
-    """Catches blend shapes of the model in a page that was asked for without them, or another
-    motion in it."""
+    """Catches blend shapes in a page without them, or another motion in it."""
     header, arrays = exported(tmp_path, motion_only=True)
     assert (header["sliders"], header["joints"]) == ([], ["root"])
     scene = bpy.context.scene

@@ -30,7 +30,10 @@ def head(extension, tmp_path):
 
 def viewports() -> list:
     return [
-        area.spaces.active for screen in bpy.data.screens for area in screen.areas if area.type == "VIEW_3D"
+        area.spaces.active
+        for screen in bpy.data.screens
+        for area in screen.areas
+        if area.type == "VIEW_3D"
     ]  # fmt: skip
 
 
@@ -49,8 +52,7 @@ def test_viewports_look_at_the_head(head):
 
 
 def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
-    """Catches a wall that covers the scene or lies on its side, and a second one each time the
-    avatar is shown."""
+    """Catches a wall that covers the scene or lies down, and a second one."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     write_ply(tmp_path / "world.ply", avatar.splats)
@@ -70,8 +72,7 @@ def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved):
-    """Catches a first look from within Blender's cube of 2 m, and a cube of the artist's own that
-    disappears."""
+    """Catches a first look from within the default cube, and an artist's cube removed."""
     bpy.ops.mesh.primitive_cube_add()
     cube = bpy.context.object
     cube.location.x = float(moved)
@@ -124,8 +125,7 @@ def test_heads_without_bones_say_so(extension, tmp_path):
 
 
 def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
-    """Catches images by Blender's own engines in which an avatar shown as trained is missing, or is
-    points."""
+    """Catches images by Blender's engines where an avatar is missing, or points."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
@@ -146,8 +146,7 @@ def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
 
 
 def test_cycles_sees_through_splats_that_are_shown(extension, tmp_path):
-    """Catches F12 in Cycles that makes holes of overlapping splats, and limits lowered or raised
-    where none are."""
+    """Catches F12 in Cycles with holes, and limits lowered or raised needlessly."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     other, cycles = bpy.data.scenes.new("other").cycles, bpy.context.scene.cycles
@@ -161,8 +160,7 @@ def test_cycles_sees_through_splats_that_are_shown(extension, tmp_path):
 
 
 def test_preview_for_other_engines(extension, tmp_path):
-    """Catches quads that face no camera, black holes in Cycles, and displays that do not state
-    their limits."""
+    """Catches quads that face no camera, black holes, and displays without limits."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))

@@ -51,15 +51,13 @@ def quaternion(axis_angle: np.ndarray) -> np.ndarray:
 
 
 def test_tracked_frames_equal_the_forward_pass(source):
-    """Fails when a joint, a corrective, a weight, a rotation's sense or the translation is not
-    FLAME's."""
+    """Fails when a joint, corrective, weight, rotation or translation is not FLAME's."""
     sequence = flame_sequence(flame_model())
     assert_parity(import_head(motion_capture(sequence, source)), sequence)
 
 
 def test_poses_set_by_hand_equal_the_forward_pass(source):
-    """Fails when only imported frames match: fixed joints, correctives without drivers,
-    unnormalized quaternions."""
+    """Fails when only imported frames match: fixed joints, missing drivers, raw quaternions."""
     sequence = flame_sequence(flame_model())
     head = import_head(motion_capture(sequence, source))
     rig, keys = rig_of(head), head.data.shape_keys
@@ -76,8 +74,7 @@ def test_poses_set_by_hand_equal_the_forward_pass(source):
 
 
 def test_small_rotations_and_offsets_do_not_snap(source):
-    """Fails when new drivers keep their default keyframes, to which Blender snaps results below
-    1e-4."""
+    """Fails when new drivers keep default keyframes, which snap results below 1e-4."""
     model = flame_model()
     sequence = flame_sequence(model)
 
@@ -96,8 +93,7 @@ def test_small_rotations_and_offsets_do_not_snap(source):
 
 
 def test_correctives_of_moving_joints_only(source):
-    """Fails when joints without rotation get shape keys and drivers, or rotating ones lose
-    theirs."""
+    """Fails when still joints get keys and drivers, or rotating ones lose theirs."""
     sequence = flame_sequence(flame_model())
 
     def frame(timestep: int):
@@ -124,8 +120,7 @@ def model_without_neck(model):
 
 
 def test_drivers_need_no_python_and_no_cycle(source, capfd):
-    """Fails when Blender would run the drivers as scripts (refused in files from others) or in an
-    undefined order."""
+    """Fails when drivers count as scripts (refused from others) or have no order."""
     head = import_head(motion_capture(flame_sequence(flame_model()), source))
     at_frame(head, 5)
     for owner in (rig_of(head), head.data.shape_keys):
@@ -137,8 +132,7 @@ def test_drivers_need_no_python_and_no_cycle(source, capfd):
 
 
 def test_between_frames_the_head_turns_and_does_not_shrink(source):
-    """Fails when a quaternion changes sign between keyframes, so that the interpolated head runs
-    through zero."""
+    """Fails when a quaternion changes sign, so that the head runs through zero."""
     model = flame_model()
     sequence = flame_sequence(model, timesteps=range(12))
 
@@ -157,8 +151,7 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
 
 
 def test_all_components_have_sliders(source):
-    """Fails when a component that another person's motion needs has no key, or a slider ends where
-    faces do not."""
+    """Fails when another motion's component has no key, or sliders end too early."""
     model = flame_model(identity=12)
     sequence = flame_sequence(model)
 
@@ -183,8 +176,7 @@ def test_all_components_have_sliders(source):
 
 
 def test_identity_sliders_move_the_joints(source):
-    """Fails when joints stay where the tracked person has them, or the sliders count from FLAME's
-    mean face."""
+    """Fails when joints stay put, or sliders count from FLAME's mean face."""
     sequence = flame_sequence(flame_model())
     head = import_head(motion_capture(sequence, source))
     rng = np.random.default_rng(8)
@@ -202,8 +194,7 @@ def test_identity_sliders_move_the_joints(source):
 
 
 def test_the_published_topology_with_teeth(source, shared_data):
-    """Fails when parity holds for a hundred random vertices and is lost at the size and scale of
-    FLAME itself."""
+    """Fails when parity of a hundred random vertices is lost at FLAME's own size."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, identity, faces = (
             data["v_template"],
@@ -244,8 +235,7 @@ def test_fixed_joints_have_no_helper_bones(source):
 
 
 def test_offsets_per_frame_become_keys(source):
-    """Fails when dynamic_offset is dropped, does not move the joints, or is added without a
-    warning."""
+    """Fails when dynamic_offset is dropped, spares the joints, or comes without warning."""
     sequence = flame_sequence(flame_model(), dynamic=True)
     said = []
     head = import_head(motion_capture(sequence, source), warn=said.append)
@@ -272,8 +262,7 @@ def test_coefficients_beyond_the_slider_range_are_reported(source):
 
 
 def test_a_flame_capture_imports_as_a_rig(tmp_path):
-    """Fails when a capture's FLAME parameters are flattened to one key a frame, or its regions are
-    lost."""
+    """Fails when FLAME parameters become one key a frame, or regions are lost."""
     sequence = flame_sequence(flame_model(vertices=60))
     capture = replace(
         mesh_capture(tmp_path, timesteps=sequence.timesteps),
@@ -313,8 +302,7 @@ def test_importing_again_replaces_the_rig(source):
 
 
 def test_adding_a_rig_keeps_the_active_object(source):
-    """Fails when making bones, which needs edit mode, leaves another object active or a stray
-    object behind."""
+    """Fails when making bones leaves another object active or a stray one behind."""
     mine = bpy.data.objects.new("mine", None)
     bpy.context.scene.collection.objects.link(mine)
     bpy.context.view_layer.objects.active = mine

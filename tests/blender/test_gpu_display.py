@@ -1,5 +1,4 @@
-"""The GPU display as far as it needs no window: what it draws, from where, and that it leaves
-nothing behind."""
+"""The GPU display without a window: what it draws, from where, and what it leaves."""
 
 import numpy as np
 import pytest
@@ -54,8 +53,7 @@ class Region:
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_depth_of_a_view(is_perspective):
-    """Catches splats that are hidden by, or hide, the wrong objects, and a clip range of another
-    length."""
+    """Catches splats hidden by, or hiding, wrong objects, and another clip range."""
     region = Region(is_perspective)
     view, (a, b, c, d) = region_view(region, 300, 200)
     point = np.array([0.05, 0.02, -0.4, 1.0])

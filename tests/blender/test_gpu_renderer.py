@@ -24,13 +24,15 @@ from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Caster, Light, Lighting
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
-from stga_addon.scene.gpu.context import has_gpu_context
 from stga_addon.scene.gpu.packing import View
-from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer, _pixels
+from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer, _pixels, has_gpu_context
 from stga_addon.scene.layers import DisplaySettings, Relit, SceneLayer
 
 from .gpu_context import run_with_gpu
 
+needs_gpu = pytest.mark.skipif(
+    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
+)
 MIN_PSNR_DB = 60.0
 MIN_COMPACT_PSNR_DB = 45.0
 MIN_RELIT_PSNR_DB = 55.0
@@ -95,9 +97,13 @@ def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
         "rotated and scaled": ([layer(avatar(3), TURNED)], near),
         "orthographic": ([layer(avatar(3))], far),
         "inside": ([layer(avatar(2))], inside),
-        "two and world": ([layer(avatar(3)), layer(avatar(0, True), TURNED), unembedded(avatar(2))], near),
+        "two and world": (
+            [layer(avatar(3)), layer(avatar(0, True), TURNED), unembedded(avatar(2))], near,
+        ),
         "display settings": ([layer(avatar(2, True), settings=display, frozen=frozen)], near),
-        "selected only": ([layer(avatar(0), settings=DisplaySettings(selected_only=True), frozen=frozen)], near),
+        "selected only": (
+            [layer(avatar(0), settings=DisplaySettings(selected_only=True), frozen=frozen)], near,
+        ),
     }  # fmt: skip
 
 
@@ -124,7 +130,8 @@ def psnr_db(found: np.ndarray, expected: np.ndarray) -> float:
 def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact: bool) -> None:
     expected = render(layers, camera, exact)
     print(
-        f"{psnr_db(found.rgb, expected.rgb):.1f} dB, alpha {psnr_db(found.alpha, expected.alpha):.1f} dB"
+        f"{psnr_db(found.rgb, expected.rgb):.1f} dB, "
+        f"alpha {psnr_db(found.alpha, expected.alpha):.1f} dB"
     )
     assert psnr_db(found.rgb, expected.rgb) >= MIN_PSNR_DB
     assert psnr_db(found.alpha, expected.alpha) >= MIN_PSNR_DB
@@ -136,13 +143,10 @@ def check(found: ComposedImage, layers: list[SceneLayer], camera: Camera, exact:
     assert np.sqrt(np.mean(error**2)) < 1e-3 * np.ptp(expected.depth[opaque])
 
 
-@pytest.mark.skipif(
-    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
-)
+@needs_gpu
 @pytest.mark.parametrize("name", cases())
 def test_picture_equals_the_rasterizers(name: str) -> None:
-    """Catches another projection, order, color, filter, pose or setting than that of the CPU
-    rasterizer."""
+    """Catches another projection, order, color, filter, pose or setting than the CPU's."""
     layers, camera = cases()[name]
     found: list[ComposedImage] = []
 
@@ -155,12 +159,9 @@ def test_picture_equals_the_rasterizers(name: str) -> None:
     check(found[0], layers, camera, exact=name == "orthographic")
 
 
-@pytest.mark.skipif(
-    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
-)
+@needs_gpu
 def test_clip_planes() -> None:
-    """Catches splats outside a viewport's clipping region, and planes taken for those of another
-    space."""
+    """Catches splats outside a clipping region, and planes of another space."""
     camera, of = cases()["sh 0"][1], avatar(0)
     planes = np.array([[1.0, 0.2, 0.0, 0.0], [0.0, 1.0, 0.0, 0.02]])
     world = to_world(of.splats, of.frames(of.neutral))
@@ -178,12 +179,9 @@ def test_clip_planes() -> None:
     assert psnr_db(found[0].rgb, expected.rgb) >= MIN_PSNR_DB
 
 
-@pytest.mark.skipif(
-    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
-)
+@needs_gpu
 def test_other_splats_in_the_compact_format() -> None:
-    """Catches splats of an earlier picture in one of fewer, and wrong targets of viewports on a
-    card."""
+    """Catches splats of an earlier picture, and wrong targets of viewports on a card."""
     pictures = [cases()[name] for name in ("two and world", "sh 0", "two and world")]
     found: list[ComposedImage] = []
 
@@ -239,9 +237,7 @@ def relit_layers(mode: str) -> list[SceneLayer]:
     return [recorded, shown]
 
 
-@pytest.mark.skipif(
-    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
-)
+@needs_gpu
 @pytest.mark.parametrize("mode", ["scene", "mix", "kept"])
 def test_light_of_the_scene(mode):
     """Catches a light, shadow, highlight, bounce or share of recorded colors that the GPU computes
@@ -274,9 +270,7 @@ def check_shadow_map(atlas: np.ndarray, index: int, expected: np.ndarray) -> Non
     assert (error > 1e-3).mean() < 1e-4  # edges of triangles at the middle of a texel
 
 
-@pytest.mark.skipif(
-    not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
-)
+@needs_gpu
 def test_shadow_maps() -> None:
     """Catches surfaces that hide what is nearer to a sun or a lamp, near, far, or drawn later, and
     depth that does not run straight across a large triangle."""

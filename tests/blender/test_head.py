@@ -29,8 +29,7 @@ def block_counts() -> dict[str, int]:
 
 
 def test_each_frame_evaluates_to_its_timestep(tmp_path):
-    """Fails when a key is off by a frame, neighbours leak into a frame, or gaps in the timesteps
-    shift keys."""
+    """Fails when a key is off by a frame, leaks into others, or is shifted by gaps."""
     capture = mesh_capture(tmp_path, timesteps=(2, 3, 7, 8))
     head = import_head(capture)
     for timestep in capture.timesteps:
@@ -63,8 +62,7 @@ def test_studio_head_evaluates_to_its_tracked_meshes(shared_data):
 
 
 def test_up_axis_is_z(tmp_path):
-    """Fails when the capture's up (y) is not Blender's (z), or when the head is mirrored on the
-    way."""
+    """Fails when y up does not become z up, or the head is mirrored on the way."""
     head = import_head(mesh_capture(tmp_path / "anna", timesteps=(1,)))
     bpy.context.view_layer.update()
     turned = np.array(head.matrix_world)[:3, :3]
@@ -76,8 +74,7 @@ def test_up_axis_is_z(tmp_path):
 
 
 def test_faces_and_regions_keep_their_order(tmp_path):
-    """Fails when faces are re-ordered or turned (splats hang on face number and first corner), or
-    regions are lost."""
+    """Fails when faces are re-ordered or turned, or regions are lost."""
     capture = mesh_capture(tmp_path)
     mesh = import_head(capture).data
     assert [list(polygon.vertices) for polygon in mesh.polygons] == capture.faces.tolist()
@@ -86,8 +83,7 @@ def test_faces_and_regions_keep_their_order(tmp_path):
 
 
 def test_second_import_replaces_the_first(tmp_path):
-    """Fails when a second import duplicates the head, leaves unused data-blocks, or breaks
-    references to the head."""
+    """Fails when a second import duplicates the head, leaves data, or breaks references."""
     first = import_head(mesh_capture(tmp_path))
     first.modifiers.new("artist's own", "SMOOTH").iterations = 0
     follower = bpy.data.objects.new("follower", None)
@@ -103,8 +99,7 @@ def test_second_import_replaces_the_first(tmp_path):
 
 
 def test_second_import_in_edit_mode(tmp_path):
-    """Fails when the mesh is exchanged under edit mode, which writes the old mesh back on leaving
-    it."""
+    """Fails when edit mode writes the old mesh back over the new one."""
     head = import_head(mesh_capture(tmp_path))
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
@@ -125,8 +120,7 @@ def test_two_captures_are_imported_separately(tmp_path):
 
 
 def test_rig_is_removed_with_the_capture_s_flame_parameters(tmp_path):
-    """Fails when a folder that changed from FLAME to meshes keeps an armature that deforms the new
-    mesh."""
+    """Fails when a folder that now has meshes keeps FLAME's armature."""
     source = tmp_path / "capture"
     import_head(motion_capture(flame_sequence(flame_model()), source))
     capture = mesh_capture(source)

@@ -1,5 +1,4 @@
-"""The built zip, installed as a user installs it: into a new Blender profile, in its own
-process."""
+"""The built zip, installed as users do: in a new Blender profile and process."""
 
 import json
 import os
@@ -71,8 +70,7 @@ def test_same_files_as_blenders_own_build(zip_file, tmp_path):
 
 
 def test_zip_holds_what_the_extension_runs(zip_file):
-    """Catches tests, docs, the benchmark, the demo or the photo studio in the zip, and a module
-    left out."""
+    """Catches tests, docs or development in the zip, and a module left out."""
     names = set(zipfile.ZipFile(zip_file).namelist())
     left_out = ("tests/", "docs/", "benchmarks/", "stga_addon/development/", ".")
     assert not [name for name in names if name.startswith(left_out) or name.endswith(".pyc")]
@@ -121,21 +119,26 @@ class Bare(importlib.machinery.PathFinder):
         if package in {"torch", "numba", "scipy", "PIL", "smplx"}:
             return None
         if path is None and package in {"filelock", "trimesh", "tqdm"}:
-            path = [folder for folder in sys.path if folder.startswith(os.environ["BLENDER_USER_RESOURCES"])]
+            own = os.environ["BLENDER_USER_RESOURCES"]
+            path = [folder for folder in sys.path if folder.startswith(own)]
         return super().find_spec(name, path, target)
 
-sys.meta_path = [Bare if finder is importlib.machinery.PathFinder else finder for finder in sys.meta_path]
+whole = importlib.machinery.PathFinder
+sys.meta_path = [Bare if finder is whole else finder for finder in sys.meta_path]
 archive, capture, avatar = sys.argv[1:]
 result = {}
 commands = {}
 bpy.utils.register_cli_command = lambda name, handler: commands.setdefault(name, handler)
 bpy.utils.unregister_cli_command = lambda handler: commands.clear()
-bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
+install = bpy.ops.extensions.package_install_files
+install(filepath=archive, repo="user_default", enable_on_install=True)
 result["commands"] = sorted(commands)
 module = "bl_ext.user_default.stga"
 result["enabled"] = module in bpy.context.preferences.addons
-result["heavy"] = sorted({"torch", "numba", "trimesh", "tqdm"} & {name.split(".")[0] for name in sys.modules})
-names = "import_capture import_motion import_meshes select heat_map train show_avatar apply_motion".split()
+loaded = {name.split(".")[0] for name in sys.modules}
+result["heavy"] = sorted({"torch", "numba", "trimesh", "tqdm"} & loaded)
+names = "import_capture import_motion import_meshes select heat_map train".split()
+names += ["show_avatar", "apply_motion"]
 names += "standard_view import_ply export_avatar".split()
 result["missing"] = [name for name in names if not hasattr(bpy.types, "STGA_OT_" + name)]
 result["tabs"] = [name for name in dir(bpy.types) if name.startswith("STGA_PT_")]
@@ -155,7 +158,8 @@ result["groups"] = sum(group.name.startswith("stga_") for group in scene.stga.he
 
 bpy.ops.preferences.addon_disable(module=module)
 result["left"] = [*commands] + [name for name in names if hasattr(bpy.types, "STGA_OT_" + name)]
-index = next(i for i, repo in enumerate(bpy.context.preferences.extensions.repos) if repo.module == "user_default")
+repos = bpy.context.preferences.extensions.repos
+index = next(i for i, repo in enumerate(repos) if repo.module == "user_default")
 bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id="stga")
 folder = Path(bpy.context.preferences.extensions.repos[index].directory)
 result["files"] = [path.name for path in folder.glob("stga*")]
@@ -164,8 +168,7 @@ print("RESULT " + json.dumps(result))
 
 
 def test_install_use_and_uninstall(zip_file, shared_data, tmp_path):
-    """Catches absolute imports, files left out of the zip, and packages that enabling, importing or
-    showing needs."""
+    """Catches absolute imports, files left out, and packages needed too early."""
     folder = shared_data / "studio_head"
     capture = open_capture(folder)
     splats = lattice_splats(capture.neutral, capture.faces, order=0, sh_degree=0)

@@ -1,5 +1,4 @@
-"""Blender's lights, worlds and objects as an avatar sees them, against Cycles; and its colors in
-the engine."""
+"""Lights, worlds and objects as an avatar sees them, against Cycles; its colors."""
 
 import sys
 from pathlib import Path
@@ -136,11 +135,17 @@ def baked_irradiance(shown, head) -> np.ndarray:
 LAMPS = {
     "sun": ("SUN", (1.0, -0.5, 2.0), 3.0, {"angle": 0.02}),
     "point": ("POINT", (0.9, -0.6, 0.9), 20.0, {"shadow_soft_size": 0.01}),
-    "spot": ("SPOT", (0.9, -0.6, 0.9), 80.0, {"spot_size": 0.4, "spot_blend": 0.6, "shadow_soft_size": 0.01}),
+    "spot": (
+        "SPOT", (0.9, -0.6, 0.9), 80.0,
+        {"spot_size": 0.4, "spot_blend": 0.6, "shadow_soft_size": 0.01},
+    ),
     "area": ("AREA", (0.4, -1.0, 0.8), 10.0, {"shape": "RECTANGLE", "size": 0.3, "size_y": 0.1}),
-    "disk, exposed": ("AREA", (1.2, 0.6, 0.8), 4.0, {"shape": "DISK", "size": 0.2, "exposure": 1.5}),
+    "disk, exposed": (
+        "AREA", (1.2, 0.6, 0.8), 4.0, {"shape": "DISK", "size": 0.2, "exposure": 1.5},
+    ),
     "per area, warm": (
-        "AREA", (0.4, -1.0, 0.8), 90.0, {"size": 0.2, "normalize": False, "use_temperature": True, "temperature": 3e3}
+        "AREA", (0.4, -1.0, 0.8), 90.0,
+        {"size": 0.2, "normalize": False, "use_temperature": True, "temperature": 3e3},
     ),
 }  # fmt: skip
 
@@ -239,7 +244,8 @@ def test_edges_of_shadows_are_those_of_cycles(kind, energy, tmp_path):
     one, other = apart.min(0), apart.min(1)
     most = [float(np.quantile(distance, 0.95)) for distance in (one, other)]
     print(
-        f"{kind}: {len(theirs)} pixels of edges; mean {one.mean():.2f}, {other.mean():.2f}, 95 % {most} px"
+        f"{kind}: {len(theirs)} pixels of edges; "
+        f"mean {one.mean():.2f}, {other.mean():.2f}, 95 % {most} px"
     )
     assert max(most) < 2
 
@@ -294,8 +300,7 @@ def use_texture(world, image, **mapping: object) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["color", "texture", "turned point", "turned texture"])
 def test_world_is_that_of_cycles(case):
-    """Catches a mirrored or turned environment, its strength, and occlusion by the head, beyond 5 %
-    of the mean."""
+    """Catches a turned environment, its strength, and occlusion, beyond 5 % of the mean."""
     shown, head = shown_head()
     world = bpy.context.scene.world
     background(world)["Strength"].default_value = 1.7
@@ -313,8 +318,7 @@ def test_world_is_that_of_cycles(case):
 
 
 def test_lights_that_do_not_count():
-    """Catches light linking, hidden lights, a chosen collection, or a switched-off world that is
-    ignored."""
+    """Catches light linking, hidden lights, a collection or world switch ignored."""
     shown, _ = shown_head()
     lighting = bpy.context.scene.stga_lighting
     kinds = [lamp(kind, (1.0, -0.5, 2.0), 3.0) for kind in ("SUN", "POINT", "SPOT")]
@@ -349,8 +353,7 @@ def test_lights_that_do_not_count():
 
 
 def test_nothing_is_made_anew_while_nothing_moves():
-    """Catches a redraw that relights what it has, and one that keeps an earlier light, pose or
-    caster."""
+    """Catches a redraw that relights what it has, or keeps earlier light, pose or caster."""
     _, head = shown_head()
     light = lamp("POINT", (1.0, -0.5, 1.0), 30.0)
     bpy.ops.mesh.primitive_cube_add(size=0.1, location=(1, 1, 1))
@@ -391,8 +394,7 @@ def test_light_is_kept_in_the_file():
 
 @pytest.mark.parametrize("engine", ["CYCLES", pytest.param(EEVEE, marks=EEVEE_MARKS)])
 def test_shadow_onto_the_scene(engine, tmp_path):
-    """Catches a head that is seen where it should only throw its shadow, and a shadow that is
-    missing."""
+    """Catches a head seen where it should only throw its shadow, and no shadow."""
     shown, head = shown_head()
     lamp("SUN", (0.4, -0.2, 2.0), 3.0)
     bpy.ops.mesh.primitive_plane_add(size=2, location=(0.4, -0.2, 0.0))

@@ -1,5 +1,4 @@
-"""What the GPU display and the engine draw of heads in other files: linked, instanced, and library
-overrides."""
+"""What display and engine draw of heads in other files: linked, instanced, overridden."""
 
 from pathlib import Path
 
@@ -31,8 +30,7 @@ def shown_at(frame: int, cache: SplatCache) -> np.ndarray:
 
 @pytest.fixture
 def library(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
-    """A .blend file with a moving head and its splats in the collection "anna", and where they are
-    at FRAMES."""
+    """A .blend file with a moving head and splats in "anna", and their places at FRAMES."""
     avatar = avatar_of("stga", 300)
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
@@ -55,8 +53,7 @@ def linked_collection(path: Path):
 
 
 def test_linked_heads_are_followed(library):
-    """Catches linked splats that are not drawn, stand still, or need what only their own file
-    has."""
+    """Catches linked splats that are missing, stand still, or need their own file."""
     path, expected = library
     bpy.context.scene.collection.children.link(linked_collection(path))
     cache = SplatCache()
@@ -79,8 +76,7 @@ def test_instances_of_linked_heads_are_followed(library):
 
 
 def test_overridden_heads_are_followed(library):
-    """Catches splats of a library override that follow the library's head instead of the one that
-    is posed here."""
+    """Catches splats of an override that follow the library's head."""
     path, expected = library
     scene = bpy.context.scene
     linked = linked_collection(path)

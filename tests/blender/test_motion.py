@@ -62,8 +62,7 @@ def curves_of(owner, action) -> dict:
 
 
 def test_applied_motion_equals_the_forward_pass(head, own, other):
-    """Fails when the other's identity is applied too, a frame is shifted, or an old coefficient
-    keeps its value."""
+    """Fails when the other's identity is applied, a frame shifted, or a value kept."""
     apply_motion(head, retimed(other), 11, "other")
     for index in range(4):
         expected = mesh(own, other.frame(index))
@@ -85,8 +84,7 @@ def test_applying_one_part_keeps_the_other_parts(head, own, other, part, as_stri
 
 
 def test_the_old_action_is_unchanged(head, own, other, tmp_path):
-    """Fails when applying edits the action in place, or the old one is gone once the file is saved
-    and opened."""
+    """Fails when the action is edited in place, or the old one is lost in the file."""
     before = [
         (owner.animation_data.action.name, curves_of(owner, owner.animation_data.action))
         for owner in owners(head)
@@ -155,8 +153,7 @@ def test_tracked_offsets_are_zero_under_another_motion(own, other, tmp_path):
 
 
 def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
-    """Fails when a motion is written in part, or a head without a rig raises another error than
-    StgaError."""
+    """Fails when a motion is written in part, or the error is no StgaError."""
     rig = rig_of(head)
     rig.pose.bones["jaw"].rotation_mode = "XYZ"
     actions = len(bpy.data.actions)
@@ -188,8 +185,7 @@ def assert_same_motion(read: FlameSequence, frames: list) -> None:
 
 
 def test_sampled_motion_equals_the_keyframes(head, own):
-    """Fails when a rotation is read in another space, or the root joint's displacement counts as
-    translation."""
+    """Fails when a rotation's space or the root joint's displacement is wrong."""
     said = []
     bpy.context.scene.frame_set(3)
     read = sample_motion(head, own, range(1, 7), warn=said.append)

@@ -1,5 +1,4 @@
-"""What Blender's native splats are drawn from, against the numpy embedding; also in the Blenders of
-STGA_BLENDER."""
+"""What Blender's native splats are drawn from, against numpy; also in STGA_BLENDER."""
 
 import os
 import shlex

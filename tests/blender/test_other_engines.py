@@ -21,7 +21,7 @@ from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import QUADS  # noqa: E402
 from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
-from stga_addon.scene.gpu.context import has_gpu_context  # noqa: E402
+from stga_addon.scene.gpu.renderer import has_gpu_context  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .test_engine import camera_at, show, textured, with_light  # noqa: E402
@@ -60,8 +60,7 @@ def overlapping_splats() -> Splats:
 
 
 def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
-    """(3, H, W) sRGB over black as both engines blend: the rasterizer's image of splats with linear
-    colors."""
+    """(3, H, W) sRGB over black as both engines blend: rasterized with linear colors."""
     linear = srgb_to_linear(np.clip(0.5 + SH_C0 * splats.sh.astype(np.float64), 0, 1))
     image = compose(
         [
@@ -111,8 +110,7 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
 def test_images_of_recorded_light_say_so(
     extension, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches F12 and animations whose light is not the panel's, and which do not say so, or do for
-    each image."""
+    """Catches F12 and animations in another light that do not say so, or do each image."""
     scene, cast = bpy.context.scene, "the light of this frame"
     shown, _ = show(with_light(textured(avatar_of("stga"))))
     camera_at()
@@ -146,8 +144,7 @@ def test_images_of_recorded_light_say_so(
 
 
 def test_relit_color_of_a_frame(tmp_path: Path) -> None:
-    """Catches relit colors that do not reach the nodes, in another color space, or stay when they
-    are taken back."""
+    """Catches relit colors that do not reach the nodes, or stay when taken back."""
     from stga_addon.light.relight import Relighter
     from stga_addon.scene.display.display_modes import DISPLAY_COLOR
     from stga_addon.scene.light import settings

@@ -115,8 +115,7 @@ def draw(extension, name: str = "") -> list[str]:
 
 
 def test_drawing_reads_no_file(extension, trained, monkeypatch):
-    """Catches panels that open, stat or list files: on a network drive, each redraw would block
-    Blender."""
+    """Catches panels that open, stat or list files, which would block redraws."""
     extension.operators.training_python.has_training_python(bpy.context)
 
     def refuse(*arguments, **_):
@@ -137,8 +136,7 @@ def test_drawing_reads_no_file(extension, trained, monkeypatch):
 
 
 def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch, capsys):
-    """Catches a timer that ends at an unexpected error without a trace, and one that repeats it at
-    every call."""
+    """Catches a timer that ends at an error without a trace, or repeats it."""
     monitor = extension.operators.monitor
     monkeypatch.setattr(monitor, "_read_status", lambda scene, state: 1 / 0)
     assert monitor.tick() is None

@@ -62,8 +62,7 @@ def engine_image(frame: int, path: Path) -> np.ndarray:
 
 
 def test_image_sequence_of_the_scene(shown):
-    """Catches a sequence of another camera, size, frame or transparency than the render
-    engine's."""
+    """Catches another camera, size, frame or transparency than the engine's."""
     scene = bpy.context.scene
     assert bpy.ops.stga.render_video(
         filepath=str(shown / "images"), path="scene", format="png"
@@ -199,8 +198,7 @@ def around_each_image(monkeypatch, before, after) -> None:
 
 
 def test_a_recording_follows_its_own_scene(shown, monkeypatch):
-    """Catches images of another scene, which the window shows meanwhile, and another scene's frame
-    that is moved."""
+    """Catches images of the scene in the window, and a frame moved in another."""
     render = {"path": "scene", "format": "png"}
     assert bpy.ops.stga.render_video(filepath=str(shown / "alone"), **render) == {"FINISHED"}
     own, other = bpy.context.scene, bpy.data.scenes.new("other")

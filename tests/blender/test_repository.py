@@ -77,8 +77,7 @@ def extension(blender: list[str], profile: Path, *arguments: str) -> str:
 def test_install_and_update(
     blender: list[str], zips: tuple[Path, Path], served: tuple[Path, str], tmp_path
 ) -> None:
-    """Catches an index that Blender cannot read, an update that fails, and one that ends a
-    training."""
+    """Catches an index Blender cannot read, and an update that fails or ends training."""
     (folder, address), profile, (old, new) = served, tmp_path / "profile", zips
     index = write_repository([old], folder / "stga", blender)
     assert index == folder / "stga" / INDEX

@@ -34,8 +34,7 @@ FRAMES = (1, 5, 9)
 
 
 def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Head-sized triangles (V, 3), (F, 3), a meter from the origin, each starting at a random one
-    of its corners."""
+    """Head-sized triangles (V, 3), (F, 3) off the origin, from random first corners."""
     rng = np.random.default_rng(0)
     theta, phi = np.meshgrid(
         np.linspace(0.2, np.pi - 0.2, rings), np.linspace(0, 2 * np.pi, segments, endpoint=False)
@@ -104,8 +103,7 @@ def same_rotation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
-    """The evaluated splats against `to_world` on the evaluated head's vertices; returns the
-    positions."""
+    """The evaluated splats against `to_world` on the head; their positions."""
     expected = to_world(avatar.splats, avatar.frames(evaluated_vertices(head)))
     xyz, rotation, scale = evaluated_splats(shown)
     assert np.abs(xyz - expected.xyz).max() < 1e-5
@@ -116,8 +114,7 @@ def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_splats_follow_the_animated_head(convention, tmp_path):
-    """Catches wrong axes, a wrong first corner, a wrong unit, and trees that stop working once
-    saved and reopened."""
+    """Catches wrong axes, corner or unit, and trees that fail once saved."""
     avatar = avatar_of(convention)
     head = animated_head(avatar.neutral, avatar.faces)
     shown = show_avatar(avatar, head)
@@ -135,8 +132,7 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
 
 
 def test_splat_object_has_the_head_s_transform():
-    """Catches a splat object that ignores the head's parent, and separates from it when the root
-    rotates."""
+    """Catches a splat object that ignores the head's parent."""
     avatar = avatar_of("stga", 100)
     head = animated_head(avatar.neutral, avatar.faces)
     head.location = (0.1, 0.2, 0.3)
@@ -162,8 +158,7 @@ def test_degenerate_triangles_stay_finite(convention):
 
 
 def test_attributes_hold_activated_values():
-    """Catches logits shown as opacities, log sigmas as sizes, and sRGB stored where Blender expects
-    scene-linear."""
+    """Catches logits as opacities, log sigmas as sizes, and sRGB as linear."""
     avatar = avatar_of("stga", 50)
     splats = replace(
         avatar.splats, sh=np.zeros((50, 4, 3), np.float32), opacity=np.zeros(50, np.float32)
@@ -219,8 +214,7 @@ def test_constant_colors_are_scene_linear():
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_colors_follow_the_active_camera(degree):
-    """Catches harmonics of another order or sign, and directions in the world's instead of the
-    splats' own space."""
+    """Catches harmonics of another order, sign or space."""
     harmonics = pytest.importorskip("stga_addon.raster.cpu.harmonics")
     avatar = avatar_of("stga", 400)
     sh = np.random.default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
@@ -242,8 +236,7 @@ def test_colors_follow_the_active_camera(degree):
 
 
 def test_colors_follow_a_moving_camera():
-    """Catches colors that stay those of the first frame while the camera moves, in playback and in
-    renders."""
+    """Catches colors that stay while the camera moves, in playback and renders."""
     avatar = avatar_of("stga", 100)
     sh = np.random.default_rng(3).normal(0, 0.3, (100, 4, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
@@ -264,8 +257,7 @@ def test_colors_follow_a_moving_camera():
 
 
 def test_colors_follow_strain():
-    """Catches strain of another triangle, in other axes or not averaged, against numpy on the
-    deformed mesh."""
+    """Catches strain of another triangle or axes, or not averaged, against numpy."""
     avatar = avatar_of("stga", 1500)
     colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3, 3)).astype(np.float32)
     splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors)
@@ -359,8 +351,7 @@ def test_positions_follow_strain(convention, strain_color, tmp_path):
 
 
 def test_updated_splats_follow_strain_anew():
-    """Catches a live preview that shows new splats with the strain coefficients of the first
-    ones."""
+    """Catches new splats shown with the strain coefficients of the first ones."""
     first, second = (following_positions("stga", seed) for seed in (6, 7))
     second = replace(second, neutral=first.neutral, faces=first.faces)
     head = animated_head(first.neutral, first.faces)
@@ -382,8 +373,7 @@ def test_updated_splats_follow_strain_anew():
 
 
 def test_names_of_trees_are_told_apart():
-    """Catches names that Blender shortens, and a tree or group that is found for another whose name
-    begins likewise."""
+    """Catches names that Blender shortens, and a tree found for a similar name."""
     kinds = [
         splat_nodes.TreeOptions(convention, degree, *strain)
         for convention in (*CONVENTIONS, None)
@@ -411,8 +401,7 @@ def test_no_strain_nodes_without_strain():
 
 
 def test_display_inputs():
-    """Catches inputs that are not wired: threshold, percentage and quads must each change what is
-    shown."""
+    """Catches inputs that are not wired: threshold, percentage and quads."""
     avatar = avatar_of("stga", 2000)
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     opacity = 1 / (1 + np.exp(-avatar.splats.opacity))
@@ -431,8 +420,7 @@ def test_display_inputs():
 
 
 def test_quads_face_the_camera_and_cover_the_splat():
-    """Catches quads seen edge-on, of another size or shape than their splats: both cut Gaussians
-    off."""
+    """Catches quads edge-on, or of another size or shape: Gaussians are cut off."""
     avatar = avatar_of("stga", 200)
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     camera = active_camera((0.4, -1.0, 1.3))
@@ -462,8 +450,7 @@ def test_quads_face_the_camera_and_cover_the_splat():
 
 
 def test_selection_grays_out_frozen_splats():
-    """Catches the selection of another frame, and triangles that count as selected next to selected
-    ones."""
+    """Catches the selection of another frame, or of triangles beside selected ones."""
     avatar = avatar_of("stga", 1000)
     head = animated_head(avatar.neutral, avatar.faces)
     chosen = avatar.faces[:40]
@@ -518,7 +505,8 @@ def test_trees_and_materials_are_built_once(tmp_path: Path):
 
 
 TREES = [
-    ("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False), ("stga", 0, False, ("strain_position",)),
+    ("stga", 3, True), ("gaussian_avatars", 2, False), (None, 0, False),
+    ("stga", 0, False, ("strain_position",)),
     ("gaussian_avatars", 3, True, ("strain_position",)),
 ]  # fmt: skip
 

@@ -30,8 +30,7 @@ def random_selection(capture, share: float = 0.2, seed: int = 0) -> dict[int, np
 
 
 def test_reading_back_gives_the_closure(capture, head):
-    """Fails when a group is written to the wrong frame or vertices, or one timestep's group leaks
-    into another's."""
+    """Fails when a group has another frame or vertices, or leaks into another."""
     chosen = random_selection(capture)
     write_selection(head, chosen)
     read = read_selection(head)
@@ -52,8 +51,7 @@ def test_round_trip_is_idempotent(capture, head):
 
 
 def test_new_selection_replaces_only_selection_groups(tmp_path):
-    """Fails when old timesteps keep their groups, or the rig's vertex groups are removed with
-    them."""
+    """Fails when old timesteps keep groups, or the rig's groups are removed."""
     sequence = flame_sequence(flame_model(), timesteps=(1, 2))
     head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
     bones = {group.name: [head.vertex_groups[group.name].weight(3)] for group in head.vertex_groups}
@@ -71,8 +69,7 @@ def test_new_selection_replaces_only_selection_groups(tmp_path):
 
 
 def test_the_rest_of_the_head_stays(tmp_path):
-    """Fails when writing weights moves vertices or shape keys, turns triangles, or drops what is
-    stored on them."""
+    """Fails when writing weights moves vertices, turns triangles, or drops data."""
     sequence = flame_sequence(flame_model(), timesteps=(1, 2))
     head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
     mesh = head.data

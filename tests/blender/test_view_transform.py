@@ -1,5 +1,4 @@
-"""Colors of the engine's images through view transforms, whose inverses are kept of several scenes
-and settings."""
+"""The engine's colors through view transforms, inverses of several of which are kept."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,8 +25,7 @@ def scene_with(view: str, exposure: float = 0.0):
 
 
 def test_scenes_with_different_view_transforms():
-    """Catches a render of two scenes in which only the scene measured last shows the trained
-    colors."""
+    """Catches a render of two scenes in which only the last shows trained colors."""
     scenes = [scene_with("AgX"), scene_with("Standard", exposure=1.0)]
     for scene in scenes:
         measure(scene)
@@ -41,8 +39,7 @@ def test_scenes_with_different_view_transforms():
 
 
 def test_dark_colors_are_shown_as_trained():
-    """Catches an inverse that has not come to the end where the view transform hardly changes: in
-    dark skin."""
+    """Catches an inverse not yet converged where the transform is flat: dark skin."""
     rng = np.random.default_rng(0)
     skin = rng.uniform(0.1, 1.3, (4000, 1)) * [0.75, 0.55, 0.45] + rng.normal(0, 0.04, (4000, 3))
     scene, skin = scene_with("AgX"), np.clip(skin, 0, 1)
@@ -91,8 +88,7 @@ def sheet(color: np.ndarray | None = None) -> None:
 
 
 def saved_picture(folder: Path, **view: object) -> np.ndarray:
-    """(H, W, 4) values 0 to 255 of the image that Blender saves of a render through these view
-    settings."""
+    """(H, W, 4) 0 to 255 of a render that Blender saves through these settings."""
     scene = bpy.context.scene
     scene.view_settings.look = "None"
     scene.view_settings.view_transform = view["view_transform"]  # which says what looks there are
@@ -151,8 +147,7 @@ def test_view_transforms_show_trained_colors(view, transparent, tmp_path):
 
 
 def test_standard_needs_no_table():
-    """Catches a table between the trained colors and the image where the view transform needs
-    none."""
+    """Catches a table where the view transform needs none."""
     scene = bpy.context.scene
     for name in ("Standard", "Raw"):
         scene.view_settings.view_transform = name

@@ -14,8 +14,8 @@ bpy = pytest.importorskip("bpy")
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene.cameras import camera_of, viewport_camera  # noqa: E402
-from stga_addon.scene.render import engine_viewport  # noqa: E402
-from stga_addon.scene.render.engine_viewport import RenderRequest, ViewportRenderer  # noqa: E402
+from stga_addon.scene.render import engine as engine_viewport  # noqa: E402
+from stga_addon.scene.render.engine import RenderRequest, ViewportRenderer  # noqa: E402
 
 CAMERA = Camera(800, 600, 700.0, 700.0, 400.0, 300.0, np.eye(4))
 
@@ -27,8 +27,7 @@ def request(x: float = 0.0, layers=(), background=None) -> RenderRequest:
 
 
 class Recorder:
-    """A renderer whose images are empty; records the requests, and lets the thread go on one image
-    per `go`."""
+    """A renderer of empty images that records requests; one image per `go`."""
 
     def __init__(self, error: Exception | None = None, waits: bool = False) -> None:
         self.rendered: list[tuple[RenderRequest, float]] = []
@@ -133,8 +132,7 @@ def poll_until_idle() -> None:
 
 
 def test_viewports_are_redrawn_from_the_main_thread():
-    """Catches bpy called from the render thread, a last image that is never shown, and a timer that
-    runs when idle."""
+    """Catches bpy in the render thread, a lost last image, and an idle timer."""
     recorder, engine = Recorder(waits=True), Engine()
     recorder.renderer.request(request())
     engine_viewport.redraw_when_rendered(recorder.renderer, engine)

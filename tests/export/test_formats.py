@@ -27,8 +27,7 @@ def posed(avatar: Avatar, shift: float) -> np.ndarray:
 
 
 def test_ply_is_the_first_mesh(avatar, tmp_path):
-    """Catches splats of another mesh in the file, and meshes that are posed although nothing is
-    written of them."""
+    """Catches splats of another mesh, and meshes posed for nothing."""
     taken = []
 
     def meshes():
@@ -43,8 +42,7 @@ def test_ply_is_the_first_mesh(avatar, tmp_path):
 
 
 def test_sequence_is_named_by_number(avatar, tmp_path):
-    """Catches frames that are left out, overwritten, or named after their place instead of their
-    timestep."""
+    """Catches frames left out, overwritten, or named after their place."""
     numbered = [(3, posed(avatar, 3)), (12, posed(avatar, 12))]
     files = export_avatar(tmp_path, avatar, "ply-sequence", numbered)
     assert [path.name for path in files] == ["00003.ply", "00012.ply"]
@@ -78,8 +76,7 @@ def test_a_sequence_replaces_an_earlier_one(avatar, tmp_path):
 
 
 def test_a_sequence_that_fails_leaves_the_earlier_one(avatar, tmp_path):
-    """Catches the first frames of an export that was cancelled among the last ones of the export
-    before."""
+    """Catches the first frames of a cancelled export among those of the last."""
 
     def meshes():
         yield 0, posed(avatar, 9)
@@ -97,8 +94,7 @@ def test_a_sequence_that_fails_leaves_the_earlier_one(avatar, tmp_path):
 @pytest.mark.parametrize("fps", [0.0, -25.0, 1e-9, 1e4, 1e300, float("inf"), float("nan")])
 @pytest.mark.parametrize("format", [name for name, format in FORMATS.items() if format.has_rate])
 def test_frame_rates_that_nothing_plays(format, fps, avatar, tmp_path):
-    """Catches a file that its viewers refuse, such as a page that says that its data are
-    damaged."""
+    """Catches a file its viewers refuse, such as a page with damaged data."""
     path = tmp_path / f"a{FORMATS[format].suffixes[0]}"
     with pytest.raises(StgaError, match=r"frame rate \(--fps\) must be from 0\.01 to 1000"):
         export_avatar(path, avatar, format, [(0, avatar.neutral)], fps=fps)
@@ -107,8 +103,7 @@ def test_frame_rates_that_nothing_plays(format, fps, avatar, tmp_path):
 
 @pytest.mark.parametrize("format", ["ply", "ply-sequence", "gaussian-avatars"])
 def test_missing_source(format, avatar, tmp_path):
-    """Catches a format that writes nothing, or fails with a traceback, where its meshes or
-    parameters are missing."""
+    """Catches a format that writes nothing, or a traceback, without its input."""
     with pytest.raises(StgaError, match=r"FLAME parameters|no posed mesh"):
         export_avatar(tmp_path / f"out{next(iter(FORMATS[format].suffixes), '')}", avatar, format)
     assert list(tmp_path.iterdir()) == []
@@ -116,8 +111,7 @@ def test_missing_source(format, avatar, tmp_path):
 
 @pytest.mark.parametrize("format", [name for name, format in FORMATS.items() if format.suffixes])
 def test_other_suffixes_are_refused(format, avatar, tmp_path):
-    """Catches binary glTF under the name of its text form, and a file under a name that no viewer
-    opens."""
+    """Catches binary glTF named as text, and names that no viewer opens."""
     with pytest.raises(StgaError, match=r"a\.gltf: expected a name that ends in \."):
         export_avatar(tmp_path / "a.gltf", avatar, format, [(0, avatar.neutral)])
     assert list(tmp_path.iterdir()) == []
@@ -134,8 +128,7 @@ def test_other_suffixes_are_refused(format, avatar, tmp_path):
     ],
 )
 def test_rate_of_a_capture(tmp_path: Path, timesteps, fps, in_a_row, at_their_numbers) -> None:
-    """Catches every third frame of a recording played three times too fast, or too slowly where
-    frames are numbered."""
+    """Catches every third frame of a recording played too fast, or too slowly."""
     capture = replace(
         open_capture(factory.write_mesh_capture(tmp_path / "ball")),
         timesteps=tuple(timesteps),
@@ -152,8 +145,7 @@ SMALL_DISK = 'mount -t tmpfs -o size=24m small "$1" && exec "$2" "$3" "$1"'
 
 @pytest.mark.slow
 def test_every_format_on_a_full_disk(tmp_path: Path) -> None:
-    """Catches a format whose message leaves out the file or the cause, and files or folders left by
-    half an export."""
+    """Catches a message without file or cause, and leftovers of half an export."""
     if not can_mount():
         pytest.skip("private mounts (unshare -rm) are not available")
     driver = str(Path(__file__).with_name("full_disk_driver.py"))

@@ -34,8 +34,7 @@ PLY_HEADER = (
 
 @pytest.fixture
 def sequence() -> FlameSequence:
-    """A model of twenty vertices that moves; timesteps with a gap, a dynamic offset in one of
-    them."""
+    """A moving model of twenty vertices; a gap in its timesteps, one dynamic offset."""
     rng = np.random.default_rng(5)
     template, faces = random_mesh(5, VERTICES)
     model = FlameModel(
@@ -112,14 +111,12 @@ def test_sequence_without_offsets_writes_zeros(tmp_path, sequence):
 
 
 def bound_splats(path: Path) -> Splats:
-    """Splats in the "gaussian_avatars" convention, with the triangles that the property binding_0
-    names."""
+    """Splats in the "gaussian_avatars" convention, with triangles by binding_0."""
     return replace(read_ply(path), face=read_vertices(path)["binding_0"].astype(np.int32))
 
 
 def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
-    """Catches a motion or binding that has changed on the way: every frame's world splats must be
-    the same."""
+    """Catches a motion or binding changed on the way: world splats are the same."""
     avatar = avatar_on(sequence, "gaussian_avatars")
     write_gaussian_avatars(tmp_path, avatar, sequence)
     splats = bound_splats(tmp_path / "point_cloud.ply")
@@ -136,8 +133,7 @@ def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
 
 
 def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) and covariance (3, 3) of one splat on its triangle (3, 3), by GaussianAvatars'
-    definition."""
+    """Position (3,) and covariance (3, 3) of a splat on its triangle, by definition."""
     p, q, r = corners
     first = (q - p) / np.linalg.norm(q - p)
     normal = np.cross(q - p, r - p)
@@ -152,8 +148,7 @@ def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.nd
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
-    """Catches a pair that leaves out what strain color adds at rest: the least compression that it
-    follows is not 0."""
+    """Catches a pair without strain color at rest, whose least compression is not 0."""
     avatar = avatar_on(sequence, convention)
     strain_color = np.random.default_rng(1).normal(0, 0.2, (50, 3, 3)).astype(np.float32)
     limits = np.broadcast_to(
@@ -170,8 +165,7 @@ def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
 
 
 def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence):
-    """Catches a conversion that is only approximately right, checked by the viewer's own
-    arithmetic."""
+    """Catches a conversion only nearly right, by the viewer's own arithmetic."""
     avatar = avatar_on(sequence, "stga")
     write_gaussian_avatars(tmp_path, avatar, sequence)
     splats = bound_splats(tmp_path / "point_cloud.ply")
@@ -193,8 +187,7 @@ def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence
 
 
 def test_conversion_there_and_back_keeps_precision_far_from_the_origin(sequence):
-    """Catches a detour through world coordinates, which costs digits where the head is meters
-    away."""
+    """Catches a detour through world coordinates, which costs digits far away."""
     avatar = avatar_on(sequence, "stga")
     far = replace(avatar, neutral=avatar.neutral + np.float32(64))
     there = replace(

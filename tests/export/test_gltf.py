@@ -1,5 +1,4 @@
-"""glTF: against the extension's specification, by trimesh, and by the loader of three.js where it
-is installed."""
+"""glTF: against the specification, by trimesh, and by three.js's loader."""
 
 import json
 import os
@@ -24,8 +23,7 @@ COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def parsed(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The document and the attributes of the only primitive; checks what glTF demands of the
-    container."""
+    """The document and the only primitive's attributes; checks the container."""
     data = path.read_bytes()
     magic, version, length, size, kind = struct.unpack("<4sIII4s", data[:20])
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -56,8 +54,7 @@ def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_keeps_the_specification(avatar, tmp_path, degree):
-    """Catches missing fields, partly defined degrees, wrong component types, and values out of
-    their range."""
+    """Catches missing fields, partial degrees, wrong types, and values out of range."""
     avatar.splats.__dict__.update(random_splats(1, 50, 30, degree).__dict__)
     path = tmp_path / "a.glb"
     assert export_avatar(path, avatar, "gltf", [(0, avatar.neutral)]) == [path]
@@ -132,7 +129,8 @@ import { pathToFileURL } from 'node:url';
 const three = pathToFileURL(process.argv[2] + '/three/examples/jsm/loaders/').href;
 globalThis.self = globalThis;
 const { GLTFLoader } = await import(three + 'GLTFLoader.js');
-const { GLTFGaussianSplatLoaderExtension } = await import(three + 'GLTFGaussianSplatLoaderExtension.js');
+const name = 'GLTFGaussianSplatLoaderExtension';
+const { [name]: GLTFGaussianSplatLoaderExtension } = await import(`${three}${name}.js`);
 const loader = new GLTFLoader();
 loader.register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
 const file = readFileSync(process.argv[3]);

@@ -11,8 +11,10 @@ from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply, write_ply
 
 NAMES = {
-    "i1": ("char", "int8"), "u1": ("uchar", "uint8"), "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
-    "i4": ("int", "int32"), "u4": ("uint", "uint32"), "f4": ("float", "float32"), "f8": ("double", "float64"),
+    "i1": ("char", "int8"), "u1": ("uchar", "uint8"),
+    "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
+    "i4": ("int", "int32"), "u4": ("uint", "uint32"),
+    "f4": ("float", "float32"), "f8": ("double", "float64"),
 }  # fmt: skip
 CODES = {name: code for code, names in NAMES.items() for name in names}
 """Scalar types of PLY by both of their names: Turk's description of the format, and those of newer
@@ -28,8 +30,7 @@ def world_splats(count: int = 20, sh_degree: int = 3) -> Splats:
 def by_hand(
     kind: str, properties: dict[str, str], rows: list[dict[str, float]], before: str = ""
 ) -> bytes:
-    """A PLY file put together without the code under test; `before` is header text of an earlier
-    element."""
+    """A PLY file made without the code under test; `before`: an earlier element."""
     lines = ["ply", f"format {kind} 1.0", "comment made by hand, Zoë"] + (
         [before] if before else []
     )
@@ -140,8 +141,7 @@ def test_trimesh_reads_the_positions(tmp_path):
 @pytest.mark.parametrize("rest", [0, 9, 24, 45])
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_foreign_files_of_every_degree_and_kind(tmp_path, kind, rest):
-    """Catches a wrong split of f_rest into channels, byte order, and dependence on the properties'
-    order."""
+    """Catches a wrong split of f_rest, byte order, and order of properties."""
     names = layout(rest)
     rows = numbered_rows(names)
     shuffled = np.random.default_rng(0).permutation([*names, "binding_0", "red"]).tolist()
@@ -166,8 +166,7 @@ def test_foreign_files_of_every_degree_and_kind(tmp_path, kind, rest):
 
 @pytest.mark.parametrize("type_", CODES)
 def test_numbers_of_every_type(tmp_path, type_):
-    """Catches a type by one of its names that is unknown, or taken for another: what follows it is
-    then shifted."""
+    """Catches a type name that is unknown or mistaken: what follows is shifted."""
     names = layout(0)
     kinds = {"more": type_, **dict.fromkeys(names, "float"), "x": type_}
     content = by_hand(

@@ -1,5 +1,4 @@
-"""SPZ: read by gsply where it is installed, by a reader written from the specification, rendered as
-it was."""
+"""SPZ: read by gsply, by a reader from the specification, rendered as it was."""
 
 import gzip
 import struct
@@ -18,8 +17,7 @@ from stga_addon.export.spz import write_spz
 
 
 def read(path: Path) -> tuple[Splats, int]:
-    """Splats and flags of a file of version 3, one splat after the other, by Niantic's description
-    of the format."""
+    """Splats and flags of a file of version 3, by Niantic's description."""
     data = gzip.decompress(path.read_bytes())
     magic, version, count, degree, bits, flags, reserved = struct.unpack("<4sIIBBBB", data[:16])
     assert (magic, version, reserved) == (b"NGSP", 3, 0)
@@ -50,8 +48,7 @@ def read(path: Path) -> tuple[Splats, int]:
 
 
 def quaternion(row: np.ndarray) -> list[float]:
-    """wxyz of four bytes: two bits name the largest of x, y, z, w; the others have a sign and nine
-    bits."""
+    """wxyz of four bytes: two bits name the largest; others have sign and nine bits."""
     packed = int.from_bytes(row.tobytes(), "little")
     largest, fields = packed >> 30, [packed >> shift & 1023 for shift in (20, 10, 0)]
     small = [(-1 if field >> 9 else 1) * (field & 511) / 511 / 2**0.5 for field in fields]

@@ -1,5 +1,4 @@
-"""USD: read back by USD itself, checked by its validators and by what they do not look at, rendered
-equal."""
+"""USD: read back by USD, checked by its validators and more, rendered equal."""
 
 import sys
 from collections.abc import Iterator
@@ -62,8 +61,7 @@ def splats_at(stage: Any, time: float) -> Splats:
 @pytest.mark.parametrize("color", ["constant", "strain"])
 @pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
 def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
-    """Catches wrong quaternion order, activations, coefficient order, frames off by one, and strain
-    left out."""
+    """Catches wrong quaternion or coefficient order, activations, frames, no strain."""
     path = tmp_path / f"a{suffix}"
     stage_of = avatar if color == "constant" else strained(avatar)
     assert export_avatar(path, stage_of, "usd", moved(avatar), fps=FPS) == [path]
@@ -86,8 +84,7 @@ def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
 
 
 def test_valid(avatar, tmp_path):
-    """Catches what USD's validators find, and what they do not: units, axis, hints, an extent that
-    is too small."""
+    """Catches what validators find, and units, axis, hints and extents they do not."""
     validation = pytest.importorskip(
         "pxr.UsdValidation", reason="the package usd-core is not installed"
     )
@@ -146,8 +143,7 @@ def test_nothing_is_left_of_an_export_that_ends_early(avatar, tmp_path):
 
 
 def test_mistakes_are_sentences(avatar, tmp_path, monkeypatch):
-    """Catches a traceback where USD is not installed, or for a name that USD takes for another
-    format."""
+    """Catches a traceback without USD, or for a name of another format."""
     with pytest.raises(StgaError, match=r"a\.abc: expected a name that ends in \.usdc or \.usdz"):
         export_avatar(tmp_path / "a.abc", avatar, "usd", moved(avatar))
     for name in [name for name in sys.modules if name.partition(".")[0] == "pxr"]:

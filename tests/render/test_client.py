@@ -145,7 +145,8 @@ def test_the_server_renders_the_same(monkeypatch):
 def test_output_of_libraries_does_not_disturb_the_protocol(tmp_path, monkeypatch):
     """Catches a server whose replies are mixed with what C code writes to descriptor 1 while
     packages are imported."""
-    shim = "import os, sys\nos.write(1, b'noise' * 100)\nsys.path.remove({!r})\ndel sys.modules[__name__]\nimport {}\n"
+    shim = "import os, sys\nos.write(1, b'noise' * 100)\nsys.path.remove({!r})\n"
+    shim += "del sys.modules[__name__]\nimport {}\n"
     (tmp_path / "platformdirs.py").write_text(shim.format(str(tmp_path), "platformdirs"))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])

@@ -41,8 +41,8 @@ def test_a_right_and_faster_gpu_is_taken(trials: dict[str, Trial]) -> None:
     chosen, why = choose_device("auto")
     assert chosen == f"gpu:{CARD}"
     assert (
-        why
-        == f"Training on {CARD}, 10.0 times as fast as the CPU in a trial (2.0 and 20.0 ms an image)"
+        why == f"Training on {CARD}, 10.0 times as fast as the CPU in a trial "
+        "(2.0 and 20.0 ms an image)"
     )
     assert choose_device("cpu")[0] == "cpu"
     assert choose_device("gpu:dx12")[0] == f"gpu:{OTHER}"
@@ -147,7 +147,8 @@ def test_what_is_a_device() -> None:
 def test_wgpu_is_imported_only_where_it_works() -> None:
     """Catches a run on the CPU that needs wgpu, or waits for a driver."""
     script = (
-        "import sys; from stga_addon.render import device; from stga_addon.training.run import session; "
+        "import sys; from stga_addon.render import device; "
+        "from stga_addon.training.run import session; "
         "device.choose_device('cpu'); sys.exit('wgpu' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0

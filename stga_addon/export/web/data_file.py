@@ -1,5 +1,4 @@
-"""Web data files: an avatar, a linear rig that moves it, and cameras, quantized, in a container
-(docs/formats.md)."""
+"""Web data files: an avatar, a linear rig that moves it, and cameras (docs/formats.md)."""
 
 import gzip
 import json
@@ -64,42 +63,25 @@ def _entry(name: str, array: np.ndarray | FixedPoint) -> tuple[dict[str, Any], b
             raise ValueError(
                 f"{name} holds a value that is not finite, or beyond {MAX_STEPS * array.step:g}"
             )
-        planes, low, block = _planes(steps.astype(np.int64))
-        return {
-            "type": "fixed",
-            "shape": list(steps.shape),
-            "planes": planes,
-            "low": low,
-            "step": array.step,
-        }, block
-    if array.dtype.kind in "iub":
-        planes, low, block = _planes(array.astype(np.int64))
-        return {"type": "integer", "shape": list(array.shape), "planes": planes, "low": low}, block
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} holds a value that is not finite")
-    return {"type": "float32", "shape": list(array.shape)}, np.ascontiguousarray(
-        array, "<f4"
-    ).tobytes()
-
-
-def _planes(integers: np.ndarray) -> tuple[int, int, bytes]:
-    """(count, lowest value, bytes) of integers above their lowest: byte planes, least significant
-    first.
-
-    Within a plane the last axis varies slowest, so that equal quantities lie side by side: gzip
-    gains a fifth.
-    """
+        integers, entry = steps.astype(np.int64), {"type": "fixed", "step": array.step}
+    elif array.dtype.kind in "iub":
+        integers, entry = array.astype(np.int64), {"type": "integer"}
+    else:
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds a value that is not finite")
+        floats = np.ascontiguousarray(array, "<f4")
+        return {"type": "float32", "shape": list(array.shape)}, floats.tobytes()
+    # Byte planes of what is above the lowest, least significant first. Within a plane the last
+    # axis varies slowest, so that equal quantities lie side by side: gzip gains a fifth.
     low = int(integers.min()) if integers.size else 0
     above = np.ascontiguousarray(np.moveaxis(integers - low, -1, 0)).ravel()
     largest = int(above.max()) if above.size else 0
     count = max(1, (largest.bit_length() + 7) // 8)
     if count > MAX_PLANES:
         raise ValueError(f"values from {low} to {low + largest} do not fit {MAX_PLANES} bytes")
-    return (
-        count,
-        low,
-        b"".join(((above >> 8 * plane) & 255).astype(np.uint8).tobytes() for plane in range(count)),
-    )
+    planes = [((above >> 8 * plane) & 255).astype(np.uint8).tobytes() for plane in range(count)]
+    entry |= {"shape": list(integers.shape), "planes": count, "low": low}
+    return entry, b"".join(planes)
 
 
 BAKE_TOLERANCE_M = 5e-6
@@ -138,8 +120,7 @@ class WebRig:
 
 
 def flame_rig(sequence: FlameSequence) -> WebRig:
-    """The FLAME model of a sequence with the person's identity baked in; dynamic offsets become
-    blend shapes."""
+    """The FLAME model with the person's identity baked in; dynamic offsets become blend shapes."""
     person = with_identity(sequence)
     model = person.model
     frames = [person.frame(timestep) for timestep in person.timesteps]
@@ -202,8 +183,7 @@ def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
 
 
 def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes (R, V, 3) and coefficients (T, R) in −1…1 whose products are offsets (T, V, 3) to
-    BAKE_TOLERANCE_M."""
+    """Shapes (R, V, 3) and coefficients (T, R) in −1…1 with products near offsets (T, V, 3)."""
     frames, vertices = offsets.shape[:2]
     flat = offsets.reshape(frames, -1)
     _, directions = np.linalg.eigh(flat @ flat.T)
@@ -237,8 +217,7 @@ COLOR_STEP = 0.004
 SH_STEP = 0.005
 STRAIN_COLOR_STEP = 0.008
 STRAIN_RANGE_STEP = 0.002
-"""Of the ends of a triangle's range, where strain is clipped: positions that follow it by 2 mm a
-unit err by 2 µm."""
+"""Of the ends of a triangle's range of strain: positions that follow it by 2 mm err by 2 µm."""
 OFFSET_STEPS_M = {"strain_position": POSITION_STEP_M / 16}
 """Driven offset that the player has a signal for (`player/face_frames.js`) -> step of its
 coefficients.
@@ -273,32 +252,28 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     # meters of a unit of the splats' local frames, where it is largest
     unit = float(frames.scale.max(initial=1e-6))
-    arrays = _splat_arrays(splats, unit) | _driven_arrays(avatar, unit)
-    arrays |= {
+    arrays = _splat_arrays(splats, unit) | {
         "faces": avatar.faces,
         "neutral": FixedPoint(avatar.neutral, VERTEX_STEP_M),
         "splats_per_face": np.bincount(splats.face, minlength=len(avatar.faces)),
+        "base": FixedPoint(rig.base, VERTEX_STEP_M),
+        "basis": FixedPoint(rig.basis, BASIS_STEP_M),
+        "correctives": FixedPoint(rig.correctives, BASIS_STEP_M),
+        "weights": FixedPoint(rig.weights, WEIGHT_STEP),
+        "joint_rest": rig.joints.astype(np.float32),
+        "joint_basis": rig.joint_basis.astype(np.float32),
+        "coefficients": rig.coefficients.astype(np.float32),
+        "pose": rig.pose.astype(np.float32),
+        "translation": rig.translation.astype(np.float32),
     }
-    arrays |= _rig_arrays(rig) | _light_arrays(relighter, order, unit)
-    controls = playback.controls if rig.expressions else None
-    if controls is not None:
-        arrays["shape_linear"] = controls.linear.astype(np.float32)
-        arrays["shape_products"] = controls.products.astype(np.float32)
-    if playback.selection is not None:
-        arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
-    if exact:
-        arrays = {
-            name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a
-            for name, a in arrays.items()
-        }
-    return pack(_header(avatar, rig, playback, relighter), arrays)
-
-
-def _header(
-    avatar: Avatar, rig: WebRig, playback: Playback, relighter: Relighter | None
-) -> dict[str, Any]:
-    controls = playback.controls if rig.expressions else None
-    return {
+    rows = (len(avatar.faces), -1)
+    if avatar.follows_strain and avatar.strain_range is not None:
+        arrays["strain_range"] = FixedPoint(avatar.strain_range.reshape(rows), STRAIN_RANGE_STEP)
+    for name, coefficients in avatar.driven_offsets.items():
+        if name not in OFFSET_STEPS_M:
+            raise ValueError(f"the web player has no driven offset {name}")
+        arrays[name] = FixedPoint(coefficients.reshape(rows), OFFSET_STEPS_M[name] / unit)
+    header: dict[str, Any] = {
         "title": playback.title,
         "convention": avatar.convention,
         "antialiased": avatar.antialiased,
@@ -307,20 +282,7 @@ def _header(
         "up": [float(value) for value in playback.up],
         "joints": list(rig.joint_names),
         "parents": list(rig.parents),
-        # Where expressions are ARKit's shapes, those are their sliders.
-        "sliders": [] if controls is not None and rig.expression_names else _sliders(rig),
-        **(
-            {}
-            if controls is None
-            else {
-                "shapes": {
-                    "names": list(controls.names),
-                    "opens": controls.opens,
-                    "limited": controls.limited,
-                }
-            }
-        ),
-        **({} if relighter is None else {"light": _light(relighter)}),
+        "sliders": _sliders(rig),
         "views": [
             {
                 "name": name,
@@ -332,6 +294,29 @@ def _header(
             for name, camera in playback.views.items()
         ],
     }
+    if playback.controls is not None and rig.expressions:
+        controls = playback.controls
+        arrays["shape_linear"] = controls.linear.astype(np.float32)
+        arrays["shape_products"] = controls.products.astype(np.float32)
+        header["shapes"] = {"names": list(controls.names)}
+        header["shapes"] |= {"opens": controls.opens, "limited": controls.limited}
+        if rig.expression_names:  # they are ARKit's shapes, whose sliders these are
+            header["sliders"] = []
+    if relighter is not None:
+        arrays |= _light_arrays(relighter, order, unit)
+        header["light"] = {
+            "damping": relighter.light.damping,
+            "typical": relighter.typical_albedo.tolist(),
+            "recorded": relighter.recorded_light.ravel().tolist(),
+        }
+    if playback.selection is not None:
+        arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
+    if exact:
+        arrays = {
+            name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a
+            for name, a in arrays.items()
+        }
+    return pack(header, arrays)
 
 
 def _sliders(rig: WebRig) -> list[dict[str, Any]]:
@@ -359,9 +344,8 @@ def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
     if splats.sh.shape[1] > 1:
         arrays["sh"] = FixedPoint(splats.sh[:, 1:].reshape(len(splats), -1), SH_STEP)
     if splats.strain_color.shape[1]:
-        arrays["strain_color"] = FixedPoint(
-            splats.strain_color.reshape(len(splats), -1), STRAIN_COLOR_STEP
-        )
+        strained = splats.strain_color.reshape(len(splats), -1)
+        arrays["strain_color"] = FixedPoint(strained, STRAIN_COLOR_STEP)
     return arrays
 
 
@@ -376,35 +360,8 @@ def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return largest.astype(np.uint8), np.take_along_axis(q, others, 1)
 
 
-def _driven_arrays(avatar: Avatar, local_unit: float) -> Arrays:
-    """What the triangles hold for colors and positions that follow the pose."""
-    arrays: Arrays = {}
-    rows = (len(avatar.faces), -1)
-    if avatar.follows_strain and avatar.strain_range is not None:
-        arrays["strain_range"] = FixedPoint(avatar.strain_range.reshape(rows), STRAIN_RANGE_STEP)
-    for name, coefficients in avatar.driven_offsets.items():
-        if name not in OFFSET_STEPS_M:
-            raise ValueError(f"the web player has no driven offset {name}")
-        arrays[name] = FixedPoint(coefficients.reshape(rows), OFFSET_STEPS_M[name] / local_unit)
-    return arrays
-
-
-def _light(relighter: Relighter) -> dict[str, Any]:
-    """What is one for the whole head: how much albedo is drawn to its mean, that, and the light of
-    the capture."""
-    recorded = relighter.recorded_light.ravel().tolist()
-    return {
-        "damping": relighter.light.damping,
-        "typical": relighter.typical_albedo.tolist(),
-        "recorded": recorded,
-    }
-
-
-def _light_arrays(relighter: Relighter | None, order: np.ndarray, local_unit: float) -> Arrays:
-    """How the vertices receive light, what the capture's light gave them, on which triangles the
-    splats lie, and lashes."""
-    if relighter is None:
-        return {}
+def _light_arrays(relighter: Relighter, order: np.ndarray, local_unit: float) -> Arrays:
+    """How vertices receive light, and did in the capture; triangles of splats; lashes."""
     light, lashes, faces = relighter.light, relighter.lashes, len(relighter.avatar.faces)
     largest = float(light.irradiance.max(initial=1e-6))
     return {
@@ -418,21 +375,4 @@ def _light_arrays(relighter: Relighter | None, order: np.ndarray, local_unit: fl
         "light_lash_corners": FixedPoint(
             lashes.corners.reshape(-1, 12), POSITION_STEP_M / local_unit
         ),
-    }
-
-
-def _rig_arrays(rig: WebRig) -> Arrays:
-    exact: Mapping[str, np.ndarray] = {
-        "joint_rest": rig.joints,
-        "joint_basis": rig.joint_basis,
-        "coefficients": rig.coefficients,
-        "pose": rig.pose,
-        "translation": rig.translation,
-    }
-    return {
-        "base": FixedPoint(rig.base, VERTEX_STEP_M),
-        "basis": FixedPoint(rig.basis, BASIS_STEP_M),
-        "correctives": FixedPoint(rig.correctives, BASIS_STEP_M),
-        "weights": FixedPoint(rig.weights, WEIGHT_STEP),
-        **{name: array.astype(np.float32) for name, array in exact.items()},
     }

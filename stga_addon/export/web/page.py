@@ -1,5 +1,4 @@
-"""The web page of an avatar: player, styles and data in one HTML file, or data and player for a
-server."""
+"""The web page of an avatar as one HTML file, or its data and the player for a server."""
 
 import base64
 import html
@@ -26,7 +25,8 @@ ELEMENT, PAGE = "stga-avatar.js", "page.js"
 IMPORT = re.compile(r"^import\b[^;]*?'\./([\w-]+\.js)';\n", re.MULTILINE)
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
 TYPES = re.compile(
-    r"^// @ts-check\n|^ */\*\*\n(?: *\* @.*\n)+ *\*/\n|^ */\*\* @.*\*/\n|^ *\* @.*\n|/\*\* @type \{.*?\} \*/ ",
+    r"^// @ts-check\n|^ */\*\*\n(?: *\* @.*\n)+ *\*/\n|^ */\*\* @.*\*/\n|^ *\* @.*\n|"
+    r"/\*\* @type \{.*?\} \*/ ",
     re.MULTILINE,
 )
 """Comments that only `make lint-web` reads."""
@@ -34,8 +34,7 @@ TYPES = re.compile(
 
 @cache
 def element_script() -> str:
-    """The custom element as one module: the player's files without their imports and exports, under
-    their licence."""
+    """The custom element as one module, under its licence."""
     licence = (PLAYER / "LICENSE").read_text(encoding="utf-8")
     return "/*!\n" + licence + "*/\n" + "\n".join(map(_source, modules()))
 
@@ -48,8 +47,7 @@ def modules(name: str = ELEMENT) -> tuple[str, ...]:
 
 
 def _source(name: str) -> str:
-    """A module without its imports, exports and types, and with the GLSL that it shares with
-    Blender's shaders."""
+    """A module without imports, exports and types, and with the GLSL shared with Blender."""
     source = (PLAYER / name).read_text(encoding="utf-8")
     for comment in (IMPORT, EXPORT, TYPES):
         source = comment.sub("", source)
@@ -58,13 +56,11 @@ def _source(name: str) -> str:
 
 
 def page(title: str, notice: str, data: bytes) -> str:
-    """The HTML of a page that plays `data` (`data_file`); `notice`: a sentence on its licence, or
-    ""."""
+    """The HTML of a page that plays `data` (`data_file`); `notice`: on its licence, or ""."""
     template = (PLAYER / "page.html").read_text(encoding="utf-8")
     parts = {
         "title": html.escape(title),
         "notice": html.escape(notice),
-        "style": (PLAYER / "page.css").read_text(encoding="utf-8"),
         "script": f"{element_script()}\n{_source(PAGE)}",
         "data": base64.b64encode(data).decode("ascii"),
     }
@@ -72,26 +68,20 @@ def page(title: str, notice: str, data: bytes) -> str:
 
 
 BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
-"""About what a splat, and a coefficient of its color, takes in a page: compressed, then written as
-text."""
-BUNDLED_NOTICE = "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for Creative Technologies."
-RIG_NOTICE = (
-    "Contains blend shapes and a skeleton derived from a FLAME model: FLAME's licence (flame.is.tue.mpg.de) decides "
-    "who may receive them."
+"""About what a splat, and a coefficient of its color, takes in a page."""
+BUNDLED_NOTICE = (
+    "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for "
+    "Creative Technologies."
 )
-MESH_NOTICE = (
-    "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence (flame.is.tue.mpg.de) decides who "
-    "may receive them."
-)
+FLAME_LICENCE = ": FLAME's licence (flame.is.tue.mpg.de) decides who may receive them."
+RIG_NOTICE = f"Contains blend shapes and a skeleton derived from a FLAME model{FLAME_LICENCE}"
+MESH_NOTICE = f"Contains the triangles and the posed meshes of a FLAME head{FLAME_LICENCE}"
 
 
 def write_web(
-    path: Path,
-    avatar: Avatar,
-    playback: Playback,
-    meshes: Iterable[np.ndarray] = (),
+    path: Path, avatar: Avatar, playback: Playback, meshes: Iterable[np.ndarray] = (),
     sequence: FlameSequence | None = None,
-) -> list[Path]:
+) -> list[Path]:  # fmt: skip
     """Write a page that plays the avatar, or an .stga data file with the player beside it; returns
     the files.
 
@@ -99,12 +89,9 @@ def write_web(
               the posed `meshes` (V, 3) meters are baked, of which there is one at least
     Raises StgaError where there is no pose, or a file cannot be written.
     """
+    motion = None if playback.motion_only else sequence
     try:
-        rig = (
-            baked_rig(list(meshes))
-            if playback.motion_only or sequence is None
-            else flame_rig(sequence)
-        )
+        rig = baked_rig(list(meshes)) if motion is None else flame_rig(motion)
         data = data_file(avatar, rig, playback)
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
@@ -135,7 +122,6 @@ def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bo
 
 def web_bytes(avatar: Avatar) -> int:
     """About the size of a page of the avatar."""
-    colors = (
-        avatar.splats.sh[0].size + avatar.splats.strain_color[0].size if len(avatar.splats) else 0
-    )
-    return round((BYTES_PER_SPLAT + BYTES_PER_COEFFICIENT * colors) * len(avatar.splats))
+    splats = avatar.splats
+    coefficients = splats.sh.size + splats.strain_color.size
+    return round(BYTES_PER_SPLAT * len(splats) + BYTES_PER_COEFFICIENT * coefficients)

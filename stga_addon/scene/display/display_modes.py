@@ -1,52 +1,118 @@
-"""Node groups and materials of the display modes: as trained, points, camera quads and, from 5.3,
-native splats."""
+"""Node groups and materials of the display modes, and of colors by direction and strain."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import bpy
 
-from ...avatar.splats import SH_C0
+from ...avatar.splats import SH_C0, harmonics
 from ..compat import native_splats
-from .color_nodes import LINEAR_TO_SRGB
 from .node_builder import NodeGroup, Nodes, new_material
-from .splat_attributes import OPACITY, RELIT_COLOR, SH
+from .splat_attributes import OPACITY, RELIT_COLOR, SH, STRAIN_COLOR
+
+
+def constant_color(nodes: Nodes, strain: Any) -> Any:
+    """The part of each splat's sRGB color, not clamped, that does not depend on the view direction.
+
+    strain: vector from SAMPLED_STRAIN, None where colors do not follow it. Coefficients as in
+    `Splats`.
+    """
+    terms = [nodes.scale(nodes.attribute(SH.format(0), "FLOAT_VECTOR"), SH_C0), (0.5, 0.5, 0.5)]
+    for index, factor in enumerate(() if strain is None else nodes.components(strain)):
+        color = nodes.attribute(STRAIN_COLOR.format(index), "FLOAT_VECTOR")
+        terms.append(nodes.scale(color, factor))
+    return nodes.sum(*terms)
+
+
+def view_color(nodes: Nodes, color: Any, degree: int) -> tuple[Any, Any]:
+    """The constant color plus harmonics of degrees 1 to `degree` from the scene's active camera,
+    in the space that splats were trained in, and whether there is a camera."""
+    camera = nodes.object_info(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
+    position = nodes.out("GeometryNodeInputPosition")
+    direction = nodes.vector("NORMALIZE", nodes.vector("SUBTRACT", position, camera))
+    seen = nodes.sum(color, *(nodes.group(band, direction) for band in SH_BANDS[:degree]))
+    # Without a camera object the location is zero, which is inside the head: no camera is there.
+    return seen, nodes.compare("GREATER_THAN", nodes.vector("LENGTH", camera), 0.0)
+
+
+def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
+    """Scene-linear color of sRGB, clamped to 0…1 (IEC 61966-2-1)."""
+    clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", srgb, (0, 0, 0)), (1, 1, 1))
+    linear = []
+    for value in nodes.components(clamped):
+        base = nodes.math("DIVIDE", nodes.math("ADD", value, 0.055), 1.055)
+        line, power = nodes.math("DIVIDE", value, 12.92), nodes.math("POWER", base, 2.4)
+        is_bright = nodes.compare("GREATER_THAN", value, 0.04045)
+        linear.append(nodes.switch("FLOAT", is_bright, line, power))
+    return nodes.combine(*linear)
+
+
+def _linear_to_srgb(nodes: Nodes, color: Any) -> Any:
+    """The inverse, of colors from 0 on."""
+    srgb = []
+    for value in nodes.components(color):
+        power = nodes.math("MULTIPLY_ADD", nodes.math("POWER", value, 1 / 2.4), 1.055, -0.055)
+        line = nodes.math("MULTIPLY", value, 12.92)
+        is_bright = nodes.compare("GREATER_THAN", value, 0.0031308)
+        srgb.append(nodes.switch("FLOAT", is_bright, line, power))
+    return nodes.combine(*srgb)
+
+
+class _Formula:
+    """Arithmetic of numbers and sockets, whose nodes are made once its socket is asked for."""
+
+    def __init__(self, make: Callable[[], Any], nodes: Nodes) -> None:
+        self._make, self._nodes = make, nodes
+
+    @cached_property
+    def socket(self) -> Any:
+        return self._make()
+
+    def _with(self, operation: str, other: Any) -> "_Formula":
+        def make() -> Any:
+            value = other.socket if isinstance(other, _Formula) else other
+            return self._nodes.math(operation, self.socket, value)
+
+        return _Formula(make, self._nodes)
+
+    def __mul__(self, other: Any) -> "_Formula":
+        return self._with("MULTIPLY", other)
+
+    def __sub__(self, other: Any) -> "_Formula":
+        return self._with("SUBTRACT", other)
+
+    __rmul__ = __mul__
+
+
+def _band(degree: int, nodes: Nodes, direction: Any) -> Any:
+    """Sum of the coefficients of one degree times their harmonics in a unit direction."""
+    x, y, z = nodes.components(direction)
+    axes = _Formula(lambda: x, nodes), _Formula(lambda: y, nodes), _Formula(lambda: z, nodes)
+    total, terms = (0, 0, 0), harmonics(*axes)
+    for index in range(degree**2, (degree + 1) ** 2):
+        coefficient = nodes.attribute(SH.format(index), "FLOAT_VECTOR")
+        total = nodes.vector("MULTIPLY_ADD", coefficient, terms[index].socket, total)
+    return total
+
+
+SRGB_TO_LINEAR = NodeGroup("STGA sRGB to Linear", {"sRGB": "Vector"}, "Color", _srgb_to_linear)
+LINEAR_TO_SRGB = NodeGroup("STGA Linear to sRGB", {"Color": "Color"}, "Vector", _linear_to_srgb)
+SH_BANDS = tuple(
+    NodeGroup(f"STGA Spherical Harmonics {n}", {"Direction": "Vector"}, "Vector", partial(_band, n))
+    for n in (1, 2, 3)
+)
+
 
 POINT_MATERIAL = "STGA Points"
 GAUSSIAN_MATERIAL = "STGA Gaussians"
 DISPLAY_COLOR = "stga_display_color"  # attribute that the splat nodes store
 EXTENT = 3.0
-"""Standard deviations from a quad's center to its sides; beyond, a Gaussian is below 1.2 % of its
-maximum."""
-
-
-def point_material() -> bpy.types.Material:
-    """Emits the color of a point cloud's points, with their opacity; built where the file has
-    none."""
-    # EEVEE does not sort the points of a point cloud.
-    return _splat_material(
-        POINT_MATERIAL,
-        lambda nodes: _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY")),
-        "DITHERED",
-    )
-
-
-def gaussian_material() -> bpy.types.Material:
-    """Renders instances of a quad as Gaussians; the instance's scale is the standard deviation.
-
-    Along a ray with unit direction D through a point P of the quad, both in the instance's space,
-    the Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² −
-    (P·D)²; its density there is taken for the whole splat. Exact for Cycles up to the order of
-    overlapping splats, and for EEVEE up to their order by centers.
-    """
-    # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come as
-    # close.
-    return _splat_material(GAUSSIAN_MATERIAL, _gaussian_shader, "BLENDED")
+"""Standard deviations from a quad's center to its sides; a Gaussian is below 1.2 % there."""
 
 
 def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bpy.types.Material:
-    """method: EEVEE's, "DITHERED" or "BLENDED"."""
+    """Built where the file has none; method: EEVEE's, "DITHERED" or "BLENDED"."""
     material = bpy.data.materials.get(name)
     if material is None:
         material = new_material(name, build)
@@ -55,27 +121,32 @@ def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bp
     return material
 
 
+def _point_shader(nodes: Nodes) -> Any:
+    """Emits the color of a point cloud's points, with their opacity."""
+    return _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY"))
+
+
 def _gaussian_shader(nodes: Nodes) -> Any:
+    """Renders instances of a quad as Gaussians; the instance's scale is the standard deviation.
+
+    Along a ray with unit direction D through a point P of the quad, both in the instance's space,
+    the Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² −
+    (P·D)²; its density there is taken for the whole splat. Exact for Cycles up to the order of
+    overlapping splats, and for EEVEE up to their order by centers.
+    """
     color, opacity = _color_and_opacity(nodes, "INSTANCER")
     geometry = nodes.add("ShaderNodeNewGeometry").outputs
     position = nodes.add("ShaderNodeTexCoord").outputs["Object"]
-    incoming = {"Vector": geometry["Incoming"]}
-    ray = nodes.out(
-        "ShaderNodeVectorTransform",
-        incoming,
-        vector_type="VECTOR",
-        convert_from="WORLD",
-        convert_to="OBJECT",
-    )
+    to_object = {"vector_type": "VECTOR", "convert_from": "WORLD", "convert_to": "OBJECT"}
+    ray = nodes.out("ShaderNodeVectorTransform", {"Vector": geometry["Incoming"]}, **to_object)
     along = nodes.vector("DOT_PRODUCT", position, nodes.vector("NORMALIZE", ray))
     length2 = nodes.vector("DOT_PRODUCT", position, position)
     distance2 = nodes.math("SUBTRACT", length2, nodes.math("MULTIPLY", along, along))
     density = nodes.math("EXPONENT", nodes.math("MULTIPLY", distance2, -0.5))
     # Whatever is behind a quad sees through it.
     front = nodes.math("SUBTRACT", 1.0, geometry["Backfacing"])
-    return _emission(
-        nodes, color, nodes.math("MULTIPLY", nodes.math("MULTIPLY", density, front), opacity)
-    )
+    visible = nodes.math("MULTIPLY", density, front)
+    return _emission(nodes, color, nodes.math("MULTIPLY", visible, opacity))
 
 
 def _color_and_opacity(nodes: Nodes, attribute_type: str) -> tuple[Any, Any]:
@@ -88,11 +159,9 @@ def _color_and_opacity(nodes: Nodes, attribute_type: str) -> tuple[Any, Any]:
 
 
 def _emission(nodes: Nodes, color: Any, alpha: Any) -> Any:
-    transparent, emission = (
-        nodes.out("ShaderNodeBsdfTransparent"),
-        nodes.out("ShaderNodeEmission", {"Color": color}),
-    )
-    return nodes.out("ShaderNodeMixShader", {"Fac": alpha, "Shader": [transparent, emission]})
+    shaders = [nodes.out("ShaderNodeBsdfTransparent")]
+    shaders.append(nodes.out("ShaderNodeEmission", {"Color": color}))
+    return nodes.out("ShaderNodeMixShader", {"Fac": alpha, "Shader": shaders})
 
 
 # Attributes that Blender's native splats use; rotation and scale are those that the splats have by
@@ -107,7 +176,8 @@ POINTS = "Points"
 QUADS = "Camera Quads"
 NATIVE = "Native Splats"
 LIMITS = {
-    AS_TRAINED: "Exact in viewports and by the engine STGA Splats; EEVEE and Cycles render camera quads",
+    AS_TRAINED: "Exact in viewports and by the engine STGA Splats; "
+    "EEVEE and Cycles render camera quads",
     POINTS: "Fast: round, of each splat's mean size",
     QUADS: "For EEVEE and Cycles; right through the scene's camera only",
     NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; not tried in Blender 5.3",
@@ -124,10 +194,8 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
     made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
     # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads
     # that face the camera.
-    is_viewport = nodes.out("GeometryNodeIsViewport")
-    in_images = nodes.out(
-        "GeometryNodeSwitch", {"Switch": is_viewport, "False": made[QUADS]}, input_type="GEOMETRY"
-    )
+    choice = {"Switch": nodes.out("GeometryNodeIsViewport"), "False": made[QUADS]}
+    in_images = nodes.out("GeometryNodeSwitch", choice, input_type="GEOMETRY")
     geometries = {AS_TRAINED: in_images, **made}
     if native is not None and (points := native_splats(nodes.tree, native)) is not None:
         geometries[NATIVE] = points
@@ -143,16 +211,13 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
     # A point has one radius: the mean of the three standard deviations.
-    mean = nodes.math(
-        "DIVIDE",
-        nodes.vector("DOT_PRODUCT", nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), (1, 1, 1)),
-        3,
-    )
-    radius = nodes.math("MULTIPLY", mean, size)
-    points = nodes.out(
-        "GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible, "Radius": radius}
-    )
-    return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": point_material()})
+    scale = nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR")
+    mean = nodes.math("DIVIDE", nodes.vector("DOT_PRODUCT", scale, (1, 1, 1)), 3)
+    inputs = {"Mesh": splats, "Selection": visible, "Radius": nodes.math("MULTIPLY", mean, size)}
+    points = nodes.out("GeometryNodeMeshToPoints", inputs)
+    # EEVEE does not sort the points of a point cloud.
+    material = _splat_material(POINT_MATERIAL, _point_shader, "DITHERED")
+    return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": material})
 
 
 def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
@@ -161,14 +226,14 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
     In the ellipsoid's own space it is a sphere, and the quad faces the camera there. Instances:
     realizing them would take twenty times as long.
     """
-    side = 2 * EXTENT
-    quad = nodes.out(
-        "GeometryNodeMeshGrid", {"Size X": side, "Size Y": side, "Vertices X": 2, "Vertices Y": 2}
-    )
-    quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": gaussian_material()})
-    quads = nodes.out(
-        "GeometryNodeInstanceOnPoints", {"Points": splats, "Selection": visible, "Instance": quad}
-    )
+    sides = {"Size X": 2 * EXTENT, "Size Y": 2 * EXTENT, "Vertices X": 2, "Vertices Y": 2}
+    quad = nodes.out("GeometryNodeMeshGrid", sides)
+    # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come
+    # as close.
+    material = _splat_material(GAUSSIAN_MATERIAL, _gaussian_shader, "BLENDED")
+    quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": material})
+    points = {"Points": splats, "Selection": visible, "Instance": quad}
+    quads = nodes.out("GeometryNodeInstanceOnPoints", points)
     # Per splat: its ellipsoid's transform after a rotation that turns +Z to the active camera.
     position = nodes.out("GeometryNodeInputPosition")
     rotation = nodes.attribute(WORLD_ROTATION, "QUATERNION")
@@ -185,41 +250,30 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
         nodes.out("FunctionNodeCombineTransform", ellipsoid),
         nodes.out("FunctionNodeCombineTransform", {"Rotation": facing}),
     ]
-    transform = nodes.out("FunctionNodeMatrixMultiply", {"Matrix": transforms})
-    return nodes.out(
-        "GeometryNodeSetInstanceTransform", {"Instances": quads, "Transform": transform}
-    )
+    placed = {"Instances": quads}
+    placed["Transform"] = nodes.out("FunctionNodeMatrixMultiply", {"Matrix": transforms})
+    return nodes.out("GeometryNodeSetInstanceTransform", placed)
 
 
 def _native(
-    degree: int,
-    nodes: Nodes,
-    splats: Any,
-    visible: Any,
-    size: Any,
-    color: Any,
-    view_dependent: Any,
-    gray: Any,
-) -> bpy.types.NodeSocket:
+    degree: int, nodes: Nodes, splats: Any, visible: Any, size: Any, color: Any,
+    view_dependent: Any, gray: Any,
+) -> bpy.types.NodeSocket:  # fmt: skip
     """Points with what native splats are drawn from: harmonics have the object's axes, in which
     they were trained.
 
     color: constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as are those that are
     relit.
     """
-    relit = nodes.add(
-        "GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR"
-    ).outputs
-    flat = nodes.logic("OR", gray, relit["Exists"])
+    _, is_relit = nodes.attribute_if_any(RELIT_COLOR, "FLOAT_COLOR")
+    flat = nodes.logic("OR", gray, is_relit)
     shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
     color = nodes.vector("SUBTRACT", nodes.switch("VECTOR", flat, color, shown), (0.5, 0.5, 0.5))
     red, green, blue = nodes.components(nodes.scale(color, 1 / SH_C0))
     base = {"Red": red, "Green": green, "Blue": blue, "Alpha": nodes.attribute(OPACITY, "FLOAT")}
-    # A color, which 5.3 converts to four floats where it draws; of FLOAT4, this node of 5.2 stores
-    # three.
-    splats = nodes.store(
-        splats, RADIANCE, nodes.out("FunctionNodeCombineColor", base), "FLOAT_COLOR"
-    )
+    # A color, which 5.3 draws as four floats; of FLOAT4, this node of 5.2 stores three.
+    radiance = nodes.out("FunctionNodeCombineColor", base)
+    splats = nodes.store(splats, RADIANCE, radiance, "FLOAT_COLOR")
     scale = nodes.scale(nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR"), size)
     splats = nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
     factor = nodes.logic("NIMPLY", view_dependent, flat)
@@ -234,13 +288,9 @@ MODES = {
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }
+_NATIVE_INPUTS = _INPUTS | {"Color": "Vector", "View-Dependent": "Bool", "Gray": "Bool"}
 NATIVE_GROUPS = tuple(
-    NodeGroup(
-        f"STGA Native Splats {degree}",
-        {**_INPUTS, "Color": "Vector", "View-Dependent": "Bool", "Gray": "Bool"},
-        "Geometry",
-        partial(_native, degree),
-    )
-    for degree in range(4)
+    NodeGroup(f"STGA Native Splats {n}", _NATIVE_INPUTS, "Geometry", partial(_native, n))
+    for n in range(4)
 )
 """By the harmonics' degree."""

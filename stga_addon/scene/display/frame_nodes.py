@@ -1,7 +1,7 @@
 """Node groups that compute triangles' frames and strain on the head, and place splats by them."""
 
-from collections.abc import Callable, Collection
-from functools import cache, partial
+from collections.abc import Callable, Collection, Iterable
+from functools import cache, partial, reduce
 from typing import Any, NamedTuple
 
 import bpy
@@ -22,14 +22,11 @@ from .splat_attributes import (
     TENSOR,
     TENSOR_HALVES,
     XYZ,
-)
+)  # fmt: skip
 
 # Temporary attributes on the head's faces.
-_FRAME_ORIGIN, _FRAME_ROTATION, _FRAME_SIZE = (
-    "stga_frame_origin",
-    "stga_frame_rotation",
-    "stga_frame_size",
-)
+_FRAME_ORIGIN, _FRAME_ROTATION = "stga_frame_origin", "stga_frame_rotation"
+_FRAME_SIZE = "stga_frame_size"
 
 
 def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
@@ -47,9 +44,8 @@ def shifted_frames(nodes: Nodes, mesh: Any, shift: Any, convention: str) -> Any:
 
     mesh: from FRAMES, with the neutral mesh's attributes; shift: a vector field on its faces.
     """
-    shift = nodes.scale(
-        shift, _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention)
-    )
+    size = nodes.attribute(_FRAME_SIZE, "FLOAT")
+    shift = nodes.scale(shift, _frame_scale(nodes, size, convention))
     rotation = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
     moved = nodes.out("FunctionNodeRotateVector", {"Vector": shift, "Rotation": rotation})
     origin = nodes.vector("ADD", nodes.attribute(_FRAME_ORIGIN, "FLOAT_VECTOR"), moved)
@@ -57,8 +53,7 @@ def shifted_frames(nodes: Nodes, mesh: Any, shift: Any, convention: str) -> Any:
 
 
 def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any = None) -> Any:
-    """The splats at their positions in object space, with rotation and scale stored; mesh: from
-    `_stored_frames`."""
+    """Splats placed in object space, rotation and scale stored; mesh: from `_stored_frames`."""
     xyz = nodes.attribute(XYZ, "FLOAT_VECTOR")
     rotation = nodes.attribute(ROTATION, "QUATERNION")
     scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
@@ -69,16 +64,11 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
             return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
 
         size = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
-        origin, frame_rotation = (
-            sample(_FRAME_ORIGIN, "FLOAT_VECTOR"),
-            sample(_FRAME_ROTATION, "QUATERNION"),
-        )
-        xyz = nodes.out(
-            "FunctionNodeRotateVector",
-            {"Vector": nodes.scale(xyz, size), "Rotation": frame_rotation},
-        )
-        xyz = nodes.vector("ADD", xyz, origin)
-        rotations = {"Rotation": rotation, "Rotate By": frame_rotation}
+        turn = sample(_FRAME_ROTATION, "QUATERNION")
+        local = {"Vector": nodes.scale(xyz, size), "Rotation": turn}
+        turned = nodes.out("FunctionNodeRotateVector", local)
+        xyz = nodes.vector("ADD", turned, sample(_FRAME_ORIGIN, "FLOAT_VECTOR"))
+        rotations = {"Rotation": rotation, "Rotate By": turn}
         rotation = nodes.out("FunctionNodeRotateRotation", rotations, rotation_space="GLOBAL")
         scale = nodes.scale(scale, size)
     splats = nodes.out("GeometryNodeSetPosition", {"Geometry": splats, "Position": xyz})
@@ -97,8 +87,7 @@ def _frame_scale(nodes: Nodes, size: Any, convention: str) -> Any:
 
 
 def _stga_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
-    """Centroid; axes [n(p0−o), ·, normal]; the triangle's area (its ratio to the neutral area is
-    the square of k)."""
+    """Centroid; axes [n(p0−o), ·, normal]; the triangle's area."""
     origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
     edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
     # p0 − origin from the edges: exactly zero where the corners coincide, which a difference to a
@@ -109,8 +98,7 @@ def _stga_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]
 
 
 def _gaussian_avatars_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
-    """Centroid; axes [n(p1−p0), normal, ·]; mean of the first edge's length and the height over
-    it."""
+    """Centroid; axes [n(p1−p0), normal, ·]; mean of the first edge and the height over it."""
     origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
     edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
     rotation, normal, no_edge = _axes_to_rotation(nodes, edge, edge, side, "Y")
@@ -137,50 +125,39 @@ def _axes_to_rotation(
     `first` is degenerate.
     """
     normal = nodes.vector("CROSS_PRODUCT", edge, side)
-    lengths = [
-        nodes.vector("LENGTH", v) for v in (edge, side, nodes.vector("SUBTRACT", edge, side))
-    ]
-    longest = nodes.math("MAXIMUM", nodes.math("MAXIMUM", lengths[0], lengths[1]), lengths[2])
-    no_first = nodes.compare(
-        "LESS_EQUAL", nodes.vector("LENGTH", first), nodes.math("MULTIPLY", longest, MIN_AREA_RATIO)
-    )
+    edges = edge, side, nodes.vector("SUBTRACT", edge, side)
+    longest = reduce(partial(nodes.math, "MAXIMUM"), [nodes.vector("LENGTH", v) for v in edges])
+    limit = nodes.math("MULTIPLY", longest, MIN_AREA_RATIO)
+    no_first = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", first), limit)
     limit = nodes.math("MULTIPLY", nodes.math("MULTIPLY", longest, longest), 2 * MIN_AREA_RATIO)
     no_normal = nodes.compare("LESS_EQUAL", nodes.vector("LENGTH", normal), limit)
     first = nodes.switch("VECTOR", no_first, nodes.vector("NORMALIZE", first), (1, 0, 0))
     z = nodes.math("ABSOLUTE", nodes.vector("DOT_PRODUCT", first, (0, 0, 1)))
-    helper = nodes.switch(
-        "VECTOR", nodes.compare("GREATER_THAN", z, UPRIGHT_COSINE), (0, 0, 1), (1, 0, 0)
-    )
+    is_upright = nodes.compare("GREATER_THAN", z, UPRIGHT_COSINE)
+    helper = nodes.switch("VECTOR", is_upright, (0, 0, 1), (1, 0, 0))
     second = nodes.vector("CROSS_PRODUCT", first, helper)
     second = nodes.switch("VECTOR", no_normal, nodes.vector("NORMALIZE", normal), second)
     axes = {"Primary Axis": first, "Secondary Axis": second}
-    rotation = nodes.out(
-        "FunctionNodeAxesToRotation", axes, primary_axis="X", secondary_axis=normal_axis
-    )
-    return rotation, normal, no_first
+    names = {"primary_axis": "X", "secondary_axis": normal_axis}
+    return nodes.out("FunctionNodeAxesToRotation", axes, **names), normal, no_first
+
+
+def _meshes(name: str, build: Callable[..., Any], *inputs: str) -> NodeGroup:
+    """A group from geometries to a geometry."""
+    return NodeGroup(f"STGA {name}", dict.fromkeys(inputs, "Geometry"), "Geometry", build)
 
 
 FRAMES = {
-    convention: NodeGroup(
-        f"STGA Triangle Frames ({convention})",
-        {"Mesh": "Geometry"},
-        "Geometry",
-        partial(_stored_frames, convention),
-    )
-    for convention in _FRAMES
+    name: _meshes(f"Triangle Frames ({name})", partial(_stored_frames, name), "Mesh")
+    for name in _FRAMES
 }
 """Head mesh -> the mesh with frames, by convention."""
 PLACED: dict[str | None, NodeGroup] = {
-    convention: NodeGroup(
-        f"STGA Place Splats ({convention or 'world'})",
-        {"Splats": "Geometry"} | ({"Frames": "Geometry"} if convention else {}),
-        "Geometry",
-        partial(_placed_splats, convention),
-    )
-    for convention in (None, *_FRAMES)
+    name: _meshes(f"Place Splats ({name})", partial(_placed_splats, name), "Splats", "Frames")
+    for name in _FRAMES
 }
-"""Splats (and the mesh with frames) -> splats in object space, by convention; None for world
-space."""
+PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "Splats")
+"""Splats (and the mesh with frames) -> splats in object space; None: in world space."""
 
 
 SMOOTHED_STRAIN = "stga_smoothed_strain"
@@ -190,65 +167,55 @@ _GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
 
 
 def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
-    """The neutral mesh moved to the posed vertices, with each face's deformation tensor
-    (`avatar.strain`) stored."""
+    """The neutral mesh at the posed vertices, with deformation tensors (`avatar.strain`)."""
     position, index = nodes.out("GeometryNodeInputPosition"), nodes.out("GeometryNodeInputIndex")
     moved = nodes.sample(posed, position, index, "FLOAT_VECTOR", "POINT")
     mesh = nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
     p0, p1, p2 = nodes.triangle_corners()
     e1, e2 = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
-    gram = nodes.combine(
-        *(nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2)))
-    )
-    change = nodes.vector("SUBTRACT", gram, nodes.attribute(GRAM, "FLOAT_VECTOR"))
+    products = (nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2)))
+    rest = nodes.attribute(GRAM, "FLOAT_VECTOR")
+    change = nodes.vector("SUBTRACT", nodes.combine(*products), rest)
     mesh = nodes.store(mesh, _GRAM_CHANGE, change, "FLOAT_VECTOR", "FACE")
     changes = nodes.components(nodes.attribute(_GRAM_CHANGE, "FLOAT_VECTOR"))
     for half in TENSOR_HALVES:
-        columns = (
-            nodes.attribute(TENSOR.format(k, half), "FLOAT_VECTOR")
-            for k in range(STRAIN_COMPONENTS)
-        )
-        tensor = nodes.sum(
-            *(nodes.scale(column, by) for column, by in zip(columns, changes, strict=True))
-        )
+        tensor = _weighted(nodes, [TENSOR.format(k, half) for k in range(3)], changes)
         mesh = nodes.store(mesh, half, tensor, "FLOAT_VECTOR", "FACE")
     return mesh
 
 
+def _weighted(nodes: Nodes, names: Iterable[str], factors: Iterable[Any]) -> Any:
+    """Sum of vector attributes times numbers."""
+    vectors = (nodes.attribute(name, "FLOAT_VECTOR") for name in names)
+    return nodes.sum(*(nodes.scale(v, by) for v, by in zip(vectors, factors, strict=True)))
+
+
 def _strained(nodes: Nodes, mesh: Any) -> Any:
-    """The mesh with each triangle's strain (`avatar.strain.face_strain`) stored; mesh: from
-    `_deformed`."""
+    """The mesh from `_deformed` with triangles' strain (`avatar.strain.face_strain`) stored."""
     # Faces to points and back: the mean over the triangles that touch a triangle.
-    means = [
-        nodes.on_domain(nodes.attribute(half, "FLOAT_VECTOR"), "FLOAT_VECTOR", "POINT")
-        for half in TENSOR_HALVES
-    ]
+    tensors = [nodes.attribute(half, "FLOAT_VECTOR") for half in TENSOR_HALVES]
+    means = [nodes.on_domain(tensor, "FLOAT_VECTOR", "POINT") for tensor in tensors]
     strains = []
     for index in range(STRAIN_COMPONENTS):
-        plane = (
-            nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR") for half in TENSOR_HALVES
-        )
-        products = [
-            nodes.vector("DOT_PRODUCT", mean, part) for mean, part in zip(means, plane, strict=True)
-        ]
+        products = []
+        for half, mean in zip(TENSOR_HALVES, means, strict=True):
+            plane = nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR")
+            products.append(nodes.vector("DOT_PRODUCT", mean, plane))
         strains.append(nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN))
-    return nodes.store(
-        mesh, _STRAIN, _in_range(nodes, nodes.combine(*strains)), "FLOAT_VECTOR", "FACE"
-    )
+    strain = _in_range(nodes, nodes.combine(*strains))
+    return nodes.store(mesh, _STRAIN, strain, "FLOAT_VECTOR", "FACE")
 
 
 def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
     """Strain of each splat's triangle as a vector; mesh: from `_strained`."""
-    return nodes.sample(
-        mesh, nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT"), "FLOAT_VECTOR"
-    )
+    strain, face = nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT")
+    return nodes.sample(mesh, strain, face, "FLOAT_VECTOR")
 
 
 def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
     """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
-    change = nodes.vector(
-        "SUBTRACT", nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0))
-    )
+    strain, rest = nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0))
+    change = nodes.vector("SUBTRACT", strain, rest)
     # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge
     # with it.
     inputs = {"Value": change, "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}
@@ -261,14 +228,10 @@ def _in_range(nodes: Nodes, strain: Any) -> Any:
     return nodes.vector("MAXIMUM", nodes.vector("MINIMUM", strain, highest), lowest)
 
 
-DEFORMED = NodeGroup(
-    "STGA Triangle Deformation", {"Posed": "Geometry", "Neutral": "Geometry"}, "Geometry", _deformed
-)
-STRAIN = NodeGroup("STGA Triangle Strain", {"Deformed": "Geometry"}, "Geometry", _strained)
+DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
+STRAIN = _meshes("Triangle Strain", _strained, "Deformed")
 SAMPLED_STRAIN = NodeGroup("STGA Sampled Strain", {"Strain": "Geometry"}, "Vector", _sampled_strain)
-SMOOTHED = NodeGroup(
-    "STGA Smoothed Strain", {"Strain": "Geometry"}, "Geometry", _with_smoothed_strain
-)
+SMOOTHED = _meshes("Smoothed Strain", _with_smoothed_strain, "Strain")
 
 
 class SignalNodes(NamedTuple):
@@ -296,17 +259,11 @@ def displayed_offsets(names: Collection[str]) -> tuple[str, ...]:
 @cache
 def shifted(offset: str, convention: str) -> NodeGroup:
     """The group that moves frames by an offset: a mesh from STRAIN with FRAMES to the same mesh."""
-    name = f"STGA Driven Offset ({SIGNALS[offset].label}, {convention})"
-    return NodeGroup(
-        name, {"Frames": "Geometry"}, "Geometry", partial(_shifted, offset, convention)
-    )
 
+    def build(nodes: Nodes, mesh: Any) -> Any:
+        mesh = nodes.group(SIGNALS[offset].group, mesh)
+        signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute, "FLOAT_VECTOR"))
+        names = [DRIVEN_OFFSET.format(offset, index) for index in range(len(signal))]
+        return shifted_frames(nodes, mesh, _weighted(nodes, names, signal), convention)
 
-def _shifted(offset: str, convention: str, nodes: Nodes, mesh: Any) -> Any:
-    mesh = nodes.group(SIGNALS[offset].group, mesh)
-    signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute, "FLOAT_VECTOR"))
-    terms = (
-        nodes.scale(nodes.attribute(DRIVEN_OFFSET.format(offset, index), "FLOAT_VECTOR"), factor)
-        for index, factor in enumerate(signal)
-    )
-    return shifted_frames(nodes, mesh, nodes.sum(*terms), convention)
+    return _meshes(f"Driven Offset ({SIGNALS[offset].label}, {convention})", build, "Frames")

@@ -1,5 +1,4 @@
-"""How often each triangle is selected, or how far the avatar is from the images there, as colors on
-the head."""
+"""Shares of selection, or errors of the avatar, by triangle as colors on the head."""
 
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from ..arrays import flat_floats
 from .node_builder import Nodes, new_material
-from .splat_attributes import write_attributes
+from .splat_attributes import with_alpha, write_attributes
 
 SHARE = "stga_selected_share"  # on faces: fraction of the frames that select them
 RESIDUAL = "stga_residual"  # on faces: mean absolute error (0…1) of what their splats show
@@ -36,19 +35,25 @@ def show_heat_map(
     RESIDUAL, in which the values are stored.
     """
     hide_heat_map(head)
-    scaled = np.minimum(
-        values / max(values.max(initial=0.0) if largest is None else largest, 1e-9), 1.0
-    )
+    whole = values.max(initial=0.0) if largest is None else largest
+    scaled = np.minimum(values / max(whole, 1e-9), 1.0)
     channels = [np.interp(scaled, STOPS, channel) for channel in zip(*COLORS, strict=True)]
-    colors = np.column_stack([*channels, np.ones(len(values))])
+    colors = flat_floats(np.repeat(with_alpha(np.column_stack(channels)), 3, axis=0))
     write_attributes(head.data, {attribute: ("FLOAT", "value", flat_floats(values))}, "FACE")
-    write_attributes(
-        head.data,
-        {HEAT: ("FLOAT_COLOR", "color", flat_floats(np.repeat(colors, 3, axis=0)))},
-        "CORNER",
-    )
+    write_attributes(head.data, {HEAT: ("FLOAT_COLOR", "color", colors)}, "CORNER")
     head.data.attributes.active_color_name = HEAT
-    head.modifiers.new(MODIFIER, "NODES").node_group = _node_group()
+    tree = bpy.data.node_groups.get(MODIFIER)
+    if tree is None:  # it assigns the heat map's material
+        tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
+        tree.is_modifier = True
+        for side in ("INPUT", "OUTPUT"):
+            tree.interface.new_socket("Geometry", in_out=side, socket_type="NodeSocketGeometry")
+        nodes = Nodes(tree)
+        inputs = {"Geometry": nodes.out("NodeGroupInput")}
+        inputs["Material"] = new_material(MODIFIER, _unlit)
+        colored = nodes.out("GeometryNodeSetMaterial", inputs)
+        nodes.finish("NodeGroupOutput", {"Geometry": colored})
+    head.modifiers.new(MODIFIER, "NODES").node_group = tree
 
 
 def hide_heat_map(head: Any) -> None:
@@ -66,21 +71,6 @@ def has_heat_map(head: Any) -> bool:
 
 def shows_residuals(head: Any) -> bool:
     return has_heat_map(head) and RESIDUAL in head.data.attributes
-
-
-def _node_group() -> Any:
-    """Assigns the heat map's material; built where the file has none."""
-    if MODIFIER in bpy.data.node_groups:
-        return bpy.data.node_groups[MODIFIER]
-    tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
-    tree.is_modifier = True
-    for direction in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
-    nodes = Nodes(tree)
-    geometry, material = nodes.out("NodeGroupInput"), new_material(MODIFIER, _unlit)
-    colored = nodes.out("GeometryNodeSetMaterial", {"Geometry": geometry, "Material": material})
-    nodes.finish("NodeGroupOutput", {"Geometry": colored})
-    return tree
 
 
 def _unlit(nodes: Nodes) -> Any:

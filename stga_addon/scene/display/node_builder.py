@@ -1,8 +1,9 @@
-"""Building node trees: short names for adding nodes, node groups that are built once per file, new
-materials."""
+"""Node trees: short names for adding nodes, groups built once per file, new materials."""
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial, reduce
 from typing import Any
 
 import bpy
@@ -22,14 +23,11 @@ def new_tree(name: str) -> bpy.types.NodeTree:
 
 
 def find_tree(name: str) -> bpy.types.NodeTree | None:
-    """The tree of this name made by this version of the add-on, or None: those of other versions
-    are not reused."""
-    trees = (
-        tree
-        for tree in bpy.data.node_groups
-        if tree.name.startswith(name) and tree.get(_VERSION) == __version__
-    )
-    return next(trees, None)
+    """The tree of this name made by this version of the add-on, or None."""
+    for tree in bpy.data.node_groups:
+        if tree.name.startswith(name) and tree.get(_VERSION) == __version__:
+            return tree
+    return None
 
 
 def is_splat_tree(tree: bpy.types.NodeTree) -> bool:
@@ -64,11 +62,9 @@ class NodeGroup:
         if (existing := find_tree(f".{self.name}")) is not None:
             return existing
         tree = new_tree(f".{self.name}")
-        tree.interface.new_socket(
-            self.output, in_out="OUTPUT", socket_type=f"NodeSocket{self.output}"
-        )
-        for name, kind in self.inputs.items():
-            tree.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}")
+        sockets = [(self.output, "OUTPUT", self.output)]
+        for name, side, kind in sockets + [(n, "INPUT", k) for n, k in self.inputs.items()]:
+            tree.interface.new_socket(name, in_out=side, socket_type=f"NodeSocket{kind}")
         nodes = Nodes(tree)
         inputs = nodes.add("NodeGroupInput").outputs
         result = self.build(nodes, *(inputs[name] for name in self.inputs))
@@ -87,8 +83,7 @@ def new_material(name: str, build: Callable[["Nodes"], bpy.types.NodeSocket]) ->
 
 
 class Nodes:
-    """Adds nodes to a tree; methods named after what a node computes return its first enabled
-    output socket."""
+    """Adds nodes to a tree; most methods return the first enabled output of the node they name."""
 
     def __init__(self, tree: bpy.types.NodeTree) -> None:
         self.tree = tree
@@ -105,13 +100,9 @@ class Nodes:
         for name, value in properties.items():
             setattr(node, name, value)
         for name, values in (inputs or {}).items():
-            sockets = [
-                socket
-                for socket in node.inputs
-                if socket.enabled and name in (socket.name, socket.identifier)
-            ]
+            named = [s for s in node.inputs if s.enabled and name in (s.name, s.identifier)]
             values = values if isinstance(values, list) else [values]
-            for socket, value in zip(sockets, values, strict=True):
+            for socket, value in zip(named, values, strict=True):
                 if isinstance(value, bpy.types.NodeSocket):
                     self.tree.links.new(value, socket)
                 else:
@@ -119,8 +110,24 @@ class Nodes:
         return node
 
     def finish(self, kind: str, inputs: Mapping[str, Any]) -> None:
-        """Add the tree's output node and arrange all nodes in columns, from input to output."""
-        _arrange(self.tree, self.add(kind, inputs))
+        """Add the tree's output node and arrange all nodes in columns, by links to it."""
+        output, sources = self.add(kind, inputs), defaultdict[str, list[Any]](list)
+        for link in self.tree.links:
+            sources[link.to_node.name].append(link.from_node)
+        columns: dict[str, int] = {}
+        waiting = [(output, 0)]
+        while waiting:
+            node, column = waiting.pop()
+            if columns.get(node.name, -1) < column:
+                columns[node.name] = column
+                waiting += [(source, column + 1) for source in sources[node.name]]
+        rows, locations = Counter[int](), list[float]()
+        for node in self.tree.nodes:
+            column = columns.get(node.name, 0)
+            locations += (-_COLUMN_WIDTH * column, -_ROW_HEIGHT * rows[column])
+            rows[column] += 1
+        # one by one, each would update the whole tree
+        self.tree.nodes.foreach_set("location", locations)
 
     def out(
         self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any
@@ -140,15 +147,11 @@ class Nodes:
         return self.out("ShaderNodeVectorMath", {"Vector": list(values)}, operation=operation)
 
     def sum(self, *vectors: Any) -> bpy.types.NodeSocket:
-        total = vectors[0]
-        for vector in vectors[1:]:
-            total = self.vector("ADD", total, vector)
-        return total
+        return reduce(partial(self.vector, "ADD"), vectors)
 
     def scale(self, vector: Any, factor: Any) -> bpy.types.NodeSocket:
-        return self.out(
-            "ShaderNodeVectorMath", {"Vector": vector, "Scale": factor}, operation="SCALE"
-        )
+        inputs = {"Vector": vector, "Scale": factor}
+        return self.out("ShaderNodeVectorMath", inputs, operation="SCALE")
 
     def components(self, vector: Any) -> list[bpy.types.NodeSocket]:
         return list(self.add("ShaderNodeSeparateXYZ", {"Vector": vector}).outputs)
@@ -157,30 +160,30 @@ class Nodes:
         return self.out("ShaderNodeCombineXYZ", {"X": x, "Y": y, "Z": z})
 
     def compare(self, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
-        return self.out(
-            "FunctionNodeCompare", {"A": a, "B": b}, data_type="FLOAT", operation=operation
-        )
+        kind = {"data_type": "FLOAT", "operation": operation}
+        return self.out("FunctionNodeCompare", {"A": a, "B": b}, **kind)
 
     def logic(self, operation: str, a: Any, b: Any) -> bpy.types.NodeSocket:
         return self.out("FunctionNodeBooleanMath", {"Boolean": [a, b]}, operation=operation)
 
     def switch(self, kind: str, condition: Any, false: Any, true: Any) -> bpy.types.NodeSocket:
-        return self.out(
-            "GeometryNodeSwitch",
-            {"Switch": condition, "False": false, "True": true},
-            input_type=kind,
-        )
+        inputs = {"Switch": condition, "False": false, "True": true}
+        return self.out("GeometryNodeSwitch", inputs, input_type=kind)
 
     def attribute(self, name: Any, data_type: str) -> bpy.types.NodeSocket:
-        return self.out("GeometryNodeInputNamedAttribute", {"Name": name}, data_type=data_type)
+        return self.attribute_if_any(name, data_type)[0]
+
+    def attribute_if_any(self, name: Any, data_type: str) -> list[bpy.types.NodeSocket]:
+        """The attribute, and whether it is there."""
+        kind = "GeometryNodeInputNamedAttribute"
+        node = self.add(kind, {"Name": name}, data_type=data_type)
+        return [socket for socket in node.outputs if socket.enabled]
 
     def store(
         self, geometry: Any, name: str, value: Any, data_type: str, domain: str = "POINT"
     ) -> Any:
-        inputs = {"Geometry": geometry, "Name": name, "Value": value}
-        return self.out(
-            "GeometryNodeStoreNamedAttribute", inputs, data_type=data_type, domain=domain
-        )
+        inputs, kind = {"Geometry": geometry, "Name": name, "Value": value}, {"domain": domain}
+        return self.out("GeometryNodeStoreNamedAttribute", inputs, data_type=data_type, **kind)
 
     def sample(
         self, geometry: Any, value: Any, index: Any, data_type: str, domain: str = "FACE"
@@ -189,51 +192,21 @@ class Nodes:
         return self.out("GeometryNodeSampleIndex", inputs, data_type=data_type, domain=domain)
 
     def on_domain(self, value: Any, data_type: str, domain: str) -> bpy.types.NodeSocket:
-        """A field interpolated to another domain: faces to points and back are means of the
-        touching elements."""
-        return self.out(
-            "GeometryNodeFieldOnDomain", {"Value": value}, data_type=data_type, domain=domain
-        )
+        """A field interpolated to another domain: means of the touching elements."""
+        kind = {"data_type": data_type, "domain": domain}
+        return self.out("GeometryNodeFieldOnDomain", {"Value": value}, **kind)
 
     def triangle_corners(self) -> list[bpy.types.NodeSocket]:
-        """Positions of the three corners of each face, in the order in which it lists its
-        vertices."""
+        """Positions of each face's three corners, in the order of its vertices."""
         position, found = self.out("GeometryNodeInputPosition"), []
+        kind = {"data_type": "FLOAT_VECTOR", "domain": "POINT"}
         for number in range(3):
             corner = self.out("GeometryNodeCornersOfFace", {"Sort Index": number})
             point = self.out("GeometryNodeVertexOfCorner", {"Corner Index": corner})
             inputs = {"Index": point, "Value": position}
-            found.append(
-                self.out(
-                    "GeometryNodeFieldAtIndex", inputs, data_type="FLOAT_VECTOR", domain="POINT"
-                )
-            )
+            found.append(self.out("GeometryNodeFieldAtIndex", inputs, **kind))
         return found
 
     def object_info(self, obj: Any, space: str = "RELATIVE") -> bpy.types.Node:
-        """Object Info: "RELATIVE" gives geometry and location in the space of the object that has
-        the modifier."""
+        """Object Info; "RELATIVE": in the space of the object that has the modifier."""
         return self.add("GeometryNodeObjectInfo", {"Object": obj}, transform_space=space)
-
-
-def _arrange(tree: bpy.types.NodeTree, output: bpy.types.Node) -> None:
-    """Columns by the number of links to the output node, for a person who opens the tree."""
-    sources: dict[str, list[bpy.types.Node]] = {}
-    for link in tree.links:
-        sources.setdefault(link.to_node.name, []).append(link.from_node)
-    columns: dict[str, int] = {}
-
-    def place(node: bpy.types.Node, column: int) -> None:
-        if columns.get(node.name, -1) < column:
-            columns[node.name] = column
-            for source in sources.get(node.name, ()):
-                place(source, column + 1)
-
-    place(output, 0)
-    rows: dict[int, int] = {}
-    locations: list[float] = []
-    for node in tree.nodes:
-        column = columns.get(node.name, 0)
-        row = rows[column] = rows.get(column, -1) + 1
-        locations += (-_COLUMN_WIDTH * column, -_ROW_HEIGHT * row)
-    tree.nodes.foreach_set("location", locations)  # one by one, each would update the whole tree

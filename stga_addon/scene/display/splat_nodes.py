@@ -12,15 +12,18 @@ from ...capture.meshes import SELECTED_WEIGHT
 from .. import tags
 from ..compat import NATIVE_SPLATS
 from ..layers import FROZEN_COLOR
-from .color_nodes import (
+from .display_modes import (
+    AS_TRAINED,
+    DISPLAY_COLOR,
     LINEAR_TO_SRGB,
+    MODES,
+    NATIVE_GROUPS,
     SH_BANDS,
     SRGB_TO_LINEAR,
     constant_color,
+    displayed,
     view_color,
-    view_direction,
-)
-from .display_modes import AS_TRAINED, DISPLAY_COLOR, MODES, NATIVE_GROUPS, displayed
+)  # fmt: skip
 from .frame_nodes import DEFORMED, FRAMES, PLACED, SAMPLED_STRAIN, SIGNALS, STRAIN, shifted
 from .node_builder import NodeGroup, Nodes, find_tree, new_tree
 from .splat_attributes import COLOR, FACE, OPACITY, RELIT_COLOR
@@ -55,15 +58,11 @@ class TreeOptions(NamedTuple):
 
     @property
     def tree_name(self) -> str:
-        """At most 59 characters: Blender before 5.0 has room for 63, and adds ".001" to a name that
-        is taken."""
-        driven = [
-            *(["color"] if self.strain_color else []),
-            *(SIGNALS[name].label for name in self.offsets),
-        ]
-        return (
-            f"STGA Splats ({', '.join([self.convention or 'world', f'SH {self.degree}', *driven])})"
-        )
+        """At most 59 characters: Blender before 5.0 has room for 63, and may add ".001"."""
+        parts = [self.convention or "world", f"SH {self.degree}"]
+        parts += ["color"] if self.strain_color else []
+        parts += [SIGNALS[name].label for name in self.offsets]
+        return f"STGA Splats ({', '.join(parts)})"
 
 
 def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
@@ -90,17 +89,8 @@ def build_next_node_group(options: TreeOptions) -> bool:
     """
     if find_splat_tree(options) is not None:
         return False
-    missing = next((group for group in _node_groups(options) if not group.exists()), None)
-    if missing is not None:
-        missing.tree()
-    else:
-        splat_tree(options)
-    return True
-
-
-def _node_groups(options: TreeOptions) -> list[NodeGroup]:
-    """The groups that `_build` uses, each after those that it uses itself."""
     convention, degree, strain_color, offsets = options
+    # What `_build` uses, each after those that it uses itself.
     groups = [PLACED[convention], _RELIT, *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
         groups += [FRAMES[convention], _FROZEN_SPLATS]
@@ -112,7 +102,13 @@ def _node_groups(options: TreeOptions) -> list[NodeGroup]:
         groups += [SIGNALS[name].group, shifted(name, convention)]
     if degree > 0 or strain_color:
         groups.append(SRGB_TO_LINEAR)
-    return [*groups, LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if NATIVE_SPLATS else groups
+    groups += [LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if NATIVE_SPLATS else []
+    missing = next((group for group in groups if not group.exists()), None)
+    if missing is not None:
+        missing.tree()
+    else:
+        splat_tree(options)
+    return True
 
 
 def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:
@@ -132,37 +128,22 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
     add(SIZE, "Float", "Factor on the splats' size", default_value=1.0, min_value=0.0)
     fraction = {"default_value": 0.0, "min_value": 0.0, "max_value": 1.0}
     add(OPACITY_THRESHOLD, "Float", "Hide splats with a lower opacity", **fraction)
-    percentage = {
-        "default_value": 100.0,
-        "min_value": 0.0,
-        "max_value": 100.0,
-        "subtype": "PERCENTAGE",
-    }
-    add(PERCENTAGE, "Float", "Show only a random part of the splats", **percentage)
+    percentage = {"default_value": 100.0, "min_value": 0.0, "max_value": 100.0}
+    description = "Show only a random part of the splats"
+    add(PERCENTAGE, "Float", description, subtype="PERCENTAGE", **percentage)
     if degree > 0:
         description = "Colors as the scene's active camera sees them; off: their constant part"
         add(VIEW_DEPENDENT, "Bool", description, default_value=True)
-    if embedded:
-        add(
-            SHOW_SELECTION,
-            "Bool",
-            "Gray out splats that the current frame's selection freezes",
-            default_value=False,
-        )
-        add(
-            SELECTED_ONLY,
-            "Bool",
-            "Hide splats that the current frame's selection freezes",
-            default_value=False,
-        )
+    frozen = "splats that the current frame's selection freezes"
+    for name, verb in ((SHOW_SELECTION, "Gray out"), (SELECTED_ONLY, "Hide")) if embedded else ():
+        add(name, "Bool", f"{verb} {frozen}", default_value=False)
 
 
 def _build(nodes: Nodes, options: TreeOptions) -> None:
     inputs = nodes.add("NodeGroupInput").outputs
     splats = inputs["Geometry"]
-    opaque = nodes.compare(
-        "GREATER_EQUAL", nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD]
-    )
+    opacity, threshold = nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD]
+    opaque = nodes.compare("GREATER_EQUAL", opacity, threshold)
     # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
     random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
     visible = nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", random, inputs[PERCENTAGE]))
@@ -200,8 +181,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
 
 
 def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
-    """Scene-linear color of each splat; strain: a vector field, None where colors do not follow
-    it."""
+    """Scene-linear color of each splat; strain: a vector field, None where unused."""
     color = nodes.attribute(COLOR, "FLOAT_COLOR")
     if strain is None and degree == 0:
         return color
@@ -210,29 +190,20 @@ def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
         color = nodes.group(SRGB_TO_LINEAR, srgb)
     if degree == 0:
         return color
-    direction, has_camera = view_direction(nodes, nodes.out("GeometryNodeInputPosition"))
-    from_camera = nodes.group(SRGB_TO_LINEAR, view_color(nodes, srgb, degree, direction))
-    return nodes.switch(
-        "RGBA", nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera), color, from_camera
-    )
+    seen, has_camera = view_color(nodes, srgb, degree)
+    is_chosen = nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera)
+    return nodes.switch("RGBA", is_chosen, color, nodes.group(SRGB_TO_LINEAR, seen))
 
 
 def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
-    """Field: splats whose triangles the current frame's selection leaves out; none where the frame
-    has no selection."""
-    frame = nodes.out(
-        "FunctionNodeValueToString",
-        {"Value": nodes.add("GeometryNodeInputSceneTime").outputs["Frame"]},
-    )
-    name = nodes.out(
-        "FunctionNodeReplaceString",
-        {"String": f"{tags.GROUP_PREFIX}#", "Find": "#", "Replace": frame},
-    )
-    group = nodes.add("GeometryNodeInputNamedAttribute", {"Name": name}, data_type="FLOAT")
-    weight, exists = (socket for socket in group.outputs if socket.enabled)
+    """Field: splats on triangles that the frame's selection, if there is one, leaves out."""
+    time = nodes.add("GeometryNodeInputSceneTime").outputs["Frame"]
+    frame = nodes.out("FunctionNodeValueToString", {"Value": time})
+    parts = {"String": f"{tags.GROUP_PREFIX}#", "Find": "#", "Replace": frame}
+    name = nodes.out("FunctionNodeReplaceString", parts)
+    weight, exists = nodes.attribute_if_any(name, "FLOAT")
     selected = nodes.compare("GREATER_EQUAL", weight, SELECTED_WEIGHT)
-    # Compared on the points: a boolean interpolated to a face is true where it is true at all the
-    # face's points.
+    # On the points: a boolean is true on a face where it is true at all the face's points.
     frozen = nodes.logic("NIMPLY", exists, nodes.on_domain(selected, "BOOLEAN", "POINT"))
     return nodes.sample(mesh, frozen, nodes.attribute(FACE, "INT"), "BOOLEAN")
 
@@ -242,10 +213,7 @@ _FROZEN_SPLATS = NodeGroup("STGA Frozen Splats", {"Mesh": "Geometry"}, "Bool", _
 
 def _relit_color(nodes: Nodes, color: Any) -> bpy.types.NodeSocket:
     """Field: the relit color of a frame where the splats have one, else `color`."""
-    stored = nodes.add(
-        "GeometryNodeInputNamedAttribute", {"Name": RELIT_COLOR}, data_type="FLOAT_COLOR"
-    )
-    relit, exists = (socket for socket in stored.outputs if socket.enabled)
+    relit, exists = nodes.attribute_if_any(RELIT_COLOR, "FLOAT_COLOR")
     return nodes.switch("RGBA", exists, color, relit)
 
 

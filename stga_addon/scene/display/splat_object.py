@@ -1,5 +1,6 @@
 """Splat objects: the Blender objects that display avatars and world-space splats."""
 
+from contextlib import suppress
 from typing import Any
 from uuid import uuid4
 
@@ -30,29 +31,25 @@ from .splat_attributes import (
     write_attributes,
     write_light,
     write_splats,
-)
+)  # fmt: skip
 
 TRANSPARENT_BOUNCES = 64
 """Layers of overlapping splats that Cycles has to see through; behind its default of 8 is black."""
 
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
-    """A sentence where the view transform changes the colors of splats that EEVEE and Cycles
-    render, else None."""
-    if scene.view_settings.view_transform == "Standard":
-        return None
-    return f"View transform {scene.view_settings.view_transform} changes the splats' colors; choose Standard"
+    """A sentence where the view transform changes colors in EEVEE and Cycles, else None."""
+    name = scene.view_settings.view_transform
+    return None if name == "Standard" else f"View transform {name} changes colors; choose Standard"
 
 
 def shows_nodes(scene: bpy.types.Scene) -> bool:
-    """Whether the scene is rendered by EEVEE or Cycles, which show what geometry nodes make of
-    splats."""
+    """Whether EEVEE or Cycles renders, which show what geometry nodes make of splats."""
     return scene.render.engine == "CYCLES" or scene.render.engine.startswith("BLENDER_EEVEE")
 
 
 def use_transparent_bounces(scene: bpy.types.Scene) -> None:
-    """Let Cycles, where its add-on is enabled, see through overlapping splats without ending rays
-    between them at random; limits that are higher stay."""
+    """Let Cycles, where enabled, see through overlapping splats; higher limits stay."""
     cycles = getattr(scene, "cycles", None)
     for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
         setattr(cycles, limit, max(getattr(cycles, limit), TRANSPARENT_BOUNCES))
@@ -83,10 +80,8 @@ def show_avatar(
     local = (collection for collection in head.users_collection if collection.library is None)
     collection = next(local, bpy.context.scene.collection)
     splat_object = _splat_object(name or f"{head.name} splats", prepared.splats, collection)
-    splat_object[tags.CONVENTION], splat_object[tags.ANTIALIASED] = (
-        avatar.convention,
-        avatar.antialiased,
-    )
+    splat_object[tags.CONVENTION] = avatar.convention
+    splat_object[tags.ANTIALIASED] = avatar.antialiased
     _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
@@ -108,18 +103,21 @@ def show_world_splats(splats: Splats, name: str) -> Any:
 
 
 def can_update(splat_object: Any, avatar: Avatar) -> bool:
-    """Whether `update_splats` can show the avatar in this object: the same in all but its splats
-    and its strain."""
-    try:
-        tree, neutral = (
-            splat_modifier(splat_object).node_group,
-            get_input(splat_object, splat_nodes.NEUTRAL),
-        )
-    except StgaError:
+    """Whether the avatar differs from this object's in splats and strain only."""
+    if _stored_neutral(splat_object) is None:
         return False
     stored = splat_object.get(tags.CONVENTION), splat_object.get(tags.ANTIALIASED)
-    same = stored == (avatar.convention, avatar.antialiased) and neutral is not None
-    return same and tree == splat_nodes.find_splat_tree(_tree_options(avatar))
+    tree = splat_nodes.find_splat_tree(_tree_options(avatar))
+    is_same = stored == (avatar.convention, avatar.antialiased)
+    return is_same and splat_modifier(splat_object).node_group == tree
+
+
+def _stored_neutral(splat_object: Any) -> Any:
+    """The neutral mesh; None for splats without one, or an object without a modifier."""
+    with suppress(StgaError):
+        neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+        return None if neutral is None else neutral.data
+    return None
 
 
 def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
@@ -133,47 +131,40 @@ def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
 
 def store_light(splat_object: Any, avatar: Avatar) -> bool:
     """Give the object the light of the same avatar; False where it shows another one."""
-    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
-    if neutral is None or not has_triangles(neutral.data, avatar.faces):
+    neutral = _stored_neutral(splat_object)
+    if neutral is None or not has_triangles(neutral, avatar.faces):
         return False
     if len(splat_object.data.vertices) != len(avatar.splats):
         return False
-    write_light(neutral.data, avatar.light)
+    write_light(neutral, avatar.light)
     splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
     return True
 
 
 def stored_light(splat_object: Any) -> AvatarLight | None:
-    """The light of the object's avatar; None where it does not know that, or has lost its
-    modifier."""
-    try:
-        neutral = get_input(splat_object, splat_nodes.NEUTRAL)
-    except StgaError:
-        return None
-    return None if neutral is None else read_light(neutral.data)
+    """The light of the object's avatar; None without one, or without a modifier."""
+    neutral = _stored_neutral(splat_object)
+    return None if neutral is None else read_light(neutral)
 
 
 def build_next_node_group(avatar: Avatar) -> bool:
-    """Build one of the node groups that `show_avatar` needs; returns False if all exist (see
-    `splat_nodes`)."""
+    """Build one node group that `show_avatar` needs; False if all exist (see `splat_nodes`)."""
     return splat_nodes.build_next_node_group(_tree_options(avatar))
 
 
 def check_head(avatar: Avatar, head: Any) -> None:
-    """Raise StgaError unless `head` is a mesh object with the avatar's triangles, in their
-    order."""
+    """Raise StgaError unless `head` is a mesh object with just the avatar's triangles."""
     if head is None or head.type != "MESH":
         raise StgaError("head: expected a mesh object that the avatar's splats can follow")
     if not has_triangles(head.data, avatar.faces):
         raise StgaError(
-            f"head {head.name}: the avatar was trained on {len(avatar.faces)} triangles of another mesh, "
-            f"this one has {len(head.data.polygons)} faces, or the same in another order"
+            f"head {head.name}: the avatar was trained on {len(avatar.faces)} triangles of "
+            f"another mesh, this one has {len(head.data.polygons)} faces, or another order"
         )
 
 
 def hide_object(obj: Any, scene: Any) -> None:
-    """Hide an object, such as a head that would cover its splats; a linked one stays visible in
-    renders."""
+    """Hide an object, such as a head that covers its splats; linked ones still render."""
     if obj.library is None:
         obj.hide_render = True
     for layer in scene.view_layers:
@@ -182,14 +173,10 @@ def hide_object(obj: Any, scene: Any) -> None:
 
 
 def splat_modifier(splat_object: Any) -> Any:
-    """The geometry nodes modifier that displays the splats. Raises StgaError where the object has
-    none."""
+    """The geometry nodes modifier that shows the splats. Raises StgaError without one."""
     for modifier in splat_object.modifiers if splat_object is not None else ():
-        if (
-            modifier.type == "NODES"
-            and modifier.node_group is not None
-            and is_splat_tree(modifier.node_group)
-        ):
+        tree = modifier.node_group if modifier.type == "NODES" else None
+        if tree is not None and is_splat_tree(tree):
             return modifier
     raise StgaError(f"{getattr(splat_object, 'name', None)}: is not an object that shows splats")
 
@@ -214,24 +201,22 @@ def get_input(splat_object: Any, name: str) -> Any:
 
 
 def input_identifier(modifier: Any, name: str) -> str | None:
-    """Identifier ("Socket_2") of a modifier's input by its displayed name; None where it has no
-    such input."""
-    items = modifier.node_group.interface.items_tree
-    return next(
-        (item.identifier for item in items if item.in_out == "INPUT" and item.name == name), None
-    )
+    """Identifier ("Socket_2") of a modifier's input by its displayed name, or None."""
+    for item in modifier.node_group.interface.items_tree:
+        if item.in_out == "INPUT" and item.name == name:
+            return str(item.identifier)
+    return None
 
 
 def display_mode(splat_object: Any) -> str:
     """The display mode that is chosen for a splat object, one of `display_modes`."""
     modifier = splat_modifier(splat_object)
     identifier = input_identifier(modifier, splat_nodes.DISPLAY)
-    return "" if identifier is None else modifier_menu(modifier, identifier)
+    return modifier_menu(modifier, identifier) if identifier else ""
 
 
 def display_settings(modifier: Any) -> DisplaySettings:
-    """The display settings of a splat object, by its `splat_modifier`; defaults for those that its
-    splats lack."""
+    """The settings by a `splat_modifier`; defaults for those that its splats lack."""
     chosen = {
         SETTING_NAMES[item.name]: modifier_input(modifier, item.identifier)
         for item in modifier.node_group.interface.items_tree
@@ -241,20 +226,20 @@ def display_settings(modifier: Any) -> DisplaySettings:
 
 
 def stored_avatar(splat_object: Any) -> Avatar:
-    """The avatar that `show_avatar` made a splat object of, with unit rotations and without
-    regions."""
-    neutral = get_input(splat_object, splat_nodes.NEUTRAL)
+    """The avatar of `show_avatar`, with unit rotations and without regions."""
+    splat_modifier(splat_object)
+    neutral = _stored_neutral(splat_object)
     if neutral is None:
         raise StgaError(f"{splat_object.name}: its neutral mesh is missing; show the avatar again")
     return Avatar(
         splats=read_splats(splat_object.data),
         convention=splat_object[tags.CONVENTION],
-        neutral=mesh_vertices(neutral.data),
-        faces=mesh_triangles(neutral.data),
+        neutral=mesh_vertices(neutral),
+        faces=mesh_triangles(neutral),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
-        strain_range=read_vectors(neutral.data, RANGE),
-        driven_offsets=read_driven_offsets(neutral.data),
-        light=read_light(neutral.data),
+        strain_range=read_vectors(neutral, RANGE),
+        driven_offsets=read_driven_offsets(neutral),
+        light=read_light(neutral),
     )
 
 
@@ -274,11 +259,8 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
     depsgraph = bpy.context.evaluated_depsgraph_get()
     for instance in depsgraph.object_instances:
         owner = instance.parent if instance.is_instance else instance.object
-        if (
-            owner is not None
-            and owner.original == splat_object
-            and instance.object.type == "POINTCLOUD"
-        ):
+        is_own = owner is not None and owner.original == splat_object
+        if is_own and instance.object.type == "POINTCLOUD":
             attributes = instance.object.data.attributes
             return (
                 read_values(attributes["position"].data, "vector", 3),

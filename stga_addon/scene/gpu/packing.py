@@ -17,7 +17,7 @@ from ...errors import StgaError
 from ...flame.quaternions import normalized, to_matrices
 from ...light.harmonics import GLOSSY
 from ...light.lamps import LightView, head_bounds, light_rows, light_view, texel_meters
-from ...light.relight import Kept, Relighter
+from ...light.relight import Relighter
 from ..layers import Relit, SceneLayer, random_percentage
 
 NEAR_M = 0.01
@@ -31,8 +31,7 @@ MAX_INDEX = 1 << 24
 MAX_SHORT_KEY, MAX_LONG_KEY = (1 << 16) - 1, (1 << 24) - (1 << 8)
 """Largest sort keys: of 16 bits, and of 24, as many as float32 has, less what rounding may add."""
 MAX_RELATIVE_STEP = 1e-5
-"""Largest step of depth from one short key to the next, as a share of the nearest splat's depth: 5
-µm at 0.5 m."""
+"""Largest step of depth between short keys as a share of the nearest depth: 5 µm at 0.5 m."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,7 @@ class StaticSplats:
             begin, first_face = rows.stop, first_face + len(layer.frames.origin)
             first_color += len(colors[-1])
         if max(first_color, 3 * count, 4 * first_face) > MAX_INDEX:
-            raise StgaError(
-                f"{count} splats with their colors are too many to display as trained; choose Points"
-            )
+            raise StgaError(f"{count} splats are too many to display as trained; choose Points")
         centers[:, 3] = self.face
         self.positions = np.ascontiguousarray(centers[:, :3].T)
         self.texels = {
@@ -91,8 +88,7 @@ class StaticSplats:
 
 
 def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
-    """What a `StaticSplats` of these layers was made of; valid while it keeps the layers' splats
-    alive."""
+    """What tells a `StaticSplats` of these layers, as long as their splats are alive."""
     return tuple((id(layer.splats), len(layer.frames.origin)) for layer in layers)
 
 
@@ -103,7 +99,7 @@ def _axes(splats: Splats, layer: int) -> np.ndarray:
     deviation = np.exp(splats.log_scale.astype(np.float64))
     axes[..., :3] = np.swapaxes(to_matrices(normalized(splats.rotation)) * deviation[:, None], 1, 2)
     with np.errstate(over="ignore"):
-        axes[:, 0, 3] = 1 / (1 + np.exp(-splats.opacity.astype(np.float64)))
+        axes[:, 0, 3] = splats.opacities()
     axes[:, 1, 3] = random_percentage(len(splats))
     axes[:, 2, 3] = layer
     return axes
@@ -139,25 +135,21 @@ def posed_frames(
 ) -> PosedFrames:
     """Compose `frame_block` of each layer with its object and the camera, in float64."""
     count = sum(len(layer.frames.origin) for layer in layers)
-    texels, depth_rows, base = (
-        np.zeros((4, count, 4), np.float32),
-        np.empty((4, count), np.float32),
-        None,
-    )
-    begin = 0
+    texels, depth_rows = np.zeros((4, count, 4), np.float32), np.empty((4, count), np.float32)
+    begin, base = 0, 0.0
     for layer, block in zip(layers, blocks, strict=True):
         to_camera = view.camera.world_to_camera @ layer.to_world
-        end = begin + len(layer.frames.origin)
+        rows = slice(begin, begin + len(layer.frames.origin))
         part = (to_camera[:3, :3] @ block).reshape(3, -1, 4)
         part[..., 3] += to_camera[:3, 3:]
-        texels[:3, begin:end] = part
-        base = float(part[2, 0, 3]) if base is None else base
+        texels[:3, rows] = part
+        base = base if begin else float(part[2, 0, 3])
         part[2, :, 3] -= base
-        depth_rows[:, begin:end] = part[2].T
-        texels[3, begin:end, : layer.frames.strain.shape[1]] = layer.frames.strain
-        texels[3, begin:end, 3] = 0 if layer.frozen is None else layer.frozen
-        begin = end
-    return PosedFrames(texels, depth_rows, base or 0.0)
+        depth_rows[:, rows] = part[2].T
+        texels[3, rows, : layer.frames.strain.shape[1]] = layer.frames.strain
+        texels[3, rows, 3] = 0 if layer.frozen is None else layer.frozen
+        begin = rows.stop
+    return PosedFrames(texels, depth_rows, base)
 
 
 def drawing_order(
@@ -168,7 +160,12 @@ def drawing_order(
     short_keys: whether splats that are a few micrometers apart in depth may be swapped, which takes
     half the time.
     """
-    depth = _depths(static, frames)
+    depth = np.take(frames.depth_rows[3], static.face, mode="clip")
+    product = np.empty(len(static), np.float32)
+    for row, coordinate in zip(frames.depth_rows, static.positions, strict=False):
+        np.take(row, static.face, out=product, mode="clip")  # row by row, which is fastest
+        product *= coordinate
+        depth += product
     near, far, chosen = view.near - frames.base, view.far - frames.base, None
     if not (len(depth) and depth.min() >= near and depth.max() <= far):
         chosen = np.flatnonzero((depth >= near) & (depth <= far))
@@ -199,44 +196,23 @@ def _ascending(depth: np.ndarray, base: float, short_keys: bool) -> np.ndarray:
     return np.asarray(order[np.argsort((key >> 8).astype(np.uint16)[order], kind="stable")])
 
 
-def _depths(static: StaticSplats, frames: PosedFrames) -> np.ndarray:
-    """(N,) float32 of all splats, along the view axis, less `frames.base`; row by row, which is
-    fastest."""
-    depth, product = (
-        np.take(frames.depth_rows[3], static.face, mode="clip"),
-        np.empty(len(static), np.float32),
-    )
-    for row, coordinate in zip(frames.depth_rows, static.positions, strict=False):
-        np.take(row, static.face, out=product, mode="clip")
-        product *= coordinate
-        depth += product
-    return depth
-
-
 def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.ndarray:
-    """(VIEW_TEXELS + LAYER_TEXELS · L, 4) float32: what the shader knows of the view and of each
-    layer."""
+    """(VIEW_TEXELS + LAYER_TEXELS · L, 4) float32: the view and each layer."""
     camera = view.camera
     texels = np.zeros((VIEW_TEXELS + LAYER_TEXELS * len(layers), 4), np.float32)
-    planes = (
-        np.zeros((0, 4))
-        if view.clip_planes is None
-        else view.clip_planes @ np.linalg.inv(camera.world_to_camera)
-    )
+    planes = np.zeros((0, 4)) if view.clip_planes is None else view.clip_planes
     texels[0] = camera.fl_x, camera.fl_y, camera.cx, camera.cy
     texels[1] = camera.width, camera.height, len(planes), 0
-    texels[2 : 2 + len(planes)] = planes
-    for layer, first, row in zip(
-        layers, static.rows, texels[VIEW_TEXELS:].reshape(-1, LAYER_TEXELS, 4), strict=True
-    ):
+    texels[2 : 2 + len(planes)] = planes @ np.linalg.inv(camera.world_to_camera)
+    rows = texels[VIEW_TEXELS:].reshape(-1, LAYER_TEXELS, 4)
+    for layer, first, row in zip(layers, static.rows, rows, strict=True):
         settings = layer.settings
         row[0] = first
         if not settings.view_dependent:
             row[0, 3] = 0
         strained = bool(layer.frames.strain.shape[1] and layer.splats.strain_color.shape[1])
         row[1] = layer.antialiased, strained, settings.size, settings.opacity_threshold
-        # From directions in camera space to the space that splats were trained in: without scale
-        # and reflection.
+        # From directions in camera space to those of training: without scale and reflection.
         u, _, v = np.linalg.svd((camera.world_to_camera @ layer.to_world)[:3, :3])
         row[2:5, :3] = (u @ v).T
         row[2:5, 3] = settings.percentage, settings.show_selection, settings.selected_only
@@ -253,8 +229,7 @@ MAX_MAPS = 16
 
 
 def surface(layers: Sequence[SceneLayer]) -> np.ndarray:
-    """(N · SURFACE_TEXELS, 4): what does not change of all splats; 0 for those of layers that are
-    not relit."""
+    """(N · SURFACE_TEXELS, 4): constants of all splats; 0 for those that are not relit."""
     parts, first = [], 0
     for layer in layers:
         texels = np.zeros((len(layer.splats), SURFACE_TEXELS, 4), np.float32)
@@ -293,47 +268,46 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
     """Pack poses and light of all layers; those that are not relit have a share of 0."""
     vertices, maps, rows = [np.zeros((0, 4), np.float32)], list[ShadowView](), list[np.ndarray]()
     head = np.zeros((len(layers), RELIT_TEXELS, 4), np.float32)
-    first = head.shape[0] * RELIT_TEXELS
-    map_rows: list[np.ndarray] = []
+    first, map_rows = len(layers) * RELIT_TEXELS, list[np.ndarray]()
     for block, layer in zip(head, layers, strict=True):
-        relit = layer.relit
-        if relit is None:
+        if layer.relit is None:
             continue
-        distant, kept = relit.relighter.distant_in_head(relit.mesh, relit.lighting)
-        vertices.append(_vertices(relit, distant))
-        points = _lights(relit, maps, map_rows)
-        _fill(block, relit, kept, first + sum(map(len, rows)), len(points) // LIGHT_TEXELS)
+        lighting, relighter, mesh = layer.relit.lighting, layer.relit.relighter, layer.relit.mesh
+        distant, kept = relighter.distant_in_head(mesh, lighting)
+        texels = np.zeros((len(mesh), VERTEX_TEXELS, 4), np.float32)
+        texels[:, 0, :3], texels[:, 1, :3] = mesh, _normals(relighter)(mesh)
+        arriving = np.maximum(relighter.light.transfer @ distant, 0)
+        texels[:, 2, :3] = arriving[:, :3] + relighter.bounce.light(arriving[:, 3:])
+        vertices.append(texels.reshape(-1, 4))
+        points = _lights(layer.relit, maps, map_rows)
+        block[0, 0] = lighting.mix if lighting.mode == "mix" else 1
+        block[0, 1:] = 2**lighting.exposure / np.asarray(lighting.white)
+        block[1] = (
+            max(lighting.roughness, 0.05),
+            lighting.specular,
+            first,
+            len(points) // LIGHT_TEXELS,
+        )
+        block[2, 3], block[3, :3] = relighter.light.damping, relighter.typical_albedo
+        block[4:13, :3] = GLOSSY[:, None] * lighting.world
+        block[13] = *kept.gain, kept.share
         rows.append(points)
-    first_map = first + sum(map(len, rows))
+        first += len(points)
+    head[:, 3, 3] = first
     lights = np.concatenate([head.reshape(-1, 4), *rows, *map_rows])
-    head_rows = lights[: len(layers) * RELIT_TEXELS].reshape(-1, RELIT_TEXELS, 4)
-    head_rows[:, 3, 3] = first_map
     return RelitScene(np.concatenate(vertices), lights, tuple(maps))
 
 
 def with_eye(scene: RelitScene, layers: Sequence[SceneLayer], eye: np.ndarray) -> np.ndarray:
     """`RelitScene.lights` for a camera at eye (3,)."""
     lights = scene.lights.copy()
-    for block, layer in zip(
-        lights[: len(layers) * RELIT_TEXELS].reshape(-1, RELIT_TEXELS, 4), layers, strict=True
-    ):
-        block[2, :3] = layer.eye_in_avatar(eye)
+    for index, layer in enumerate(layers):
+        lights[RELIT_TEXELS * index + 2, :3] = layer.eye_in_avatar(eye)
     return lights
 
 
-def _fill(block: np.ndarray, relit: Relit, kept: Kept, first: int, count: int) -> None:
-    lighting, relighter = relit.lighting, relit.relighter
-    block[0, 0] = lighting.mix if lighting.mode == "mix" else 1
-    block[0, 1:] = 2**lighting.exposure / np.asarray(lighting.white)
-    block[1] = max(lighting.roughness, 0.05), lighting.specular, first, count
-    block[2, 3], block[3, :3] = relighter.light.damping, relighter.typical_albedo
-    block[4:13, :3] = GLOSSY[:, None] * lighting.world
-    block[13] = *kept.gain, kept.share
-
-
 def _lights(relit: Relit, maps: list[ShadowView], map_rows: list[np.ndarray]) -> np.ndarray:
-    """(points · LIGHT_TEXELS, 4); adds the shadow maps that they need. Lights beyond MAX_MAPS throw
-    no shadow."""
+    """(points · LIGHT_TEXELS, 4); adds shadow maps; lights beyond MAX_MAPS throw no shadow."""
     bounds = head_bounds(relit.mesh)
     faces = relit.relighter.avatar.faces
     casters = *relit.casters, *relit.relighter.lash_casters(relit.mesh, relit.lighting)
@@ -353,16 +327,6 @@ def _lights(relit: Relit, maps: list[ShadowView], map_rows: list[np.ndarray]) ->
     return np.concatenate(found).reshape(-1, 4)
 
 
-def _vertices(relit: Relit, distant: np.ndarray) -> np.ndarray:
-    """distant (9, 6): as of `Relighter.distant_in_head`."""
-    relighter, mesh = relit.relighter, relit.mesh
-    texels = np.zeros((len(mesh), VERTEX_TEXELS, 4), np.float32)
-    texels[:, 0, :3], texels[:, 1, :3] = mesh, _normals(relighter)(mesh)
-    arriving = np.maximum(relighter.light.transfer @ distant, 0)
-    texels[:, 2, :3] = arriving[:, :3] + relighter.bounce.light(arriving[:, 3:])
-    return texels.reshape(-1, 4)
-
-
 class _Normals:
     """`surface.vertex_normals` for one mesh, in a fraction of the time."""
 
@@ -376,10 +340,8 @@ class _Normals:
     def __call__(self, mesh: np.ndarray) -> np.ndarray:
         rows = [np.ascontiguousarray(row, np.float32) for row in mesh.T]
         a, b, c = ([row[corner] for row in rows] for corner in self._corners)
-        u, v = (
-            [q - p for p, q in zip(a, b, strict=True)],
-            [q - p for p, q in zip(a, c, strict=True)],
-        )
+        u = [q - p for p, q in zip(a, b, strict=True)]
+        v = [q - p for p, q in zip(a, c, strict=True)]
         total = [
             np.add.reduceat((u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2])[self._face], self._first)
             for k in range(3)

@@ -4,8 +4,10 @@ in memory.
 Needs a GPU context: a viewport's drawing, or a render engine with `bl_use_gpu_context`.
 """
 
+import ctypes
+import sys
 from collections.abc import Iterator, Sequence
-from functools import partial
+from functools import cache
 from typing import Any
 
 import bpy
@@ -45,6 +47,42 @@ from .shaders import (
     texture_rows,
 )  # fmt: skip
 
+EGL_PLATFORM_DEVICE = 0x313F
+
+
+@cache
+def has_gpu_context() -> bool:
+    """Whether Blender can be asked for a GPU context: it aborts where it asks in vain.
+
+    With a window; without one only where EGL, by which Blender then gets its context, initializes
+    its default display or, as Blender tries next, its first device (Linux; other systems were not
+    tried without a window).
+    """
+    if not bpy.app.background or sys.platform != "linux":
+        return not bpy.app.background
+    try:
+        egl = ctypes.CDLL("libEGL.so.1")
+        ctypes.CDLL("libGL.so.1")
+    except OSError:
+        return False
+    pointer, count, device = ctypes.c_void_p, ctypes.c_int(), ctypes.c_void_p()
+    egl.eglGetDisplay.restype, egl.eglGetDisplay.argtypes = pointer, [pointer]
+    egl.eglInitialize.argtypes = [pointer, pointer, pointer]
+    egl.eglGetProcAddress.restype, egl.eglGetProcAddress.argtypes = pointer, [ctypes.c_char_p]
+    if egl.eglInitialize(egl.eglGetDisplay(None), None, None):
+        return True
+    names = b"eglQueryDevicesEXT", b"eglGetPlatformDisplayEXT"
+    query, open_device = map(egl.eglGetProcAddress, names)
+    if not query or not open_device:
+        return False
+    query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, pointer, pointer)(query)
+    if not query(1, ctypes.byref(device), ctypes.byref(count)) or not count.value:
+        return False
+    open_device = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)(open_device)
+    display = open_device(EGL_PLATFORM_DEVICE, device, None)
+    return bool(display and egl.eglInitialize(display, None, None))
+
+
 NEAR_PER_SQUARE = 3e-4
 """Meters from a lamp at which its map begins, over the squared distance of the head: float32 then
 tells depths there 0.2 mm apart, and less where the map begins nearer. What is nearer throws no
@@ -65,11 +103,8 @@ class RelitTextures:
         self.textures: dict[str, Any] = {}
 
     def update(self, layers: Sequence[SceneLayer], eye: np.ndarray) -> dict[str, Any]:
-        """The textures by name, for a camera at eye (3,); must be called before a framebuffer is
-        bound."""
-        relighters = tuple(
-            (id(layer.splats), layer.relit and id(layer.relit.relighter)) for layer in layers
-        )
+        """The textures by name, for a camera at eye (3,); before a framebuffer is bound."""
+        relighters = tuple((id(x.splats), x.relit and id(x.relit.relighter)) for x in layers)
         if relighters != self._surface_of:
             self.textures["surface"], self._surface_of = texture(surface(layers)), relighters
         scene_of = tuple(id(layer.relit) for layer in layers)
@@ -86,10 +121,8 @@ class RelitTextures:
         rows = max(1, -(-len(maps) // MAP_COLUMNS))
         if self._atlas is None or self._atlas[0] != rows:
             size = MAP_SIZE * MAP_COLUMNS, MAP_SIZE * rows
-            depths, tested = (
-                GPUTexture(size, format="R32F"),
-                GPUTexture(size, format="DEPTH_COMPONENT32F"),
-            )
+            depths = GPUTexture(size, format="R32F")
+            tested = GPUTexture(size, format="DEPTH_COMPONENT32F")
             target = GPUFrameBuffer(depth_slot=tested, color_slots=(depths,))
             # a framebuffer does not keep its textures alive
             self._atlas = rows, depths, target, tested
@@ -117,21 +150,21 @@ class RelitTextures:
             shader.uniform_float(name, (*axis, -float(view.origin @ axis)))
         distance = float(((drawn.meshes[0][0] - view.origin) @ view.axes[:, 2]).max())
         near = min(max(1e-3, NEAR_PER_SQUARE * distance**2), abs(distance) / 2)
-        shader.uniform_float(
-            "lens", (2 * view.scale / view.size, float(view.is_parallel), near, 0.0)
-        )
+        lens = 2 * view.scale / view.size, float(view.is_parallel), near, 0.0
+        shader.uniform_float("lens", lens)
         for mesh in drawn.meshes:
             key = id(mesh[0]), id(mesh[1])
             if key not in self._batches:
-                self._batches[key] = known.get(key) or (mesh, _triangles(*mesh))
+                self._batches[key] = known.get(key) or (mesh, _triangles("position", *mesh))
             self._batches[key][1].draw(shader)
 
 
-def _triangles(vertices: np.ndarray, faces: np.ndarray) -> Any:
+def _triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """A batch of triangles (F, 3) with one attribute (V, 2 or 3) of their vertices."""
     layout = GPUVertFormat()
-    layout.attr_add(id="position", comp_type="F32", len=3, fetch_mode="FLOAT")
+    layout.attr_add(id=name, comp_type="F32", len=vertices.shape[1], fetch_mode="FLOAT")
     buffer = GPUVertBuf(len=len(vertices), format=layout)
-    buffer.attr_fill(id="position", data=np.ascontiguousarray(vertices, np.float32))
+    buffer.attr_fill(id=name, data=np.ascontiguousarray(vertices, np.float32))
     indices = GPUIndexBuf(type="TRIS", seq=np.ascontiguousarray(faces, np.uint32))
     return GPUBatch(type="TRIS", buf=buffer, elem=indices)
 
@@ -175,8 +208,7 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
 
 
 def _bone_ends(rig: Any) -> Iterator[tuple[Any, Any, float]]:
-    """Head, tail and half the width, in the world, of each visible bone; of one with a shape, a
-    sphere around that."""
+    """Head, tail and half the width in the world of visible bones; spheres around shapes."""
     matrix = rig.matrix_world
     size = matrix.median_scale
     for bone in rig.pose.bones:
@@ -188,14 +220,10 @@ def _bone_ends(rig: Any) -> Iterator[tuple[Any, Any, float]]:
             continue
         owner = bone.custom_shape_transform or bone
         center = matrix @ owner.matrix @ bone.custom_shape_translation
-        reach = max(Vector(corner).length for corner in shape.bound_box) * max(
-            map(abs, bone.custom_shape_scale_xyz)
-        )
-        yield (
-            center,
-            center,
-            size * reach * (bone.length if bone.use_custom_shape_bone_size else 1.0),
-        )
+        reach = size * max(Vector(corner).length for corner in shape.bound_box)
+        reach *= max(map(abs, bone.custom_shape_scale_xyz))
+        reach *= bone.length if bone.use_custom_shape_bone_size else 1.0
+        yield center, center, reach
 
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
@@ -209,8 +237,7 @@ SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "basic render")
 
 
 def fastest_format() -> str:
-    """The format that a viewport is drawn in: half the traffic on a card, but software would
-    convert each pixel."""
+    """The format of a viewport: half the traffic on a card, but slow in software."""
     name = gpu.platform.renderer_get().lower()
     return EXACT if any(software in name for software in SOFTWARE_RENDERERS) else COMPACT
 
@@ -252,28 +279,30 @@ class SplatRenderer:
         count = self._project(layers, view) if layers else 0
         with self._target.bind():  # type: ignore[attr-defined]
             gpu.state.active_framebuffer_get().clear(color=CLEAR)
-            if count:
-                self._draw_splats(count)
+            if not count:
+                return
+            gpu.state.blend_set("ALPHA_PREMULT")
+            shader, blocks = self._splat_shader, -(-count // BLOCK_SPLATS)
+            shader.bind()
+            for name in PROJECTED_TEXTURES:
+                shader.uniform_sampler(name, self._projected[name])
+            rectangles = self._splat_rectangles
+            rectangles.draw_instanced(shader, instance_start=0, instance_count=blocks)
+            gpu.state.blend_set("NONE")
 
     def read(self, with_depth: bool = False) -> ComposedImage:
         """What was drawn last, in memory."""
         color, depth = _pixels(self._color, 4)[::-1], _pixels(self._depth, 2)[::-1]
         alpha = np.ascontiguousarray(color[..., 3])
         rgb = np.ascontiguousarray(color[..., :3].transpose(2, 0, 1))
-        return ComposedImage(
-            rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None
-        )
+        mean = depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None
+        return ComposedImage(rgb, alpha, mean)
 
     def composite(
-        self,
-        corner: tuple[int, int],
-        to_depth: tuple[float, ...],
-        behind: tuple[float, ...] | None = None,
-        test_depth: bool = True,
-        bones: np.ndarray | None = None,
-        scene: Any = None,
-        has_background: bool = False,
-    ) -> None:
+        self, corner: tuple[int, int], to_depth: tuple[float, ...],
+        behind: tuple[float, ...] | None = None, test_depth: bool = True,
+        bones: np.ndarray = NO_BONES, scene: Any = None, has_background: bool = False,
+    ) -> None:  # fmt: skip
         """Put what was drawn last into the active framebuffer, which blends linearly and has the
         scene's depth.
 
@@ -286,68 +315,47 @@ class SplatRenderer:
         viewport shows below the active one. Of that, if it has drawn its background there
         (`has_background`), what they cover is taken out.
         """
-        draw = partial(self._composite_part, corner, to_depth, test_depth)
-        if scene is None or bones is None or not len(bones):
-            draw(OUTSIDE, behind, NO_BONES)
-            return
-        draw(OUTSIDE, behind, bones)
-        if behind is not None and has_background:
-            draw(BEHIND, behind, bones)
-        with scene.bind():
-            draw(NEAR_BONES, None, bones)
+        bones = bones if scene is not None else NO_BONES
+        shader, bone_image = self._composite_shader, _image(bones)  # lives as long as its name
 
-    def _composite_part(
-        self,
-        corner: tuple[int, int],
-        to_depth: tuple[float, ...],
-        test_depth: bool,
-        part: int,
-        behind: tuple[float, ...] | None,
-        bones: np.ndarray,
-    ) -> None:
-        gpu.state.blend_set("SUBTRACT" if part == BEHIND else "ALPHA_PREMULT")
-        gpu.state.depth_mask_set(False)
-        gpu.state.depth_test_set("LESS_EQUAL" if test_depth else "NONE")
-        # a texture lives as long as its name
-        shader, bone_image = self._composite_shader, _image(bones)
-        shader.bind()
-        shader.uniform_sampler("color_image", self._color)
-        shader.uniform_sampler("depth_image", self._depth)
-        shader.uniform_sampler("bones", bone_image)
-        shader.uniform_float("part", (part, len(bones), 0.0, 0.0))
-        shader.uniform_float("corner_px", (*corner, 0.0, 0.0))
-        shader.uniform_float("to_depth", to_depth)
-        shader.uniform_float("behind", CLEAR if behind is None else (*behind, 1.0))
-        self._screen.draw(shader)
-        gpu.state.depth_test_set("NONE")
-        gpu.state.blend_set("NONE")
+        def draw(part: int, behind: tuple[float, ...] | None) -> None:
+            gpu.state.blend_set("SUBTRACT" if part == BEHIND else "ALPHA_PREMULT")
+            gpu.state.depth_mask_set(False)
+            gpu.state.depth_test_set("LESS_EQUAL" if test_depth else "NONE")
+            shader.bind()
+            shader.uniform_sampler("color_image", self._color)
+            shader.uniform_sampler("depth_image", self._depth)
+            shader.uniform_sampler("bones", bone_image)
+            shader.uniform_float("part", (part, len(bones), 0.0, 0.0))
+            shader.uniform_float("corner_px", (*corner, 0.0, 0.0))
+            shader.uniform_float("to_depth", to_depth)
+            shader.uniform_float("behind", CLEAR if behind is None else (*behind, 1.0))
+            self._screen.draw(shader)
+            gpu.state.depth_test_set("NONE")
+            gpu.state.blend_set("NONE")
 
-    def _update_static(self, layers: Sequence[SceneLayer]) -> StaticSplats:
+        draw(OUTSIDE, behind)
+        if len(bones):
+            if behind is not None and has_background:
+                draw(BEHIND, behind)
+            with scene.bind():
+                draw(NEAR_BONES, None)
+
+    def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
+        """Fill the projected textures with the splats, farthest first; how many there are."""
         if self._static is None or self._static.key != packing.static_key(layers):
             self._static = StaticSplats(layers)
-            self._static_textures = {
-                name: texture(texels) for name, texels in self._static.texels.items()
-            }
+            texels = self._static.texels.items()
+            self._static_textures = {name: texture(values) for name, values in texels}
             size = TEXTURE_WIDTH, texture_rows(len(self._static))
             self._projected = {name: GPUTexture(size, format=EXACT) for name in PROJECTED_TEXTURES}
             self._projected_target = GPUFrameBuffer(color_slots=tuple(self._projected.values()))
         self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
-        return self._static
-
-    def _project(self, layers: Sequence[SceneLayer], view: View) -> int:
-        """Project and color the splats, farthest first, into the projected textures; returns how
-        many there are."""
-        static = self._update_static(layers)
-        # Blocks are computed again only for frames that are new.
-        known = self._blocks
-        self._blocks = {
-            id(layer.frames): known.get(id(layer.frames))
-            or (layer.frames, packing.frame_block(layer.frames))
-            for layer in layers
-        }
-        frames = packing.posed_frames(
-            layers, [self._blocks[id(layer.frames)][1] for layer in layers], view
-        )
+        static, known, self._blocks = self._static, self._blocks, {}
+        for each in (layer.frames for layer in layers):  # computed again only where they are new
+            self._blocks[id(each)] = known.get(id(each)) or (each, packing.frame_block(each))
+        blocks = [self._blocks[id(layer.frames)][1] for layer in layers]
+        frames = packing.posed_frames(layers, blocks, view)
         order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0
@@ -357,10 +365,10 @@ class SplatRenderer:
             self._relit = self._relit or (RelitTextures(), projection_shader(relit=True))
             relit, shader = self._relit[0].update(layers, view.camera.position), self._relit[1]
             names = PACKED_TEXTURES + RELIT_TEXTURES
-        textures = self._static_textures | relit | {
-            "orders": texture(order[:, None], "R32F"), "frames": texture(frames.texels.reshape(-1, 4)),
-            "table": texture(packing.table(static, layers, view)),
-        }  # fmt: skip
+        textures = self._static_textures | relit
+        textures["orders"] = texture(order[:, None], "R32F")
+        textures["frames"] = texture(frames.texels.reshape(-1, 4))
+        textures["table"] = texture(packing.table(static, layers, view))
         with self._projected_target.bind():
             gpu.state.blend_set("NONE")
             shader.bind()
@@ -371,29 +379,12 @@ class SplatRenderer:
             self._screen.draw(shader)
         return len(order)
 
-    def _draw_splats(self, count: int) -> None:
-        """Draw the first `count` splats of the projected textures to the active framebuffer."""
-        gpu.state.blend_set("ALPHA_PREMULT")
-        shader = self._splat_shader
-        shader.bind()
-        for name in PROJECTED_TEXTURES:
-            shader.uniform_sampler(name, self._projected[name])
-        self._splat_rectangles.draw_instanced(
-            shader, instance_start=0, instance_count=-(-count // BLOCK_SPLATS)
-        )
-        gpu.state.blend_set("NONE")
-
 
 def _rectangles(count: int) -> Any:
     """`count` rectangles in one batch, each with its own four vertices at ±1."""
-    layout = GPUVertFormat()
-    layout.attr_add(id="corner", comp_type="F32", len=2, fetch_mode="FLOAT")
-    vertices = GPUVertBuf(len=4 * count, format=layout)
-    corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32)
-    vertices.attr_fill(id="corner", data=np.tile(corners, (count, 1)))
+    corners = np.tile([[-1, -1], [1, -1], [-1, 1], [1, 1]], (count, 1))
     triangles = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [2, 1, 3]])
-    indices = GPUIndexBuf(type="TRIS", seq=triangles.reshape(-1, 3).astype(np.uint32))
-    return GPUBatch(type="TRIS", buf=vertices, elem=indices)
+    return _triangles("corner", corners, triangles.reshape(-1, 3))
 
 
 def _image(texels: np.ndarray) -> Any:

@@ -30,6 +30,7 @@ drawing:
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gpu
@@ -52,6 +53,7 @@ from .packing import (
 )
 
 TEXTURE_WIDTH = 2048
+CORNER = "VEC2", "corner"  # of rectangles, ±1
 EXACT = "RGBA32F"
 
 
@@ -85,15 +87,13 @@ RELIT_DEFINES = f"""
 #define WORLD(first, k) texelFetch(lights, at(first + k), 0).rgb
 {SHADING_DEFINES}"""
 
-RELIT_FUNCTIONS = (
-    SHADING_FUNCTIONS
-    + """
+RELIT_FUNCTIONS = """
 float lit_share_of(int map_index, int first, vec3 point, float cosine)
 {
   int row = first + MAP_TEXELS * map_index;
   vec4 p = vec4(point, 1.0), lens = texelFetch(lights, at(row + 3), 0);
-  vec3 local = vec3(dot(texelFetch(lights, at(row), 0), p), dot(texelFetch(lights, at(row + 1), 0), p),
-                    dot(texelFetch(lights, at(row + 2), 0), p));
+  vec4 x = texelFetch(lights, at(row), 0), y = texelFetch(lights, at(row + 1), 0);
+  vec3 local = vec3(dot(x, p), dot(y, p), dot(texelFetch(lights, at(row + 2), 0), p));
   vec2 place = local.xy;
   if (lens.y < 0.5) {
     if (local.z <= 1e-4) {
@@ -168,16 +168,15 @@ vec3 relit(int splat, int layer, vec3 recorded, vec3 strain_color)
   return linear_to_srgb(mix(srgb_to_linear(max(recorded, vec3(0.0))), lit * factor.yzw, factor.x));
 }
 """
-)
 
 _MAP_VERTEX = """
 void main()
 {
-  vec3 local = vec3(dot(row_x, vec4(position, 1.0)), dot(row_y, vec4(position, 1.0)), dot(row_z, vec4(position, 1.0)));
-  distance_out = local.z;
-  vec2 place = local.xy * lens.x;
+  vec4 p = vec4(position, 1.0);
+  float z = distance_out = dot(row_z, p);
   /* Depths from lens.z to infinity before a light, and 1 km around a sun's center. */
-  gl_Position = lens.y > 0.5 ? vec4(place, local.z * 1e-3, 1.0) : vec4(place, local.z - 2.0 * lens.z, local.z);
+  vec2 depth = lens.y > 0.5 ? vec2(z * 1e-3, 1.0) : vec2(z - 2.0 * lens.z, z);
+  gl_Position = vec4(dot(row_x, p) * lens.x, dot(row_y, p) * lens.x, depth);
 }
 """
 
@@ -195,23 +194,38 @@ def shadow_map_shader() -> Any:
     row_x, row_y, row_z: as packed by `packing`; lens: scale to normalized device coordinates,
     whether parallel, least depth in perspective.
     """
-    info = GPUShaderCreateInfo()
-    info.vertex_in(0, "VEC3", "position")
+    info = _shader_info("", ("VEC3", "position"), ["depth_out"], "FLOAT")
     passed = GPUStageInterfaceInfo("stga_shadow")
     # In perspective, depth itself is interpolated as it should be: linear in space.
     passed.smooth("FLOAT", "distance_out")
     info.vertex_out(passed)
-    info.fragment_out(0, "FLOAT", "depth_out")
     for name in ("row_x", "row_y", "row_z", "lens"):
         info.push_constant("VEC4", name)
-    info.vertex_source(_MAP_VERTEX)
-    info.fragment_source(_MAP_FRAGMENT)
+    return _shader(info, _MAP_VERTEX, _MAP_FRAGMENT)
+
+
+def _shader_info(
+    defines: str, attribute: tuple[str, str], outputs: Sequence[str], output: str = "VEC4",
+    samplers: Sequence[str] = (),
+) -> Any:  # fmt: skip
+    info = GPUShaderCreateInfo()
+    info.typedef_source(defines)
+    info.vertex_in(0, *attribute)
+    for slot, name in enumerate(outputs):
+        info.fragment_out(slot, output, name)
+    for slot, name in enumerate(samplers):
+        info.sampler(slot, "FLOAT_2D", name)
+    return info
+
+
+def _shader(info: Any, vertex: str, fragment: str) -> Any:
+    info.vertex_source(vertex)
+    info.fragment_source(fragment)
     return gpu.shader.create_from_info(info)
 
 
 MIN_ALPHA = 1 / 255
-"""A splat adds nothing to a pixel where its alpha is less, as in the rasterizer; a pixel with less
-shows nothing."""
+"""A splat adds nothing to a pixel where its alpha is less, as in the rasterizer."""
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
 BLOCK_SPLATS = 128
@@ -236,7 +250,8 @@ ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
 """
 
 _TERMS = "\n".join(
-    f"  if (degree >= {math.isqrt(k)}) {{ color += {term} * texelFetch(colors, at(first + {k}), 0).rgb; }}"
+    f"  if (degree >= {math.isqrt(k)})\n"
+    f"    color += {term} * texelFetch(colors, at(first + {k}), 0).rgb;"
     for k, term in enumerate(harmonics_text())
 )
 _HARMONICS = f"""
@@ -267,7 +282,8 @@ void main()
   int face = int(center.w), row = VIEW_TEXELS + LAYER_TEXELS * int(axis2.w);
   vec4 color_rows = texelFetch(table, at(row), 0), display = texelFetch(table, at(row + 1), 0);
   vec4 turn0 = texelFetch(table, at(row + 2), 0), turn1 = texelFetch(table, at(row + 3), 0);
-  vec4 turn2 = texelFetch(table, at(row + 4), 0), strain = texelFetch(frames, at(3 * faces + face), 0);
+  vec4 turn2 = texelFetch(table, at(row + 4), 0);
+  vec4 strain = texelFetch(frames, at(3 * faces + face), 0);
   float opacity = axis0.w;
   bool frozen = strain.w > 0.5;
   if (opacity < display.w || axis1.w >= turn0.w || (frozen && turn2.w > 0.5)) {
@@ -285,8 +301,9 @@ void main()
   }
   /* Linearized projection; slopes far outside the image are clamped (as the rasterizer's). */
   vec2 focal = lens.xy, principal = lens.zw, margin = 0.15 * image.xy / focal;
-  vec2 slope = clamp(p.xy / p.z, -principal / focal - margin, (image.xy - principal) / focal + margin);
-  vec3 u = focal.x / p.z * (r0.xyz - slope.x * r2.xyz), v = focal.y / p.z * (r1.xyz - slope.y * r2.xyz);
+  vec2 least = -principal / focal - margin, most = (image.xy - principal) / focal + margin;
+  vec2 slope = clamp(p.xy / p.z, least, most), zoom = focal / p.z;
+  vec3 u = zoom.x * (r0.xyz - slope.x * r2.xyz), v = zoom.y * (r1.xyz - slope.y * r2.xyz);
   vec3 a = display.z * vec3(dot(u, axis0.xyz), dot(u, axis1.xyz), dot(u, axis2.xyz));
   vec3 b = display.z * vec3(dot(v, axis0.xyz), dot(v, axis1.xyz), dot(v, axis2.xyz));
   float xx = dot(a, a) + LOW_PASS_PX2, xy = dot(a, b), yy = dot(b, b) + LOW_PASS_PX2;
@@ -305,8 +322,9 @@ void main()
   vec3 by_strain = vec3(0.0);
   if (display.y > 0.5) {
     int last = first + int(color_rows.z); /* the strain colors are the last three */
-    by_strain = strain.x * texelFetch(colors, at(last - 3), 0).rgb + strain.y * texelFetch(colors, at(last - 2), 0).rgb
-              + strain.z * texelFetch(colors, at(last - 1), 0).rgb;
+    for (int k = 0; k < 3; k++) {
+      by_strain += strain[k] * texelFetch(colors, at(last - 3 + k), 0).rgb;
+    }
     color += by_strain;
   }
 #ifdef RELIT
@@ -321,11 +339,13 @@ void main()
   /* A rectangle along the ellipse's axes, up to where alpha falls below MIN_ALPHA. */
   float mean = 0.5 * (xx + yy), spread = sqrt(max(0.25 * (xx - yy) * (xx - yy) + xy * xy, 0.0));
   float large = mean + spread, small = max(determinant / large, 1e-9);
-  vec2 major = abs(xy) > 1e-6 * large ? normalize(vec2(xy, large - xx)) : (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
+  vec2 major = xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
+  major = abs(xy) > 1e-6 * large ? normalize(vec2(xy, large - xx)) : major;
   float reach = sqrt(2.0 * log(opacity / MIN_ALPHA)) * 1.001;
   vec2 pixel = focal * p.xy / p.z + principal, to_device = vec2(2.0, -2.0) / image.xy;
   place_out = vec4(to_device * pixel + vec2(-1.0, 1.0), p.z, reach);
-  sides_out = reach * vec4(sqrt(large) * to_device * major, sqrt(small) * to_device * vec2(-major.y, major.x));
+  vec2 minor = vec2(-major.y, major.x);
+  sides_out = reach * vec4(sqrt(large) * to_device * major, sqrt(small) * to_device * minor);
   shade_out = vec4(max(color, vec3(0.0)), opacity);
 }
 """
@@ -339,7 +359,8 @@ void main()
   offset = place.w * corner;
   depth = place.z;
   shade = texelFetch(shades, texel, 0);
-  gl_Position = vec4(place.xy + corner.x * half_axes.xy + corner.y * half_axes.zw, place.w > 0.0 ? 0.0 : 2.0, 1.0);
+  vec2 position = place.xy + corner.x * half_axes.xy + corner.y * half_axes.zw;
+  gl_Position = vec4(position, place.w > 0.0 ? 0.0 : 2.0, 1.0);
 }
 """
 
@@ -383,9 +404,10 @@ void main()
   if (splats.a < MIN_ALPHA || is_near_bone(vec2(texel) + 0.5) != (part.x > 0.5)) {
     discard;
   }
-  /* From z along the view axis to the depth of the projection: (x + y·z) / (z + w·z), by its matrix. */
+  /* From z along the view axis to the projection's depth: (x + y·z) / (z + w·z), by its matrix. */
   float z = distances.r / max(distances.g, 1e-9);
-  gl_FragDepth = clamp(0.5 + 0.5 * (to_depth.x + to_depth.y * z) / (to_depth.z + to_depth.w * z), 0.0, 1.0);
+  float depth = (to_depth.x + to_depth.y * z) / (to_depth.z + to_depth.w * z);
+  gl_FragDepth = clamp(0.5 + 0.5 * depth, 0.0, 1.0);
   if (part.x > 1.5) {
     color_final = vec4(splats.a * srgb_to_linear(behind.rgb), 0.0);
     return;
@@ -394,7 +416,7 @@ void main()
     color_final = vec4(srgb_to_linear(splats.rgb / splats.a) * splats.a, splats.a);
     return;
   }
-  /* Splats are blended in sRGB, the viewport blends linear: exact where `behind` is what lies behind. */
+  /* Splats are blended in sRGB, the viewport blends linear: exact where `behind` lies behind. */
   vec3 goal = srgb_to_linear(clamp(splats.rgb + (1.0 - splats.a) * behind.rgb, 0.0, 1.0));
   vec3 back = srgb_to_linear(behind.rgb);
   vec3 most = min(vec3(1.0 - splats.a), goal / max(back, vec3(1e-6)));
@@ -410,20 +432,13 @@ def projection_shader(relit: bool = False) -> Any:
 
     relit: for layers of which at least one is lit by the scene, with RELIT_TEXTURES.
     """
-    info = GPUShaderCreateInfo()
-    info.typedef_source(_DEFINES + ("#define RELIT\n" + RELIT_DEFINES if relit else ""))
-    info.vertex_in(0, "VEC2", "corner")
-    for slot, name in enumerate(("place_out", "sides_out", "shade_out")):
-        info.fragment_out(slot, "VEC4", name)
-    for slot, name in enumerate(PACKED_TEXTURES + (RELIT_TEXTURES if relit else ())):
-        info.sampler(slot, "FLOAT_2D", name)
+    defines = _DEFINES + ("#define RELIT\n" + RELIT_DEFINES if relit else "")
+    samplers = PACKED_TEXTURES + (RELIT_TEXTURES if relit else ())
+    info = _shader_info(defines, CORNER, ("place_out", "sides_out", "shade_out"), samplers=samplers)
     for name in ("faces", "count"):
         info.push_constant("INT", name)
-    info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(
-        _TEXEL_FUNCTION + _HARMONICS + (RELIT_FUNCTIONS if relit else "") + _PROJECTION_FRAGMENT
-    )
-    return gpu.shader.create_from_info(info)
+    functions = _HARMONICS + (SHADING_FUNCTIONS + RELIT_FUNCTIONS if relit else "")
+    return _shader(info, _SCREEN_VERTEX, _TEXEL_FUNCTION + functions + _PROJECTION_FRAGMENT)
 
 
 def splat_shader() -> Any:
@@ -432,21 +447,14 @@ def splat_shader() -> Any:
 
     Two color targets: sRGB premultiplied, and (depth · alpha, alpha).
     """
-    info = GPUShaderCreateInfo()
-    info.typedef_source(_DEFINES)
-    info.vertex_in(0, "VEC2", "corner")
+    outputs = "color_out", "depth_out"
+    info = _shader_info(_DEFINES, CORNER, outputs, samplers=PROJECTED_TEXTURES)
     passed = GPUStageInterfaceInfo("stga_splat")
     passed.no_perspective("VEC2", "offset")
     passed.flat("VEC4", "shade")
     passed.flat("FLOAT", "depth")
     info.vertex_out(passed)
-    info.fragment_out(0, "VEC4", "color_out")
-    info.fragment_out(1, "VEC4", "depth_out")
-    for slot, name in enumerate(PROJECTED_TEXTURES):
-        info.sampler(slot, "FLOAT_2D", name)
-    info.vertex_source(_SPLAT_VERTEX)
-    info.fragment_source(_SPLAT_FRAGMENT)
-    return gpu.shader.create_from_info(info)
+    return _shader(info, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
 
 
 def composite_shader() -> Any:
@@ -456,15 +464,9 @@ def composite_shader() -> Any:
     part.x: 0 all that is not near a bone; 1 what is; 2 what is, as the light of `behind` that it
     covers. part.y: how many bones; bones: for each, two texels as `front_bones` returns them.
     """
-    info = GPUShaderCreateInfo()
-    info.typedef_source(_DEFINES)
-    info.vertex_in(0, "VEC2", "corner")
-    info.fragment_out(0, "VEC4", "color_final")
+    samplers = "color_image", "depth_image", "bones"
+    info = _shader_info(_DEFINES, CORNER, ["color_final"], samplers=samplers)
     allow_depth_write(info)
-    for slot, name in enumerate(("color_image", "depth_image", "bones")):
-        info.sampler(slot, "FLOAT_2D", name)
     for name in ("corner_px", "to_depth", "behind", "part"):
         info.push_constant("VEC4", name)
-    info.vertex_source(_SCREEN_VERTEX)
-    info.fragment_source(SRGB_FUNCTIONS + _COMPOSITE_FRAGMENT)
-    return gpu.shader.create_from_info(info)
+    return _shader(info, _SCREEN_VERTEX, SRGB_FUNCTIONS + _COMPOSITE_FRAGMENT)

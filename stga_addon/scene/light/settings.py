@@ -24,56 +24,38 @@ class LightingSettings(bpy.types.PropertyGroup):  # type: ignore[misc]
         ),
     )
     mix: bpy.props.FloatProperty(
-        name="Mix",
-        description="Share of the scene's light",
-        default=0.5,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
+        name="Mix", description="Share of the scene's light",
+        default=0.5, min=0.0, max=1.0, subtype="FACTOR",
+    )  # fmt: skip
     exposure: bpy.props.FloatProperty(
-        name="Exposure",
-        description="Stops by which relit avatars are brighter: the absolute level of a capture's light is not known",
-        soft_min=-4.0,
-        soft_max=4.0,
-    )
+        name="Exposure", soft_min=-4.0, soft_max=4.0,
+        description="Stops by which relit avatars are brighter: the absolute level of a capture's "
+        "light is not known",
+    )  # fmt: skip
     white: bpy.props.FloatVectorProperty(
-        name="White",
-        description="What should be white or gray on the avatar; its tint is taken away. Pick it with the eyedropper "
-        "from the avatar as recorded",
-        subtype="COLOR",
-        size=3,
-        default=(1.0, 1.0, 1.0),
-        min=0.0,
-        max=1.0,
-    )
+        name="White", subtype="COLOR", size=3, default=(1.0, 1.0, 1.0), min=0.0, max=1.0,
+        description="What should be white or gray on the avatar; its tint is taken away. Pick it "
+        "with the eyedropper from the avatar as recorded",
+    )  # fmt: skip
     roughness: bpy.props.FloatProperty(
-        name="Roughness",
-        description="Of highlights on skin",
-        default=SKIN_ROUGHNESS,
-        min=0.05,
-        max=1.0,
-    )
+        name="Roughness", description="Of highlights on skin",
+        default=SKIN_ROUGHNESS, min=0.05, max=1.0,
+    )  # fmt: skip
     specular: bpy.props.FloatProperty(
-        name="Highlights",
-        description="Factor of highlights; 0: none",
-        default=1.0,
-        min=0.0,
-        soft_max=2.0,
-    )
+        name="Highlights", description="Factor of highlights; 0: none",
+        default=1.0, min=0.0, soft_max=2.0,
+    )  # fmt: skip
     shadows: bpy.props.BoolProperty(
-        name="Shadows",
-        description="Lights are blocked by the head and by other objects",
+        name="Shadows", description="Lights are blocked by the head and by other objects",
         default=True,
-    )
+    )  # fmt: skip
     world: bpy.props.BoolProperty(
         name="World", description="The scene's world lights avatars, too", default=True
     )
     lights: bpy.props.PointerProperty(
-        name="Lights",
+        name="Lights", type=bpy.types.Collection,
         description="Only the lights of this collection light avatars; empty: all",
-        type=bpy.types.Collection,
-    )
+    )  # fmt: skip
 
 
 def lighting_settings(scene: Any) -> Any:
@@ -86,9 +68,8 @@ def current_settings(depsgraph: Any) -> Any:
 
     Those of a viewport are in the scene itself: a change of them does not evaluate it anew.
     """
-    return lighting_settings(
-        depsgraph.scene if depsgraph.mode == "VIEWPORT" else depsgraph.scene_eval
-    )
+    is_viewport = depsgraph.mode == "VIEWPORT"
+    return lighting_settings(depsgraph.scene if is_viewport else depsgraph.scene_eval)
 
 
 def settings_values(scene: Any) -> tuple[Any, ...]:
@@ -96,12 +77,8 @@ def settings_values(scene: Any) -> tuple[Any, ...]:
     settings = lighting_settings(scene)
     if settings is None:
         return ()
-    names = LightingSettings.__annotations__
-    return tuple(
-        tuple(value) if name == "white" else value
-        for name in names
-        for value in [getattr(settings, name)]
-    )
+    others = [name for name in LightingSettings.__annotations__ if name != "white"]
+    return tuple(settings.white), *(getattr(settings, name) for name in others)
 
 
 def register() -> None:

@@ -1,5 +1,4 @@
-"""A video drawn by Blender's GPU and encoded by Blender's FFmpeg: where no Python here has the
-rasterizer."""
+"""A video drawn by Blender's GPU and encoded by Blender's FFmpeg, without a rasterizer."""
 
 import shutil
 import struct
@@ -35,14 +34,11 @@ class DrawnVideo:
         """Draw an image. Raises StgaError where the GPU cannot, or the disk is full."""
         image = draw_image(list(layers), camera)
         if image is None:
-            raise StgaError(
-                "The video cannot be drawn: this Blender has no GPU context, or not the memory"
-            )
+            raise StgaError("The video cannot be drawn: Blender has no GPU context or its memory")
         path = self._folder / f"{len(self._images) + 1:04d}.png"
+        pixels = finished(image, self._background, is_video(self._output))
         with replacing(path) as partial:
-            partial.write_bytes(
-                png_bytes(finished(image, self._background, is_video(self._output)))
-            )
+            partial.write_bytes(png_bytes(pixels))
         self._images.append(path)
 
     def encode(self, fps: float) -> None:
@@ -57,18 +53,13 @@ class DrawnVideo:
 
 
 def png_bytes(pixels: np.ndarray) -> bytes:
-    """A PNG of (H, W, 3 or 4) uint8 sRGB, as the PNG specification (ISO/IEC 15948) lays it out; no
-    pillow is needed."""
+    """A PNG (ISO/IEC 15948) of (H, W, 3 or 4) uint8 sRGB; no pillow is needed."""
     height, width, channels = pixels.shape
     rows = np.zeros((height, 1 + width * channels), np.uint8)  # the filter of each row: none
     rows[:, 1:] = pixels.reshape(height, -1)
     header = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
-    chunks = (
-        (b"IHDR", header),
-        (b"sRGB", b"\0"),
-        (b"IDAT", zlib.compress(rows.tobytes(), 6)),
-        (b"IEND", b""),
-    )
+    data = zlib.compress(rows.tobytes(), 6)
+    chunks = (b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", data), (b"IEND", b"")
     packed = (
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         for kind, data in chunks
@@ -77,8 +68,7 @@ def png_bytes(pixels: np.ndarray) -> bytes:
 
 
 def _encode(images: Sequence[Path], fps: float) -> Path:
-    """Encode with the sequencer of a scene of its own, which is removed; returns the file beside
-    the images."""
+    """Encode in a scene of its own, which is removed; the file beside the images."""
     size = bpy.data.images.load(str(images[0]))
     width, height = size.size
     bpy.data.images.remove(size)

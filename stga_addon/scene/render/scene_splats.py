@@ -1,5 +1,4 @@
-"""The splats of a scene's visible objects, posed at its frame, and their relit colors stored for
-EEVEE and Cycles."""
+"""A scene's visible splats, posed, and their relit colors stored for EEVEE and Cycles."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -15,7 +14,7 @@ from ...errors import StgaError
 from .. import tags
 from ..arrays import flat_floats, mesh_vertices
 from ..display import splat_nodes
-from ..display.splat_attributes import RELIT_COLOR, read_splats, write_attributes
+from ..display.splat_attributes import RELIT_COLOR, read_splats, with_alpha, write_attributes
 from ..display.splat_object import (
     display_settings,
     get_input,
@@ -91,14 +90,9 @@ def visible_layers(
     splat objects. Raises StgaError where the head of an object is gone or has other triangles than
     its splats.
     """
+    visible = [each for each in depsgraph.view_layer.objects if each.visible_get(viewport=view)]
     if view is None:
         visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
-    else:
-        visible = [
-            candidate
-            for candidate in depsgraph.view_layer.objects
-            if candidate.visible_get(viewport=view)
-        ]
     shown = [found for each in visible for found in _with_instances(each, depsgraph, Matrix())]
     return [
         _layer(visible, matrix, depsgraph, cache, shown)
@@ -111,24 +105,20 @@ def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
     if layer.exclude or layer.collection.hide_render:
         return []
-    own = [
-        candidate for candidate in layer.collection.objects if _is_rendered(candidate, depsgraph)
-    ]
+    own = [each for each in layer.collection.objects if _is_rendered(each, depsgraph)]
     inside = (each for child in layer.children for each in _rendered_objects(child, depsgraph))
     return list(dict.fromkeys([*own, *inside]))
 
 
 def _is_rendered(candidate: Any, depsgraph: Any) -> bool:
-    """By the evaluated object: while an animation is rendered, keyframes do not reach the
-    original."""
+    """By the evaluated object: in animations, keyframes do not reach the original."""
     return not candidate.evaluated_get(depsgraph).hide_render
 
 
 def _with_instances(
     visible: Any, depsgraph: Any, parent_matrix: Matrix
 ) -> Iterator[tuple[Any, Matrix]]:
-    """An object and its world matrix; of an instanced collection also its members, once per
-    instance."""
+    """An object and its world matrix, and the members of an instanced collection."""
     matrix = parent_matrix @ visible.evaluated_get(depsgraph).matrix_world
     yield visible, matrix
     collection = visible.instance_collection if visible.instance_type == "COLLECTION" else None
@@ -140,12 +130,9 @@ def _with_instances(
 
 
 def _layer(
-    splat_object: Any,
-    matrix: Matrix,
-    depsgraph: Any,
-    cache: SplatCache,
+    splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache,
     shown: Sequence[tuple[Any, Matrix]],
-) -> SceneLayer:
+) -> SceneLayer:  # fmt: skip
     stored = cache.get(splat_object)
     to_world = np.array(matrix, np.float64)
     # From the evaluated object: its settings may be animated.
@@ -155,7 +142,19 @@ def _layer(
     head = get_input(splat_object, splat_nodes.HEAD)
     if head is None:
         raise StgaError(f"{splat_object.name}: has no head to follow; choose one in its modifier")
-    vertices = _head_vertices(splat_object, head, len(stored.faces), depsgraph)
+    posed = head.evaluated_get(depsgraph)
+    if posed.type != "MESH" or len(posed.data.loops) != stored.faces.size:
+        name = splat_object.name
+        if head.mode == "EDIT":
+            raise StgaError(
+                f"{head.name}: is in Edit Mode; {name} is drawn again when you leave it"
+            )
+        raise StgaError(
+            f"{head.name}: has other triangles than {name}, which follows it; check its modifiers"
+        )
+    placed = splat_object.evaluated_get(depsgraph).matrix_world
+    to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
+    vertices = mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
     vertices, frames = cache.frames(splat_object, stored, vertices)
     relit = cache.light.relit(splat_object, head, stored, vertices, to_world, shown, depsgraph)
     selected = None
@@ -163,24 +162,6 @@ def _layer(
         selected = frame_selection(head, depsgraph.scene.frame_current)
     frozen = None if selected is None else ~selected
     return SceneLayer(stored.splats, frames, to_world, stored.antialiased, settings, frozen, relit)
-
-
-def _head_vertices(splat_object: Any, head: Any, n_faces: int, depsgraph: Any) -> np.ndarray:
-    """(V, 3) float64 vertices of the evaluated head in the space of its splats."""
-    posed = head.evaluated_get(depsgraph)
-    if posed.type != "MESH" or len(posed.data.loops) != 3 * n_faces:
-        if head.mode == "EDIT":
-            raise StgaError(
-                f"{head.name}: is in Edit Mode; {splat_object.name} is drawn again when you leave it"
-            )
-        raise StgaError(
-            f"{head.name}: has other triangles than {splat_object.name}, which follows it; check its modifiers"
-        )
-    to_splats = (
-        splat_object.evaluated_get(depsgraph).matrix_world.inverted_safe() @ posed.matrix_world
-    )
-    matrix = np.array(to_splats, np.float64)
-    return mesh_vertices(posed.data) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:
@@ -196,12 +177,10 @@ def relight_frame(splat_object: Any, scene: Any) -> None:
         )
     if scene.camera is None:
         raise StgaError("The scene has no camera, from which highlights are seen")
-    eye = layers[0].eye_in_avatar(
-        np.array(scene.camera.evaluated_get(depsgraph).matrix_world)[:3, 3]
-    )
-    relit = layers[0].relit
+    camera = scene.camera.evaluated_get(depsgraph).matrix_world
+    eye, relit = layers[0].eye_in_avatar(np.array(camera)[:3, 3]), layers[0].relit
     color = relit.relighter.radiance(relit.mesh, eye, relit.lighting, relit.casters)
-    values = flat_floats(np.concatenate([np.maximum(color, 0), np.ones((len(color), 1))], axis=1))
+    values = flat_floats(with_alpha(np.maximum(color, 0)))
     write_attributes(splat_object.data, {RELIT_COLOR: ("FLOAT_COLOR", "color", values)}, "POINT")
     splat_object.data[tags.RELIT_FRAME] = scene.frame_current
     splat_object.data.update()
@@ -218,8 +197,7 @@ def forget_frame(splat_object: Any) -> bool:
 
 
 def light_hint(scene: Any) -> str | None:
-    """A sentence where EEVEE and Cycles show splats in another light than the scene's at its frame,
-    else None."""
+    """A sentence where EEVEE and Cycles render in another light than the scene's, or None."""
     settings = lighting_settings(scene)
     if settings is None or settings.mode == "recorded":
         return None
@@ -229,7 +207,6 @@ def light_hint(scene: Any) -> str | None:
         frame = shown.data.get(tags.RELIT_FRAME) if RELIT_COLOR in shown.data.attributes else None
         if frame != scene.frame_current:
             now = "colors as recorded" if frame is None else f"the light of frame {frame}"
-            return (
-                f"EEVEE and Cycles render {now}; Relight Frame gives them the light of this frame"
-            )
+            remedy = "Relight Frame gives them the light of this frame"
+            return f"EEVEE and Cycles render {now}; {remedy}"
     return None

@@ -25,8 +25,7 @@ GRID, INVERSE_GRID = 41, 25
 DARKEST, BRIGHTEST = -14.0, 6.0
 """Range of the scene-linear samples, in log2; the first sample is 0."""
 INVERSE_STEPS, MAX_STEP, DAMPING = 15, 4, 1e-3
-"""Of finding a color of the inverse; a step is in samples, and damped where colors hardly change:
-in the dark."""
+"""Of finding a color of the inverse; steps in samples, damped where colors hardly change."""
 CHUNK = 1 << 16
 """Pixels converted at a time, which bounds the memory."""
 MAIN_THREAD_TIMEOUT_S = 10.0
@@ -55,8 +54,7 @@ class InverseView:
         return interpolate(self._shown, place.reshape(-1, 3)).reshape(linear.shape)
 
     def to_linear(self, srgb: np.ndarray) -> np.ndarray:
-        """Scene-linear colors (…, 3) float32 that the view transform shows as `srgb`, or as nearly
-        as it can."""
+        """Scene-linear colors (…, 3) float32 that are shown as `srgb`, or most nearly so."""
         flat = np.sqrt(np.clip(srgb, 0, 1)).reshape(-1, 3) * (INVERSE_GRID - 1)
         linear = np.empty(flat.shape, np.float32)
         for begin in range(0, len(flat), CHUNK):
@@ -65,21 +63,18 @@ class InverseView:
         return linear.reshape(srgb.shape)
 
     def _solve(self, target: np.ndarray) -> np.ndarray:
-        """Places (M, 3) in the table, in samples, that show colors (M, 3) most nearly, by damped
-        Gauss-Newton steps."""
+        """Places (M, 3), in samples, that show `target` best, by damped Gauss-Newton steps."""
         last = len(self._axis) - 1
         gray = np.maximum.accumulate(np.einsum("iiic->i", self._shown) / 3)
         place = np.interp(target, gray, np.arange(last + 1))
-        slopes = np.stack(np.gradient(self._shown, axis=(0, 1, 2)), -1).reshape(
-            *self._shown.shape[:3], 9
-        )
+        slopes = np.stack(np.gradient(self._shown, axis=(0, 1, 2)), -1)
+        slopes = slopes.reshape(*self._shown.shape[:3], 9)
         for _ in range(INVERSE_STEPS):
             rest = interpolate(self._shown, place) - target
             jacobian = interpolate(slopes, place).reshape(-1, 3, 3)
             transposed = jacobian.transpose(0, 2, 1)
-            step = np.linalg.solve(
-                transposed @ jacobian + DAMPING * np.eye(3), transposed @ rest[..., None]
-            )[..., 0]
+            normal = transposed @ jacobian + DAMPING * np.eye(3)
+            step = np.linalg.solve(normal, transposed @ rest[..., None])[..., 0]
             place = np.clip(place - np.clip(step, -MAX_STEP, MAX_STEP), 0, last)
         return place
 
@@ -102,9 +97,8 @@ def keeps_colors(scene: Any) -> bool:
     view = scene.view_settings
     plain = view.view_transform == "Standard" and view.look == "None" and not view.use_curve_mapping
     balanced = not getattr(view, "use_white_balance", False)  # from Blender 4.3 on
-    return bool(
-        plain and balanced and view.exposure == 0 and view.gamma == 1 and working_space() == REC709
-    )
+    even = view.exposure == 0 and view.gamma == 1
+    return bool(plain and balanced and even and working_space() == REC709)
 
 
 def needs_inverse(scene: Any) -> bool:
@@ -134,11 +128,9 @@ def measure(scene: Any) -> None:
 
     def work() -> None:
         try:
-            axis = np.append(
-                0, 2 ** (np.linspace(DARKEST, BRIGHTEST, GRID - 1) - scene.view_settings.exposure)
-            )
-            shown = _shown(scene, axis)
-            _keep(key, InverseView(axis, shown))
+            stops = np.linspace(DARKEST, BRIGHTEST, GRID - 1) - scene.view_settings.exposure
+            axis = np.append(0, 2**stops)
+            _keep(key, InverseView(axis, _shown(scene, axis)))
         finally:
             measured.set()
 
@@ -168,56 +160,39 @@ def _settings(scene: Any) -> tuple[Any, ...]:
 
 
 def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
-    """(G, G, G, 3) sRGB 0…1 that Blender shows on an sRGB display of the scene-linear colors of an
-    `axis` (G,)."""
+    """(G, G, G, 3) sRGB 0…1 that an sRGB display shows of scene-linear colors of `axis` (G,)."""
     size = len(axis)
     pixels = np.ones((size, size, size, 4), np.float32)
     pixels[..., :3] = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
     copy = scene.copy()
-    image = bpy.data.images.new("view transform", size * size, size, float_buffer=True)
+    images = [bpy.data.images.new("view transform", size * size, size, float_buffer=True)]
     try:
-        image.colorspace_settings.name = working_space()
-        image.pixels.foreach_set(pixels.ravel())
-        _show_on_srgb(copy)
+        images[0].colorspace_settings.name = working_space()
+        images[0].pixels.foreach_set(pixels.ravel())
+        copy.render.image_settings.color_management = "FOLLOW_SCENE"
+        copy.display_settings.display_device = "sRGB"
+        for name in ("view_transform", "look"):  # which the display may have changed
+            with suppress(TypeError):  # there is no such one for this display
+                setattr(copy.view_settings, name, getattr(scene.view_settings, name))
         choose_image_file(copy.render.image_settings, "PNG", "RGB", "16")
         copy.render.dither_intensity = 0
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "shown.png"
-            image.save_render(str(path), scene=copy)
-            return _read(path, pixels.size).reshape(pixels.shape)[..., :3]
+            images[0].save_render(str(path), scene=copy)
+            images.append(bpy.data.images.load(str(path)))
+            images[1].colorspace_settings.name = "Non-Color"
+            images[1].pixels.foreach_get(pixels.ravel())
+        return pixels[..., :3]
     finally:
-        bpy.data.images.remove(image)
+        for image in images:
+            bpy.data.images.remove(image)
         bpy.data.scenes.remove(copy)
 
 
-def _show_on_srgb(scene: Any) -> None:
-    """Choose the sRGB display, and again the view transform and look, which that may change."""
-    view, device = scene.view_settings, scene.display_settings
-    chosen = {name: getattr(view, name) for name in ("view_transform", "look")}
-    scene.render.image_settings.color_management = "FOLLOW_SCENE"
-    device.display_device = "sRGB"
-    for name, value in chosen.items():
-        with suppress(TypeError):  # there is no such one for this display
-            setattr(view, name, value)
-
-
-def _read(path: Path, count: int) -> np.ndarray:
-    image = bpy.data.images.load(str(path))
-    try:
-        image.colorspace_settings.name = "Non-Color"
-        values = np.empty(count, np.float32)
-        image.pixels.foreach_get(values)
-        return values
-    finally:
-        bpy.data.images.remove(image)
-
-
 def combined(
-    rgb: np.ndarray,
-    alpha: np.ndarray,
-    background: tuple[float, ...] | None,
+    rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] | None,
     view: InverseView | None = None,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W),
     alpha (H, W).
 
@@ -264,8 +239,7 @@ def scene_background(scene: Any) -> tuple[float, ...] | None:
 
 
 def world_color(scene: Any) -> tuple[float, ...] | None:
-    """Scene-linear color of the scene's world, None where it is not one color; black without a
-    world."""
+    """Scene-linear color of the world; None where it is not one color; black without one."""
     world = scene.world
     if world is None:
         return 0.0, 0.0, 0.0

@@ -48,10 +48,8 @@ class GpuDisplay:
         """Draw from now on; without a window there is nothing to draw in."""
         if not self._handlers and not bpy.app.background:
             add = bpy.types.SpaceView3D.draw_handler_add
-            self._handlers = [
-                add(call, (), "WINDOW", moment)
-                for call, moment in ((self._before, "PRE_VIEW"), (self._draw, "POST_VIEW"))
-            ]
+            self._handlers = [add(self._before, (), "WINDOW", "PRE_VIEW")]
+            self._handlers.append(add(self._draw, (), "WINDOW", "POST_VIEW"))
 
     def stop(self) -> None:
         """Remove the handlers, and free textures and shaders."""
@@ -65,13 +63,12 @@ class GpuDisplay:
         self._renderer, self._scene_target, self._cache = None, None, SplatCache()
         self.problem = self.problem if self.failed else ""
 
-    def scene_changed(self, *_: Any) -> None:
+    def scene_changed(self) -> None:
         """Read what throws shadows onto heads again."""
         self._cache.light.casters.forget()
 
     def _before(self) -> None:
-        """Keep the framebuffer of the scene's colors: after it, Blender binds that of the overlays,
-        which lie above."""
+        """Keep the framebuffer of the scene's colors, before that of the overlays is bound."""
         self._scene_target = gpu.state.active_framebuffer_get()
 
     def _draw(self) -> None:
@@ -82,9 +79,13 @@ class GpuDisplay:
             self.problem = str(error)
         except Exception as error:  # raised again at each redraw otherwise: reported once, then off
             traceback.print_exc()
-            self._fail(
-                f"Splats cannot be drawn as trained here ({type(error).__name__}: {error}); points are shown"
-            )
+            self.stop()
+            reason = f"{type(error).__name__}: {error}"
+            self.problem = f"Splats cannot be drawn as trained here ({reason}); points are shown"
+            self.failed = True
+            print(f"STGA: {self.problem}")
+            # while drawing, Blender's data cannot be changed
+            bpy.app.timers.register(show_points, persistent=True)
         finally:
             self._scene_target = None
 
@@ -94,12 +95,11 @@ class GpuDisplay:
             return
         # and nothing else, although its depth buffer has other displays of splats
         everything = is_engine_view(context)
-        layers = visible_layers(
-            depsgraph,
-            self._cache,
-            space,
-            lambda shown: everything or display_mode(shown) == AS_TRAINED,
-        )
+
+        def is_wanted(shown: Any) -> bool:
+            return everything or display_mode(shown) == AS_TRAINED
+
+        layers = visible_layers(depsgraph, self._cache, space, is_wanted)
         if not layers:
             if not any(is_shown_as_trained(candidate) for candidate in bpy.data.objects):
                 self._renderer = None  # frees its textures
@@ -111,17 +111,11 @@ class GpuDisplay:
         self._renderer.draw(layers, view)
         is_plain = space.shading.type in ("SOLID", "WIREFRAME") or keeps_colors(context.scene)
         bones = front_bones(space, context.region_data, width, height) if is_plain else NO_BONES
+        background, has_background = expected_background(context)
+        test_depth = has_scene_depth(space) and not everything
         self._renderer.composite(
-            (x, y), to_depth, expected_background(context), has_scene_depth(space) and not everything,
-            bones, self._scene_target, background_source(context) != "SCENE",
-        )  # fmt: skip
-
-    def _fail(self, problem: str) -> None:
-        self.stop()
-        self.problem, self.failed = problem, True
-        print(f"STGA: {problem}")
-        # while drawing, Blender's data cannot be changed
-        bpy.app.timers.register(show_points, persistent=True)
+            (x, y), to_depth, background, test_depth, bones, self._scene_target, has_background
+        )
 
 
 display = GpuDisplay()
@@ -137,8 +131,7 @@ def is_shown_as_trained(candidate: Any) -> bool:
 
 
 def show_points() -> float | None:
-    """Display as points what is to be displayed as trained, from a timer: also what is added or
-    opened later."""
+    """Display as points what should be as trained, also what is added or opened later."""
     for candidate in bpy.data.objects:
         if candidate.library is None and is_shown_as_trained(candidate):
             set_input(candidate, splat_nodes.DISPLAY, POINTS)
@@ -160,14 +153,12 @@ def is_drawn_by_engine(context: Any) -> bool:
 
 
 def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float, ...]]:
-    """The view of a RegionView3D, and how `SplatRenderer.composite` gets from its z to the depth
-    buffer's."""
+    """The view of a RegionView3D, and `to_depth` of `SplatRenderer.composite`."""
     camera = viewport_camera(region, width, height)
     matrix = np.array(region.window_matrix, np.float64)
     # A view that is not in perspective is drawn from this far behind Blender's camera.
-    back = float(
-        (camera.world_to_camera @ np.linalg.inv(np.array(region.view_matrix, np.float64))[:, 3])[2]
-    )
+    pose = np.linalg.inv(np.array(region.view_matrix, np.float64))
+    back = float((camera.world_to_camera @ pose[:, 3])[2])
     a, b, c, d = matrix[2, 3], -matrix[2, 2], matrix[3, 3], -matrix[3, 2]
     near, far = (back + (a - c * end) / (d * end - b) for end in (-1.0, 1.0))
     planes = np.array(region.clip_planes, np.float64) if region.use_clip_planes else None
@@ -175,31 +166,30 @@ def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float
     return View(camera, max(NEAR_M, near), far if far > near else np.inf, planes), to_depth
 
 
-def expected_background(context: Any) -> tuple[float, ...] | None:
-    """sRGB color that the viewport shows behind everything, None where that is not one color.
+def expected_background(context: Any) -> tuple[tuple[float, ...] | None, bool]:
+    """sRGB color that the viewport shows behind everything, None where that is not one color; and
+    whether it draws that itself.
 
     Splats were trained to be blended in sRGB, and a viewport blends linearly: their soft edges are
     right over what is known to be behind them.
     """
-    shading, theme = (
-        context.space_data.shading,
-        context.preferences.themes[0].view_3d.space.gradients,
-    )
-    source = background_source(context)
+    shading, scene = context.space_data.shading, context.scene
+    theme = context.preferences.themes[0].view_3d.space.gradients
+    if shading.type in ("SOLID", "WIREFRAME"):
+        source = shading.background_type
+    elif shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world:
+        is_plain = keeps_colors(scene) and not scene.render.film_transparent
+        color = world_color(scene) if is_plain else None
+        return None if color is None else srgb(color), False
+    else:
+        source = "STUDIO" if shading.studiolight_background_alpha else "THEME"
     if source == "THEME":
-        return None if theme.background_type == "RADIAL" else tuple(theme.high_gradient)
+        return None if theme.background_type == "RADIAL" else tuple(theme.high_gradient), True
     if source == "VIEWPORT":
-        return srgb(shading.background_color)
+        return srgb(shading.background_color), True
     if source == "WORLD":
-        return srgb(context.scene.world.color) if context.scene.world else (0.0, 0.0, 0.0)
-    if (
-        source == "SCENE"
-        and keeps_colors(context.scene)
-        and not context.scene.render.film_transparent
-    ):
-        color = world_color(context.scene)
-        return None if color is None else srgb(color)
-    return None
+        return srgb(scene.world.color) if scene.world else (0.0, 0.0, 0.0), True
+    return None, True
 
 
 def has_scene_depth(space: Any) -> bool:
@@ -208,20 +198,6 @@ def has_scene_depth(space: Any) -> bool:
     Render engines leave it zero where overlays are off: always in 4.3, at times in 5.2.
     """
     return bool(space.overlay.show_overlays) or space.shading.type in ("SOLID", "WIREFRAME")
-
-
-def background_source(context: Any) -> str:
-    """What gives a viewport its background: THEME, VIEWPORT, WORLD (its color for viewports), SCENE
-    or STUDIO."""
-    shading = context.space_data.shading
-    if shading.type in ("SOLID", "WIREFRAME"):
-        return str(shading.background_type)
-    uses_world = (
-        shading.use_scene_world_render if shading.type == "RENDERED" else shading.use_scene_world
-    )
-    return (
-        "SCENE" if uses_world else "THEME" if not shading.studiolight_background_alpha else "STUDIO"
-    )
 
 
 @persistent
@@ -236,14 +212,14 @@ def _scene_changed(*_: Any) -> None:
 
 def register() -> None:
     bpy.app.handlers.load_pre.append(_forget_file)
-    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post):
-        handlers.append(_scene_changed)
+    bpy.app.handlers.depsgraph_update_post.append(_scene_changed)
+    bpy.app.handlers.frame_change_post.append(_scene_changed)
     display.start()
 
 
 def unregister() -> None:
     bpy.app.handlers.load_pre.remove(_forget_file)
-    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post):
-        handlers.remove(_scene_changed)
+    bpy.app.handlers.depsgraph_update_post.remove(_scene_changed)
+    bpy.app.handlers.frame_change_post.remove(_scene_changed)
     display.failed = False
     display.stop()

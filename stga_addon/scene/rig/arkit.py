@@ -1,7 +1,5 @@
-"""ARKit's 52 shapes in Blender: controls on a FLAME rig, and heads that have shape keys of these
-names."""
+"""ARKit's 52 shapes: controls on a FLAME rig, and heads with shape keys of these names."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +8,7 @@ from ...driving.head_map import PRODUCTS, HeadMap
 from ...driving.performance import ARKIT_SHAPES, COLUMN, COUNT, arkit_name
 from ...driving.shapes import MOUTH_CLOSE
 from ...errors import StgaError
-from ..animation import add_driver, write_curve
+from ..arrays import add_driver, write_curve
 from ..compat import action_curves, push_down_action
 from .keyframes import (
     check_keyable,
@@ -59,33 +57,36 @@ def add_controls(head: Any, rig: Any, found: HeadMap) -> None:
     products[PRODUCTS, : found.expressions.shape[1]] = found.expressions[COUNT:]
     parts = [_parts(linear[:, column], products[:, column]) for column in range(linear.shape[1])]
     rig[SUMS] = [0.0] * sum(map(len, parts))
-    slot, paths = 0, []
+    slot, sums = 0, list[dict[str, tuple[Any, str]]]()
     for column_parts in parts:
-        paths.append(
-            [f"{property_path(SUMS)}[{slot + number}]" for number in range(len(column_parts))]
-        )
-        for text, columns in column_parts:
-            variables = {
-                VARIABLES[k]: (rig, property_path(ARKIT_SHAPES[c])) for k, c in enumerate(columns)
-            }
-            variables["o"] = (rig, property_path("jawOpen"))
+        sums.append({})
+        for letter, (text, columns) in zip(VARIABLES, column_parts, strict=False):
+            shapes = ["jawOpen", *(ARKIT_SHAPES[column] for column in columns)]
+            sources = [(rig, property_path(shape)) for shape in shapes]
+            variables = dict(zip("o" + VARIABLES, sources, strict=False))
             add_driver(rig, property_path(SUMS), slot, text, variables)
+            sums[-1][letter] = rig, f"{property_path(SUMS)}[{slot}]"
             slot += 1
-    count = found.expressions.shape[1]
-    for component, terms in enumerate(paths[:count]):
+    count, keys = found.expressions.shape[1], head.data.shape_keys
+    for component, variables in enumerate(sums[:count]):
         key = expression_key(head, component)
-        if terms and key in head.data.shape_keys.key_blocks:
-            variables = {VARIABLES[k]: (rig, path) for k, path in enumerate(terms)}
-            add_driver(
-                head.data.shape_keys, key_value_path(key), -1, "+".join(variables), variables
-            )
+        if variables and key in keys.key_blocks:
+            add_driver(keys, key_value_path(key), -1, "+".join(variables), variables)
     for joint, rows in JOINT_ROWS.items():
-        _drive_joint(rig, joint, [paths[count + row] for row in rows])
+        # A quaternion by its axis-angle, each of whose components is at most one sum.
+        terms = zip("abc", (sums[count + row] for row in rows), strict=True)
+        variables = {letter: term["a"] for letter, term in terms if term}
+        if variables:
+            squared = "+".join(f"{letter}*{letter}" for letter in variables)
+            length, path = f"sqrt({squared}+1e-12)", rotation_path(joint)
+            add_driver(rig, path, 0, f"cos({length}/2)", variables)
+            for element, letter in enumerate("abc", 1):
+                text = f"{letter}*sin({length}/2)/{length}" if letter in variables else "0"
+                add_driver(rig, path, element, text, variables)
 
 
 def remove_controls(head: Any, rig: Any) -> None:
-    """Remove the controls with their drivers and keyframes: expressions, jaw and eyes play their
-    own again."""
+    """Remove the controls: expressions, jaw and eyes play their own again."""
     remove_drivers(head, rig)
     if rig.animation_data is not None and rig.animation_data.action is not None:
         curves, controls = action_curves(rig), control_paths().values()
@@ -101,37 +102,23 @@ def remove_drivers(head: Any, rig: Any) -> None:
         return
     for owner in (rig, head.data.shape_keys):
         for driver in [] if owner.animation_data is None else list(owner.animation_data.drivers):
-            targets = [
-                target.data_path
-                for variable in driver.driver.variables
-                for target in variable.targets
-            ]
-            if driver.data_path == property_path(SUMS) or any(
-                path.startswith(property_path(SUMS)) for path in targets
-            ):
+            paths = [target.data_path for v in driver.driver.variables for target in v.targets]
+            if any(path.startswith(property_path(SUMS)) for path in [driver.data_path, *paths]):
                 owner.animation_data.drivers.remove(driver)
     del rig[SUMS]
 
 
 def shape_key_names(head: Any) -> dict[int, str]:
-    """Column of the 52 -> the shape key of an object that has its name in any spelling; empty
-    without any."""
+    """Column of the 52 -> shape key that has its name in any spelling."""
     keys = head.data.shape_keys if head.type == "MESH" else None
     blocks = [] if keys is None else [block.name for block in keys.key_blocks[1:]]
-    return {
-        COLUMN[name]: block for block in reversed(blocks) if (name := arkit_name(block)) is not None
-    }
+    return {COLUMN[name]: block for block in reversed(blocks) if (name := arkit_name(block))}
 
 
 def apply_weights(
-    owner: Any,
-    paths: dict[int, str],
-    weights: np.ndarray,
-    start: int,
-    name: str,
-    as_strip: bool = False,
-    neck: np.ndarray | None = None,
-) -> None:
+    owner: Any, paths: dict[int, str], weights: np.ndarray, start: int, name: str,
+    as_strip: bool = False, neck: np.ndarray | None = None,
+) -> None:  # fmt: skip
     """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T,
     52), one row per Blender frame from `start` on.
 
@@ -163,57 +150,32 @@ def control_paths() -> dict[int, str]:
 
 
 def checked_shape_keys(head: Any) -> dict[int, str]:
-    """Column -> data path of the shape keys with ARKit names. Raises StgaError where the object has
-    none."""
+    """Column -> data path of the keys with ARKit names. Raises StgaError without any."""
     names = shape_key_names(head)
     if not names:
         raise StgaError(
-            f"{head.name}: has neither a FLAME rig nor shape keys with ARKit's names, such as jawOpen"
+            f"{head.name}: has neither a FLAME rig nor shape keys with ARKit's names (jawOpen)"
         )
     return {column: key_value_path(name) for column, name in names.items()}
 
 
 def _parts(linear: np.ndarray, products: np.ndarray) -> list[tuple[str, list[int]]]:
-    """Expressions, each within Blender's limit, and the shapes that their variables are, whose sum
-    is one parameter."""
+    """Expressions within Blender's limit that add up to a parameter, and their variables."""
     found: list[tuple[str, list[int]]] = []
     text = ""
     columns: list[int] = []
     for column in np.flatnonzero(np.abs(linear) + np.abs(products) > NEGLIGIBLE).tolist():
+        factor, product = float(linear[column]), float(products[column])
         for _ in range(2):
-            variable, factor, product = (
-                VARIABLES[len(columns)],
-                float(linear[column]),
-                float(products[column]),
-            )
+            variable = VARIABLES[len(columns)]
             # mouthClose counts up to jawOpen (`effective_weights`).
             value = f"min({variable},max(o,0))" if column == MOUTH_CLOSE else variable
-            has_product = abs(product) > NEGLIGIBLE
-            term = (
-                f"+{value}*({factor:.4e}{product:+.4e}*o)"
-                if has_product
-                else f"{factor:+.4e}*{value}"
-            )
+            term = f"{factor:+.4e}*{value}"
+            if abs(product) > NEGLIGIBLE:
+                term = f"+{value}*({factor:.4e}{product:+.4e}*o)"
             if len(text) + len(term) <= MAX_EXPRESSION and len(columns) + 1 < len(VARIABLES):
                 break
             found.append((text, columns))
             text, columns = "", []
         text, columns = text + term, [*columns, column]
     return [*found, (text, columns)] if columns else found
-
-
-def _drive_joint(rig: Any, joint: str, terms: Sequence[Sequence[str]]) -> None:
-    """Drive a bone's quaternion by its axis-angle, whose three components are sums of at most one
-    term each."""
-    variables = {
-        letter: (rig, paths[0]) for letter, paths in zip("abc", terms, strict=True) if paths
-    }
-    if not variables:
-        return
-    squared = "+".join(f"{letter}*{letter}" for letter in variables)
-    length = f"sqrt({squared}+1e-12)"
-    path = rotation_path(joint)
-    add_driver(rig, path, 0, f"cos({length}/2)", variables)
-    for element, letter in enumerate("abc", 1):
-        text = f"{letter}*sin({length}/2)/{length}" if letter in variables else "0"
-        add_driver(rig, path, element, text, variables)

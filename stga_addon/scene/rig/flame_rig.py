@@ -13,7 +13,7 @@ therefore the child of a hidden bone `<name>_joint`, driven to d, and the parent
 evaluates without Python.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import bpy
@@ -22,11 +22,10 @@ from mathutils import Matrix
 
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, joint_positions, shaped_vertices
-from ...flame.model import JOINTS, FlameModel
+from ...flame.model import JOINTS
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import tags
-from ..animation import add_driver
-from ..arrays import flat_floats
+from ..arrays import add_driver, flat_floats
 from ..objects import Warn, leave_edit_mode, log_warning, place, remove
 from .keyframes import (
     EXPRESSION_NAMES,
@@ -48,7 +47,6 @@ from .keyframes import (
 BONE_LENGTH = 0.03  # meters; only how long the bones are displayed
 # meters along an axis that a joint may be off when all sliders are at their limits
 NEGLIGIBLE_DISPLACEMENT = 1e-6
-QUATERNION = ("w", "x", "y", "z")
 SQUARED_NORM = "(w*w+x*x+y*y+z*z)"  # keyed quaternions are interpolated without normalization
 # (rotation - identity) / 2 as quadratic forms of the quaternion, row by row.
 ROTATION_MINUS_IDENTITY = (
@@ -77,32 +75,52 @@ def add_rig(
     or "moving" for the shape keys and drivers of those joints only that turn in the frames.
     """
     model = sequence.model
-    basis = shaped_vertices(
-        model, sequence.shape, np.zeros(model.n_expression), sequence.static_offset
-    )
+    no_expression = np.zeros(model.n_expression)
+    basis = shaped_vertices(model, sequence.shape, no_expression, sequence.static_offset)
     sliders = slider_components(model)
     # (5, 3, K): how far each component of the shape moves each joint.
-    directions = np.einsum(
-        "jv,vck->jck", model.j_regressor, model.shapedirs[:, :, list(sliders.values())]
-    )
+    shapes = model.shapedirs[:, :, list(sliders.values())]
+    directions = np.einsum("jv,vck->jck", model.j_regressor, shapes)
     has_offsets = any(frame.dynamic_offset is not None for frame in frames)
     displaced = [has_offsets or any(_significant_terms(direction)) for direction in directions]
+    deformed = [deform_bone(n) if moves else n for n, moves in zip(JOINTS, displaced, strict=True)]
     _remove_bone_groups(head, _rigs(head))
-    rig = _place_armature(head, joint_positions(model, basis), model.parents, displaced)
-    _skin(head, rig, model.weights, displaced)
+    rig = _place_armature(head, joint_positions(model, basis), model.parents, deformed)
+    for name, column in zip(deformed, model.weights.T, strict=True):
+        group = head.vertex_groups.new(name=name)
+        for vertex in np.flatnonzero(column).tolist():
+            group.add([vertex], column[vertex], "REPLACE")
+    modifiers = (old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig)
+    modifier = next(modifiers, None) or head.modifiers.new(rig.name, "ARMATURE")
+    modifier.object = rig
+    modifier.use_vertex_groups, modifier.use_bone_envelopes = True, False
+    modifier.use_deform_preserve_volume = False
     if model.expression_names:
         head[EXPRESSION_NAMES] = ",".join(model.expression_names)
     for name, component in sliders.items():
         _new_shape_key(head, name, basis + model.shapedirs[:, :, component], MAX_SLIDER)
-    corrected = (
-        np.ones(len(JOINTS), bool)
-        if correctives == "all"
-        else joint_angles(frames) > MIN_JOINT_ANGLE_DEG
-    )
-    _add_pose_correctives(head, rig, model, basis, corrected)
+    corrected = np.array(correctives == "all") | (joint_angles(frames) > MIN_JOINT_ANGLE_DEG)
+    # Nine per joint, each driven by one entry of the joint's rotation minus identity.
+    for feature in range(model.posedirs.shape[2]):
+        joint, row, column = 1 + feature // 9, feature % 9 // 3, feature % 3
+        if not corrected[joint] or not model.posedirs[:, :, feature].any():
+            continue
+        name, path = f"pose_{JOINTS[joint]}_{row}{column}", rotation_path(JOINTS[joint])
+        _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
+        expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
+        rotation = {letter: (rig, f"{path}[{k}]") for k, letter in enumerate("wxyz")}
+        add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
     key_motion(head, rig, sequence.timesteps, frames, warn=warn)
     if has_offsets:
-        _add_offset_keys(head, rig, sequence, frames, basis, warn)
+        warn(
+            f"{head.name}: the capture has a dynamic_offset per frame, which a rig cannot "
+            f"represent; added one shape key per timestep ({len(frames)})"
+        )
+        for timestep, frame in zip(sequence.timesteps, frames, strict=True):
+            offset = 0 if frame.dynamic_offset is None else frame.dynamic_offset
+            _new_shape_key(head, offset_key(timestep), basis + offset, 1.0)
+        for name in JOINTS:
+            rig[offset_property(name)] = [0.0] * 3
         key_tracked_offsets(head, rig, sequence, frames, sequence.timesteps)
     for joint in np.flatnonzero(displaced).tolist():
         _drive_joint(head, rig, JOINTS[joint], list(sliders), directions[joint])
@@ -112,15 +130,12 @@ def add_rig(
 def rig_of(head: Any) -> Any:
     """The armature object that moves `head`. Raises StgaError where it has no FLAME rig."""
     for modifier in head.modifiers:
-        if (
-            modifier.type == "ARMATURE"
-            and modifier.object is not None
-            and modifier.object.get(tags.KIND) == tags.RIG
-        ):
-            return modifier.object
+        rig = modifier.object if modifier.type == "ARMATURE" else None
+        if rig is not None and rig.get(tags.KIND) == tags.RIG:
+            return rig
     raise StgaError(
-        f"{head.name}: has no FLAME rig, because it was not imported from FLAME parameters; its splats follow "
-        "whatever moves its mesh (shape keys, modifiers, a mesh cache)"
+        f"{head.name}: has no FLAME rig, because it was not imported from FLAME parameters; "
+        "its splats follow whatever moves its mesh (shape keys, modifiers, a mesh cache)"
     )
 
 
@@ -128,10 +143,9 @@ def remove_rig(head: Any) -> None:
     """Remove the rig of `head` and the modifiers that bind the head to it, where it has one."""
     rigs = _rigs(head)
     _remove_bone_groups(head, rigs)
-    for modifier in [
-        old for old in head.modifiers if old.type == "ARMATURE" and old.object in rigs
-    ]:
-        head.modifiers.remove(modifier)
+    for modifier in list(head.modifiers):
+        if modifier.type == "ARMATURE" and modifier.object in rigs:
+            head.modifiers.remove(modifier)
     remove(rigs)
 
 
@@ -146,19 +160,39 @@ def _rigs(head: Any) -> list[Any]:
 
 
 def _place_armature(
-    head: Any, joints: np.ndarray, parents: np.ndarray, displaced: Sequence[bool]
+    head: Any, joints: np.ndarray, parents: np.ndarray, deformed: Sequence[str]
 ) -> Any:
-    root = head.parent
-    title = f"{root.name} rig"
-    rig = place(
-        root,
-        tags.RIG,
-        title,
-        _armature(title, joints, parents, displaced),
-        next(iter(_rigs(head)), None),
-    )
+    """The rig's object with bones at joints (5, 3); deformed: the bone that each one's vertices
+    follow."""
+    title = f"{head.parent.name} rig"
+    armature = bpy.data.armatures.new(title)
+    temporary = bpy.data.objects.new(title, armature)  # edit mode needs an object that is visible
+    layer = bpy.context.view_layer
+    active = layer.objects.active
+    leave_edit_mode()
+    bpy.context.scene.collection.objects.link(temporary)
+    layer.objects.active = temporary
+    bpy.ops.object.mode_set(mode="EDIT")
+    for name, last, parent, (x, y, z) in zip(
+        JOINTS, deformed, parents.tolist(), joints.tolist(), strict=True
+    ):
+        above = deformed[parent] if parent >= 0 else None
+        for link in [name] if last == name else [parent_bone(name), name, last]:
+            edited = armature.edit_bones.new(link)
+            # Along +Y without roll, its rest orientation is the identity: its rotation is FLAME's.
+            edited.head, edited.tail, edited.roll = (x, y, z), (x, y + BONE_LENGTH, z), 0.0
+            edited.parent = armature.edit_bones[above] if above else None
+            above = link
+    bpy.ops.object.mode_set(mode="OBJECT")
+    layer.objects.active = active
+    bpy.data.objects.remove(temporary)
+    visible, hidden = armature.collections.new("Joints"), armature.collections.new("Helpers")
+    hidden.is_visible = False
+    for made in armature.bones:
+        (visible if made.name in JOINTS else hidden).assign(made)
+    rig = place(head.parent, tags.RIG, title, armature, next(iter(_rigs(head)), None))
     rig.show_in_front = True
-    bpy.context.view_layer.update()  # creates the pose bones
+    layer.update()  # creates the pose bones
     for name in JOINTS:  # an earlier import's
         rig.pop(sum_property(name), None)
         rig.pop(offset_property(name), None)
@@ -171,104 +205,11 @@ def _place_armature(
     return rig
 
 
-def _armature(name: str, joints: np.ndarray, parents: np.ndarray, displaced: Sequence[bool]) -> Any:
-    armature = bpy.data.armatures.new(name)
-    temporary = bpy.data.objects.new(name, armature)  # edit mode needs an object that is visible
-    layer = bpy.context.view_layer
-    active = layer.objects.active
-    leave_edit_mode()
-    bpy.context.scene.collection.objects.link(temporary)
-    layer.objects.active = temporary
-    bpy.ops.object.mode_set(mode="EDIT")
-    for joint, (bone, parent) in enumerate(zip(JOINTS, parents.tolist(), strict=True)):
-        above = _skinning_bone(parent, displaced) if parent >= 0 else None
-        chain = [parent_bone(bone), bone, deform_bone(bone)] if displaced[joint] else [bone]
-        for link in chain:
-            edited, head = armature.edit_bones.new(link), joints[joint].tolist()
-            # Along +Y without roll it has the identity as rest orientation: its rotation is FLAME's
-            # own.
-            edited.head, edited.tail, edited.roll = (
-                head,
-                (head[0], head[1] + BONE_LENGTH, head[2]),
-                0.0,
-            )
-            edited.parent = armature.edit_bones[above] if above else None
-            above = link
-    bpy.ops.object.mode_set(mode="OBJECT")
-    layer.objects.active = active
-    bpy.data.objects.remove(temporary)
-    visible, hidden = armature.collections.new("Joints"), armature.collections.new("Helpers")
-    hidden.is_visible = False
-    for made in armature.bones:
-        (visible if made.name in JOINTS else hidden).assign(made)
-    return armature
-
-
-def _skinning_bone(joint: int, displaced: Sequence[bool]) -> str:
-    return deform_bone(JOINTS[joint]) if displaced[joint] else JOINTS[joint]
-
-
-def _skin(head: Any, rig: Any, weights: np.ndarray, displaced: Sequence[bool]) -> None:
-    for joint, column in enumerate(weights.T):
-        group = head.vertex_groups.new(name=_skinning_bone(joint, displaced))
-        for vertex in np.flatnonzero(column).tolist():
-            group.add([vertex], column[vertex], "REPLACE")
-    modifier = next(
-        (old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig), None
-    )
-    modifier = modifier or head.modifiers.new(rig.name, "ARMATURE")
-    modifier.object = rig
-    modifier.use_vertex_groups, modifier.use_bone_envelopes = True, False
-    modifier.use_deform_preserve_volume = False
-
-
 def _new_shape_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> None:
     key = head.shape_key_add(name=name, from_mix=False)
     key.points.foreach_set("co", flat_floats(vertices))
     key.slider_min, key.slider_max = -limit, limit
     key.value = 0.0  # a key made from a script starts at 1
-
-
-def _add_pose_correctives(
-    head: Any, rig: Any, model: FlameModel, basis: np.ndarray, corrected: np.ndarray
-) -> None:
-    """FLAME's pose correctives, nine per joint, each driven by one entry of the joint's rotation
-    minus identity.
-
-    corrected (5,) bool: joints that get theirs.
-    """
-    for feature in range(model.posedirs.shape[2]):
-        joint, entry = divmod(feature, 9)
-        if not corrected[1 + joint] or not model.posedirs[:, :, feature].any():
-            continue
-        bone, row, column = JOINTS[1 + joint], *divmod(entry, 3)
-        name = f"pose_{bone}_{row}{column}"
-        _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
-        expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
-        rotation = {
-            letter: (rig, f"{rotation_path(bone)}[{element}]")
-            for element, letter in enumerate(QUATERNION)
-        }
-        add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
-
-
-def _add_offset_keys(
-    head: Any,
-    rig: Any,
-    sequence: FlameSequence,
-    frames: Sequence[FlameFrame],
-    basis: np.ndarray,
-    warn: Warn,
-) -> None:
-    warn(
-        f"{head.name}: the capture has a dynamic_offset per frame, which a rig cannot represent; added one shape key"
-        f" per timestep ({len(frames)})"
-    )
-    for timestep, frame in zip(sequence.timesteps, frames, strict=True):
-        vertices = basis if frame.dynamic_offset is None else basis + frame.dynamic_offset
-        _new_shape_key(head, offset_key(timestep), vertices, 1.0)
-    for name in JOINTS:
-        rig[offset_property(name)] = [0.0] * 3
 
 
 def _significant_terms(directions: np.ndarray) -> list[list[int]]:
@@ -294,41 +235,26 @@ def _drive_joint(
     Blender limits an expression's length, so partial sums are driven first, in a property of the
     rig.
     """
-    summands = _drive_partial_sums(head, rig, joint, sliders, directions)
-    for axis in range(3):
-        paths = summands[axis]
-        if offset_property(joint) in rig:
-            paths.append(f"{property_path(offset_property(joint))}[{axis}]")
-        if paths:
-            total, variables = (
-                "+".join(VARIABLES[: len(paths)]),
-                _variables((rig, path) for path in paths),
-            )
-            add_driver(rig, location_path(parent_bone(joint)), axis, total, variables)
-            add_driver(rig, location_path(deform_bone(joint)), axis, f"-({total})", variables)
-
-
-def _drive_partial_sums(
-    head: Any, rig: Any, joint: str, sliders: Sequence[str], directions: np.ndarray
-) -> list[list[str]]:
-    """Drive the rig's property of partial sums; returns the data paths to add up, per axis."""
     parts = [
         (axis, terms[start : start + len(VARIABLES)])
         for axis, terms in enumerate(_significant_terms(directions))
         for start in range(0, len(terms), len(VARIABLES))
     ]
-    path = property_path(sum_property(joint))
-    summands: list[list[str]] = [[], [], []]
+    keys, sums, offset = head.data.shape_keys, sum_property(joint), offset_property(joint)
     if parts:
-        rig[sum_property(joint)] = [0.0] * len(parts)
+        rig[sums] = [0.0] * len(parts)
+    summands: list[list[str]] = [[], [], []]
     for slot, (axis, terms) in enumerate(parts):
         weighted = zip(directions[axis, terms], VARIABLES, strict=False)
         expression = "".join(f"{weight:+.5e}*{letter}" for weight, letter in weighted)
-        variables = _variables((head.data.shape_keys, key_value_path(sliders[k])) for k in terms)
-        add_driver(rig, path, slot, expression, variables)
-        summands[axis].append(f"{path}[{slot}]")
-    return summands
-
-
-def _variables(sources: Iterable[tuple[Any, str]]) -> dict[str, tuple[Any, str]]:
-    return dict(zip(VARIABLES, sources, strict=False))
+        sources = [(keys, key_value_path(sliders[k])) for k in terms]
+        variables = dict(zip(VARIABLES, sources, strict=False))
+        add_driver(rig, property_path(sums), slot, expression, variables)
+        summands[axis].append(f"{property_path(sums)}[{slot}]")
+    for axis, paths in enumerate(summands):
+        paths += [f"{property_path(offset)}[{axis}]"] if offset in rig else []
+        if paths:
+            variables = dict(zip(VARIABLES, ((rig, path) for path in paths), strict=False))
+            total = "+".join(variables)
+            add_driver(rig, location_path(parent_bone(joint)), axis, total, variables)
+            add_driver(rig, location_path(deform_bone(joint)), axis, f"-({total})", variables)

@@ -1,5 +1,4 @@
-"""The tracked head as an animated Blender mesh, and meshes with shape keys as linear head
-models."""
+"""The tracked head as an animated mesh, and meshes with shape keys as head models."""
 
 from typing import Any
 
@@ -8,10 +7,18 @@ import numpy as np
 from ...capture.model import Capture
 from ...errors import StgaError
 from .. import tags
-from ..animation import write_triangle_curves
-from ..arrays import Z_UP_TO_Y_UP, flat_floats, has_triangles, read_values, triangle_mesh
+from ..arrays import (
+    Z_UP_TO_Y_UP,
+    flat_floats,
+    has_triangles,
+    key_points,
+    read_values,
+    triangle_mesh,
+    write_triangle_curves,
+)  # fmt: skip
 from ..objects import Warn, capture_root, log_warning, place, reset
 from .flame_rig import add_rig, remove_rig
+from .keyframes import key_value_path
 
 
 def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "all") -> Any:
@@ -38,9 +45,10 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
     head = _place_head(capture)
     remove_rig(head)
     names = [f"t{timestep:05d}" for timestep in capture.timesteps]
-    for key_name, mesh in zip(names, meshes, strict=True):
-        head.shape_key_add(name=key_name, from_mix=False).points.foreach_set("co", mesh.ravel())
-    write_triangle_curves(head.data.shape_keys, names, capture.timesteps)
+    for name, mesh in zip(names, meshes, strict=True):
+        head.shape_key_add(name=name, from_mix=False).points.foreach_set("co", mesh.ravel())
+    keys = head.data.shape_keys
+    write_triangle_curves(keys, [key_value_path(name) for name in names], capture.timesteps)
     return head
 
 
@@ -48,34 +56,29 @@ def _place_head(capture: Capture) -> Any:
     root = capture_root(capture.root)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
     if head is not None and has_triangles(head.data, capture.faces):
-        _update_mesh(head, capture)
+        # Into the same mesh, which keeps materials, vertex groups and painted attributes.
+        reset(head)
+        mesh = head.data
+        mesh.vertices.foreach_set("co", flat_floats(capture.neutral))
+        mesh.update()
+        for name in mesh.attributes.keys():  # noqa: SIM118
+            if name.startswith(tags.REGION_PREFIX):
+                mesh.attributes.remove(mesh.attributes[name])
+        # last first: removing a group renumbers those after it
+        for group in reversed(list(head.vertex_groups)):
+            timestep = tags.group_timestep(group.name)
+            if timestep is not None and timestep not in capture.timesteps:
+                head.vertex_groups.remove(group)
     else:
         title = f"{root.name} head"
-        head = place(
-            root, tags.HEAD, title, triangle_mesh(title, capture.neutral, capture.faces), head
-        )
+        mesh = triangle_mesh(title, capture.neutral, capture.faces)
+        head = place(root, tags.HEAD, title, mesh, head)
     for region, members in capture.regions.items():
         attribute = head.data.attributes.new(tags.REGION_PREFIX + region, "BOOLEAN", "FACE")
         attribute.data.foreach_set("value", np.ascontiguousarray(members, bool))
     head[tags.TIMESTEPS] = [int(timestep) for timestep in capture.timesteps]
     head.shape_key_add(name="Basis", from_mix=False)
     return head
-
-
-def _update_mesh(head: Any, capture: Capture) -> None:
-    """Import into a mesh with the same triangles, which keeps its materials, vertex groups and
-    painted attributes."""
-    reset(head)
-    mesh = head.data
-    mesh.vertices.foreach_set("co", flat_floats(capture.neutral))
-    mesh.update()
-    for name in [name for name in mesh.attributes.keys() if name.startswith(tags.REGION_PREFIX)]:  # noqa: SIM118
-        mesh.attributes.remove(mesh.attributes[name])
-    # last first: removing a group renumbers those after it
-    for group in reversed(list(head.vertex_groups)):
-        timestep = tags.group_timestep(group.name)
-        if timestep is not None and timestep not in capture.timesteps:
-            head.vertex_groups.remove(group)
 
 
 def has_shape_keys(thing: Any) -> bool:
@@ -92,19 +95,13 @@ def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     Modifiers, values and drivers are left out. Raises StgaError for an object without shape keys.
     """
     if not has_shape_keys(thing):
-        raise StgaError(
-            f"{thing.name}: has no shape keys; a head model needs a basis and expressions"
-        )
+        raise StgaError(f"{thing.name}: has no shape keys; a head model needs some")
     turn = Z_UP_TO_Y_UP @ np.array(thing.matrix_world)
     basis = thing.data.shape_keys.reference_key
-    mean = _points(basis) @ turn[:3, :3].T + turn[:3, 3]
+    mean = key_points(basis) @ turn[:3, :3].T + turn[:3, 3]
     others = [block for block in thing.data.shape_keys.key_blocks if block != basis]
-    moved = np.stack([_points(block) - _points(block.relative_key) for block in others], axis=2)
+    moved = np.stack([key_points(each) - key_points(each.relative_key) for each in others], axis=2)
     shapes = np.einsum("ab,vbk->vak", turn[:3, :3], moved)
     thing.data.calc_loop_triangles()
     faces = read_values(thing.data.loop_triangles, "vertices", 3, np.int32)
     return mean, faces, tuple(block.name for block in others), shapes
-
-
-def _points(block: Any) -> np.ndarray:
-    return read_values(block.data, "co", 3).astype(np.float64)

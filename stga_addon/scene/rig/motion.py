@@ -1,12 +1,13 @@
-"""Motion of a FLAME head: applied, sampled, set live, and compared with what its avatar was trained
-on."""
+"""Motion of a FLAME head: applied, sampled, set live, and compared with its training."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...driving.open_motion import PART_FIELDS, TrainedRange, outside
 from ...driving.performance import ARKIT_SHAPES
@@ -15,7 +16,7 @@ from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, to_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
-from ..arrays import evaluated_vertices, read_values
+from ..arrays import evaluated_vertices, key_points
 from ..blend_file import iterate_frames
 from ..compat import push_down_action
 from ..objects import Warn, log_warning
@@ -39,8 +40,7 @@ from .keyframes import (
 )
 
 MESH_TOLERANCE = 1e-4
-"""Metres that the mesh in the scene may differ from FLAME's forward pass of the sampled
-parameters."""
+"""Metres that the mesh may differ from FLAME's of the sampled parameters."""
 
 
 def apply_motion(
@@ -65,20 +65,16 @@ def apply_motion(
     rig = rig_of(head)
     check_keyable(rig, JOINTS)
     check_keyable(head.data.shape_keys)
-    used = (
-        np.any([frame.expr != 0 for frame in frames], axis=0)
-        if "expression" in parts
-        else np.zeros(0, bool)
-    )
-    for component in np.flatnonzero(used).tolist():
+    used = np.any([frame.expr != 0 for frame in frames], axis=0)
+    for component in np.flatnonzero(used).tolist() if "expression" in parts else ():
         if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
             raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
     # Coefficients of the sliders that the motion lacks are zero.
     sliders = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
-    padded = [
-        np.pad(frame.expr[:sliders], (0, max(0, sliders - len(frame.expr)))) for frame in frames
+    frames = [
+        replace(each, expr=np.pad(each.expr, (0, max(0, sliders - len(each.expr))))[:sliders])
+        for each in frames
     ]
-    frames = [replace(frame, expr=expr) for frame, expr in zip(frames, padded, strict=True)]
     owners = animated_by(head, rig, parts)
     for owner in owners:
         start_action(owner, f"{owner.name} {name}", lambda path: is_of_parts(path, parts), as_strip)
@@ -122,17 +118,16 @@ def sample_motion(
         frames.append(frame)
     if largest_error > MESH_TOLERANCE:
         warn(
-            f"{head.name}: its mesh differs from FLAME's by up to {1000 * largest_error:.1f} mm, because something"
-            " that is no FLAME parameter moves it; the exported parameters leave that out"
+            f"{head.name}: its mesh differs from FLAME's by up to {1000 * largest_error:.1f} mm, "
+            "because something that is no FLAME parameter moves it; the exported parameters "
+            "leave that out"
         )
-    return FlameSequence(
-        sequence.model, shape, sequence.static_offset, tuple(range(len(frames))), frames.__getitem__
-    )
+    timesteps = tuple(range(len(frames)))
+    return replace(sequence, shape=shape, timesteps=timesteps, frame=frames.__getitem__)
 
 
 def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
-    """FLAME parameters of the head as it is posed in the scene now, keyed or not. Raises StgaError
-    without a rig."""
+    """FLAME parameters of the head as posed now, keyed or not. Raises StgaError without a rig."""
     return _sample_frame(head, rig_of(head), model)
 
 
@@ -141,46 +136,30 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
     rotations = {name: bones[name].matrix.to_3x3().normalized() for name in JOINTS}
     vectors = {}
     for name, parent in zip(JOINTS, model.parents.tolist(), strict=True):
-        local = (
-            rotations[name]
-            if parent < 0
-            else rotations[JOINTS[parent]].transposed() @ rotations[name]
-        )
-        vectors[name] = to_axis_angle(np.array(local.to_quaternion()))
+        above = rotations[JOINTS[parent]].transposed() if parent >= 0 else Matrix.Identity(3)
+        vectors[name] = to_axis_angle(np.array((above @ rotations[name]).to_quaternion()))
     root, above = bones["root"], bones.get(parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
+    expressions = [expression_key(head, k) for k in range(model.n_expression)]
+    offsets = [
+        value * (key_points(key) - key_points(key.relative_key))
+        for key in offset_keys(head)
+        if (value := _key_value(head, key.name))
+    ]
     return FlameFrame(
-        expr=np.array(
-            [_key_value(head, expression_key(head, k)) for k in range(model.n_expression)]
-        ),
+        expr=np.array([_key_value(head, name) for name in expressions]),
         rotation=vectors["root"],
         neck_pose=vectors["neck"],
         jaw_pose=vectors["jaw"],
         translation=np.array(root.matrix.translation - rest),
         eyes_pose=np.concatenate([vectors["left_eye"], vectors["right_eye"]]),
-        dynamic_offset=_dynamic_offset(head),
+        dynamic_offset=np.sum(offsets, axis=0) if offsets else None,
     )
 
 
 def _key_value(head: Any, name: str) -> float:
     key = head.data.shape_keys.key_blocks.get(name)
     return 0.0 if key is None or key.mute else float(key.value)
-
-
-def _dynamic_offset(head: Any) -> np.ndarray | None:
-    """(V, 3) sum of the tracked per-frame offsets at their current values; None where all are
-    zero."""
-    total = None
-    for key in offset_keys(head):
-        value = _key_value(head, key.name)
-        if value:
-            offset = value * (_key_points(key) - _key_points(key.relative_key))
-            total = offset if total is None else total + offset
-    return total
-
-
-def _key_points(key: Any) -> np.ndarray:
-    return read_values(key.points, "co", 3).astype(np.float64)
 
 
 LIVE_JOINTS = ("neck", "jaw", "left_eye", "right_eye")
@@ -202,28 +181,20 @@ class LivePose:
         keys.foreach_get("value", self._sliders)
         self._values = self._sliders.copy()
         names = [key.name for key in keys]
-        self._turns: dict[str, tuple[float, ...]] = {}
-        self._properties: dict[str, Any] = {}
-        self._offsets: list[str] = []
         if rig is None:
-            self._rows = {
-                column: names.index(name) for column, name in shape_key_names(head).items()
-            }
+            named = shape_key_names(head).items()
+            self._rows = {column: names.index(name) for column, name in named}
             return
-        self._values[[is_expression_key(name) or name.startswith(OFFSET_KEY) for name in names]] = (
-            0.0
-        )
-        self._rows = dict(
-            enumerate(row for row, name in enumerate(names) if is_expression_key(name))
-        )
-        self._turns = {
-            joint: tuple(rig.pose.bones[joint].rotation_quaternion) for joint in LIVE_JOINTS
-        }
+        expressions = [row for row, name in enumerate(names) if is_expression_key(name)]
+        self._rows = dict(enumerate(expressions))
+        self._values[expressions] = 0.0
+        self._values[[name.startswith(OFFSET_KEY) for name in names]] = 0.0
+        bones = rig.pose.bones
+        self._turns = {joint: tuple(bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
         self._offsets = [name for joint in JOINTS if (name := offset_property(joint)) in rig]
-        controls = [] if self.takes_frames else list(ARKIT_SHAPES)
-        self._properties = {name: tuple(rig[name]) for name in self._offsets} | {
-            name: rig[name] for name in controls
-        }
+        self._properties: dict[str, Any] = {name: tuple(rig[name]) for name in self._offsets}
+        if not self.takes_frames:
+            self._properties |= {name: rig[name] for name in ARKIT_SHAPES}
 
     @property
     def is_there(self) -> bool:
@@ -234,8 +205,7 @@ class LivePose:
         return keys is not None and has_rig and len(keys.key_blocks) == len(self._sliders)
 
     def set_frame(self, frame: FlameFrame) -> None:
-        """Pose a FLAME head: expressions, jaw, eyes and neck; tracked per-frame offsets are
-        switched off."""
+        """Pose a FLAME head but for its place; tracked per-frame offsets are switched off."""
         for component, row in self._rows.items():
             self._values[row] = frame.expr[component] if component < len(frame.expr) else 0.0
         self._set_sliders(self._values)
@@ -243,8 +213,7 @@ class LivePose:
         self._set_turns(dict(zip(LIVE_JOINTS, from_axis_angle(np.stack(turns)), strict=True)))
 
     def set_weights(self, weights: Sequence[float] | np.ndarray, neck: np.ndarray) -> None:
-        """Set the 52 weights on controls or shape keys, and turn the neck of a FLAME head by an
-        axis-angle (3,)."""
+        """Set the 52 weights, and turn the neck of a FLAME head by an axis-angle (3,)."""
         limited = np.clip(weights, *WEIGHT_RANGE)
         if self._rig is None:
             for column, row in self._rows.items():
@@ -289,22 +258,18 @@ def store_range(head: Any, trained: TrainedRange) -> None:
     """Keep the range with the head, in its file."""
     head[TRAINED] = {
         f"{field} {part}": getattr(trained, field)[part].astype(float).tolist()
-        for field in FIELDS
-        for part in PART_FIELDS
+        for field, part in product(FIELDS, PART_FIELDS)
     }
 
 
 def stored_range(head: Any) -> TrainedRange | None:
     """The range that was kept with the head; None where there is none."""
     kept = head.get(TRAINED)
-    if kept is None:
+    names = {f"{field} {part}" for field, part in product(FIELDS, PART_FIELDS)}
+    if kept is None or set(kept.keys()) != names:
         return None
-    values = {name: np.array(kept[name], np.float64) for name in kept.keys()}  # noqa: SIM118, an IDPropertyGroup
-    if set(values) != {f"{field} {part}" for field in FIELDS for part in PART_FIELDS}:
-        return None
-    return TrainedRange(
-        *({part: values[f"{field} {part}"] for part in PART_FIELDS} for field in FIELDS)
-    )
+    values = {name: np.array(kept[name], np.float64) for name in names}
+    return TrainedRange(*({p: values[f"{field} {p}"] for p in PART_FIELDS} for field in FIELDS))
 
 
 def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
@@ -312,10 +277,8 @@ def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
     keys, bones = head.data.shape_keys.key_blocks, rig.pose.bones
     names = [expression_key(head, k) for k in range(len(trained.middle["face"]))]
     expr = np.array([keys[name].value if name in keys else 0.0 for name in names])
-    jaw, left, right = (
-        to_axis_angle(np.array(bones[bone].rotation_quaternion))
-        for bone in ("jaw", "left_eye", "right_eye")
-    )
+    turns = np.stack([bones[bone].rotation_quaternion for bone in LIVE_JOINTS[1:]])
+    jaw, left, right = to_axis_angle(turns)
     zero = np.zeros(3)
     frame = FlameFrame(expr, zero, zero, jaw, zero, np.concatenate([left, right]))
     return {part: float(values[0]) for part, values in outside([frame], trained).items()}

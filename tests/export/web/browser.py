@@ -46,7 +46,10 @@ class Browser:
             os.dup2(write, 4)
 
         self._process = subprocess.Popen(
-            [executable, *FLAGS, f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", "about:blank"],
+            [
+                executable, *FLAGS, f"--user-data-dir={profile}",
+                f"--window-size={size[0]},{size[1]}", "about:blank",
+            ],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=(3, 4), preexec_fn=place,
         )  # fmt: skip
         os.close(out_read)
@@ -90,7 +93,8 @@ class Browser:
         self.errors.clear()
         self.send("Page.navigate", url=address)
         self.evaluate(
-            "new Promise(r => document.readyState === 'complete' ? r() : addEventListener('load', r))"
+            "new Promise(done => document.readyState === 'complete' ? done() : "
+            "addEventListener('load', done))"
         )
 
     def evaluate(self, expression: str) -> Any:

@@ -23,7 +23,8 @@ SPLATS = 1500
 SIZE = 120
 READY = """new Promise((done) => {
   const avatar = document.querySelector('stga-avatar');
-  const look = () => (avatar.info || avatar.shadowRoot?.querySelector('p').textContent ? done() : setTimeout(look, 20));
+  const failed = () => avatar.shadowRoot?.querySelector('p').textContent;
+  const look = () => (avatar.info || failed() ? done() : setTimeout(look, 20));
   look();
 })"""
 

@@ -40,7 +40,10 @@ SNAPSHOT = """(async () => {
   avatar.background = '#ffffff';
   const blob = await avatar.snapshot();
   const reader = new FileReader();
-  return new Promise((done) => Object.assign(reader, { onload: () => done(reader.result) }).readAsDataURL(blob));
+  return new Promise((done) => {
+    reader.onload = () => done(reader.result);
+    reader.readAsDataURL(blob);
+  });
 })()"""
 
 
@@ -148,7 +151,8 @@ def test_controls(browser, head, tmp_path):
       input.value = 0.5;
       input.dispatchEvent(new Event('input'));
       avatar.frame = 1;
-      document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true }));
+      const press = new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true });
+      document.body.dispatchEvent(press);
       document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 's', bubbles: true }));
       const before = [...avatar.camera.matrix];
       document.getElementById('panel').hidden = false;
@@ -160,8 +164,9 @@ def test_controls(browser, head, tmp_path):
       avatar.player.draw();
       return { shown_value: shown, played, sliders: rows.length,
         pinned: document.querySelectorAll('.pinned').length, frame: avatar.frame,
-        value: avatar.player.motion.pinnedCoefficients[avatar.info.sliders[0].component], shown: avatar.showSelection,
-        notice: document.getElementById('number').textContent, name, jaw: avatar.player.motion.pinnedPose[6],
+        value: avatar.player.motion.pinnedCoefficients[avatar.info.sliders[0].component],
+        shown: avatar.showSelection, notice: document.getElementById('number').textContent, name,
+        jaw: avatar.player.motion.pinnedPose[6],
         views: document.getElementById('view').options.length, before };
     })()""")
     assert found["sliders"] == head.sequence.model.n_expression + 6
@@ -212,7 +217,8 @@ DAMAGED_PAGES: dict[str, tuple[Callable[[str], str], str]] = {
 }
 SHOWN = """(() => {
   const message = document.querySelector('stga-avatar')?.shadowRoot?.querySelector('p');
-  return [document.body?.innerText ?? '', message && !message.hidden ? message.textContent : ''].join(' ');
+  const said = message && !message.hidden ? message.textContent : '';
+  return [document.body?.innerText ?? '', said].join(' ');
 })()"""
 """Text that can be read on the page, also within the element."""
 

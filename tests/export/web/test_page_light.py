@@ -196,7 +196,8 @@ def test_light_controls(browser, tmp_path):
     show(browser, tmp_path, head.data())
     assert not browser.evaluate("document.getElementById('light').hidden")
     choose = "(() => {{ const list = document.querySelector('#light select'); list.value = '{}';"
-    choose += " list.dispatchEvent(new Event('change')); return document.querySelector('stga-avatar').lighting; }})()"
+    choose += " list.dispatchEvent(new Event('change'));"
+    choose += " return document.querySelector('stga-avatar').lighting; }})()"
     assert browser.evaluate(choose.format("studio")) == {
         "environment": "studio",
         "turn": 0,

@@ -39,7 +39,8 @@ CAMERA = "[...document.querySelector('stga-avatar').camera.matrix]"
 MIDDLE_IN_CAMERA = """(() => {
   const { player, camera } = document.querySelector('stga-avatar');
   const p = [...player.middle, 1];
-  return [0, 1, 2].map((row) => p.reduce((sum, value, k) => sum + camera.matrix[4 * row + k] * value, 0));
+  const m = camera.matrix;
+  return [0, 1, 2].map((row) => p.reduce((sum, value, k) => sum + m[4 * row + k] * value, 0));
 })()"""
 # Counts WebGL objects alive, draws one splat, and lets the test turn the clock of
 # requestAnimationFrame.
@@ -169,7 +170,8 @@ def test_sliders_are_flames(browser, head, tmp_path):
     found = browser.evaluate(f"""(() => {{
       const avatar = document.querySelector('stga-avatar');
       for (const [k, value] of Object.entries({expressions.tolist()})) {{
-        const input = document.querySelector(`.slider[data-name="expr_${{k.padStart(3, '0')}}"] input`);
+        const name = `expr_${{k.padStart(3, '0')}}`;
+        const input = document.querySelector(`.slider[data-name="${{name}}"] input`);
         input.value = value;
         input.dispatchEvent(new Event('input'));
       }}
@@ -197,9 +199,11 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
     show(browser, tmp_path, head.data())
     message = "document.querySelector('stga-avatar').shadowRoot.querySelector('p')"
     browser.evaluate("document.querySelector('stga-avatar').setExpression(1, 0.9)")
-    pictures = "document.querySelector('stga-avatar').player.read(document.querySelector('stga-avatar').camera)"
+    player = "document.querySelector('stga-avatar').player"
+    pictures = f"{player}.read({player}.camera)"
     before = browser.evaluate(f"Array.from({pictures})")
-    event = "new Promise((done) => avatar.shadowRoot.querySelector('canvas').addEventListener('webglcontext%s', %s))"
+    event = "new Promise((done) => avatar.shadowRoot.querySelector('canvas')"
+    event += ".addEventListener('webglcontext%s', %s))"
     browser.evaluate(f"""(async () => {{
       const avatar = document.querySelector('stga-avatar');
       window.extension = avatar.player.gl.getExtension('WEBGL_lose_context');
@@ -295,8 +299,9 @@ def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
         const avatar = document.querySelector('stga-avatar');
         if (!avatar.info || !avatar.playing) return setTimeout(look, 20);
         const { coefficients } = avatar.player.motion;
-        done({ title: avatar.info.title, height: avatar.clientHeight, width: avatar.clientWidth, loop: avatar.loop,
-          background: avatar.background, expression: coefficients[3], jaw: avatar.getPose('jaw')[0] });
+        done({ title: avatar.info.title, height: avatar.clientHeight, width: avatar.clientWidth,
+          loop: avatar.loop, background: avatar.background, expression: coefficients[3],
+          jaw: avatar.getPose('jaw')[0] });
       };
       look();
     })""")

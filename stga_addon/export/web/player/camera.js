@@ -1,5 +1,6 @@
 // @ts-check
-// Pinhole cameras (OpenCV axes: x right, y down, z ahead), and how mouse, pen and touch move one around a point.
+// Pinhole cameras (OpenCV axes: x right, y down, z ahead), and how mouse, pen and touch move one
+// around a point.
 
 /**
  * @import { Player } from './player.js'
@@ -12,19 +13,21 @@ import { box, crossed, difference, dotProduct, scaled, unit } from './vector.js'
 const MAX_ELEVATION = 1.54; // radians; short of the pole, where "up" has no direction
 const MIN_DISTANCE_M = 0.02;
 
-/**
- * A view of the data file as a camera: { size, focal, center } in pixels, matrix (16): world to camera, row-major.
- * @type {(view: View) => Camera}
- */
+// A view of the data file as a camera: { size, focal, center } in pixels, matrix (16): world to
+// camera, row-major.
+/** @type {(view: View) => Camera} */
 export function cameraOfView(view) {
   const { size, focal, center } = view;
-  return { size: [...size], focal: [...focal], center: [...center], matrix: Float64Array.from(view.world_to_camera) };
+  return {
+    size: [...size],
+    focal: [...focal],
+    center: [...center],
+    matrix: Float64Array.from(view.world_to_camera),
+  };
 }
 
-/**
- * The same camera for a canvas of another size, with the whole of its picture in the middle.
- * @type {(camera: Camera, width: number, height: number) => Camera}
- */
+// The same camera for a canvas of another size, with the whole of its picture in the middle.
+/** @type {(camera: Camera, width: number, height: number) => Camera} */
 export function fitted(camera, width, height) {
   const scale = Math.min(width / camera.size[0], height / camera.size[1]);
   return {
@@ -38,10 +41,8 @@ export function fitted(camera, width, height) {
   };
 }
 
-/**
- * A camera in front (+z, y up) of the points (3·V) for data without views.
- * @type {(points: ArrayLike<number>, up: Vector) => Camera}
- */
+// A camera in front (+z, y up) of the points (3·V) for data without views.
+/** @type {(points: ArrayLike<number>, up: Vector) => Camera} */
 export function frontCamera(points, up) {
   const [middle, radius] = bounds(points);
   const distance = 5 * radius;
@@ -50,25 +51,22 @@ export function frontCamera(points, up) {
   const x = unit(crossed(y, ahead));
   const z = crossed(x, y);
   const eye = difference(middle, scaled(z, distance));
-  const rows = [x, y, z].flatMap((row) => [...row, -dotProduct(row, eye)]);
+  const rows = [x, y, z].flatMap(row => [...row, -dotProduct(row, eye)]);
   const matrix = Float64Array.from([...rows, 0, 0, 0, 1]);
   return { size: [800, 800], focal: [1600, 1600], center: [400, 400], matrix };
 }
 
-/**
- * Middle of the bounding box of points (3·V), and half its diagonal.
- * @type {(points: ArrayLike<number>) => [Vector, number]}
- */
+// Middle of the bounding box of points (3·V), and half its diagonal.
+/** @type {(points: ArrayLike<number>) => [Vector, number]} */
 export function bounds(points) {
   const [low, high] = box(points);
   const diagonal = difference(high, low);
   return [difference(high, scaled(diagonal, 0.5)), Math.hypot(...diagonal) / 2];
 }
 
-/**
- * Turn a camera around the point `pivot`: by `yaw` about `up` and by `pitch` about its own x axis (radians).
- * @type {(camera: Camera, pivot: Vector, up: Vector, yaw: number, pitch: number) => Camera}
- */
+// Turn a camera around the point `pivot`: by `yaw` about `up` and by `pitch` about its own x axis
+// (radians).
+/** @type {(camera: Camera, pivot: Vector, up: Vector, yaw: number, pitch: number) => Camera} */
 export function orbited(camera, pivot, up, yaw, pitch) {
   const axis = unit(up);
   const elevation = Math.asin(Math.max(-1, Math.min(1, dotProduct(row(camera.matrix, 2), axis))));
@@ -77,10 +75,9 @@ export function orbited(camera, pivot, up, yaw, pitch) {
   return turned(aside, pivot, row(aside.matrix, 0), tilt);
 }
 
-/**
- * Shift a camera's picture by pixels; returns the camera and the point to orbit about, shifted with the view.
- * @type {(camera: Camera, pivot: Vector, dx: number, dy: number) => [Camera, Vector]}
- */
+// Shift a camera's picture by pixels; returns the camera and the point to orbit about, shifted with
+// the view.
+/** @type {(camera: Camera, pivot: Vector, dx: number, dy: number) => [Camera, Vector]} */
 export function panned(camera, pivot, dx, dy) {
   const depth = inCamera(camera.matrix, pivot)[2];
   const shift = [(dx * depth) / camera.focal[0], (dy * depth) / camera.focal[1]];
@@ -91,10 +88,8 @@ export function panned(camera, pivot, dx, dy) {
   return [{ ...camera, matrix }, difference(moved, scaled(row(matrix, 1), shift[1]))];
 }
 
-/**
- * Move a camera to `factor` times its distance from `pivot`.
- * @type {(camera: Camera, pivot: Vector, factor: number) => Camera}
- */
+// Move a camera to `factor` times its distance from `pivot`.
+/** @type {(camera: Camera, pivot: Vector, factor: number) => Camera} */
 export function dollied(camera, pivot, factor) {
   const q = inCamera(camera.matrix, pivot);
   const kept = Math.max(factor, MIN_DISTANCE_M / Math.max(q[2], MIN_DISTANCE_M));
@@ -103,18 +98,19 @@ export function dollied(camera, pivot, factor) {
   return { ...camera, matrix };
 }
 
-/**
- * A direction turned with what faces the camera: `yaw` moves that to the right, `pitch` down (radians).
- * @type {(camera: Camera, direction: Vector, yaw: number, pitch: number) => Vector}
- */
+// A direction turned with what faces the camera: `yaw` moves that to the right, `pitch` down
+// (radians).
+/** @type {(camera: Camera, direction: Vector, yaw: number, pitch: number) => Vector} */
 export function turnedAsSeen(camera, direction, yaw, pitch) {
-  return rotatedAbout(rotatedAbout(direction, row(camera.matrix, 1), -yaw), row(camera.matrix, 0), pitch);
+  return rotatedAbout(
+    rotatedAbout(direction, row(camera.matrix, 1), -yaw),
+    row(camera.matrix, 0),
+    pitch,
+  );
 }
 
-/**
- * Rotate about a world axis through `pivot`, which stays where it is in the picture.
- * @type {(camera: Camera, pivot: Vector, axis: Vector, angle: number) => Camera}
- */
+// Rotate about a world axis through `pivot`, which stays where it is in the picture.
+/** @type {(camera: Camera, pivot: Vector, axis: Vector, angle: number) => Camera} */
 function turned(camera, pivot, axis, angle) {
   const before = inCamera(camera.matrix, pivot);
   const matrix = camera.matrix.slice();
@@ -151,9 +147,10 @@ const ZOOM_PER_WHEEL_PIXEL = 0.0012;
 const WHEEL_LINE_PX = 16;
 const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
 
+// Let pointers on `element` move the camera of the player that `player()` gives, and with Alt its
+// sun; `changed()` after each move of the camera, `lit()` after each of the sun. Of two fingers,
+// the middle pans and the distance zooms.
 /**
- * Let pointers on `element` move the camera of the player that `player()` gives, and with Alt its sun; `changed()` after
- * each move of the camera, `lit()` after each of the sun. Of two fingers, the middle pans and the distance zooms.
  * @param {HTMLElement} element
  * @param {() => Player | null} player
  * @param {() => void} changed
@@ -162,15 +159,15 @@ const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
 export function addControls(element, player, changed, lit) {
   /** @type {Map<number, Point>} */
   const pointers = new Map();
-  element.addEventListener('contextmenu', (event) => event.preventDefault());
-  element.addEventListener('pointerdown', (event) => {
+  element.addEventListener('contextmenu', event => event.preventDefault());
+  element.addEventListener('pointerdown', event => {
     element.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
   });
   for (const name of /** @type {const} */ (['pointerup', 'pointercancel'])) {
-    element.addEventListener(name, (event) => pointers.delete(event.pointerId));
+    element.addEventListener(name, event => pointers.delete(event.pointerId));
   }
-  element.addEventListener('pointermove', (event) => {
+  element.addEventListener('pointermove', event => {
     const shown = player();
     if (!pointers.has(event.pointerId) || !shown) return;
     const before = [...pointers.values()];
@@ -179,23 +176,38 @@ export function addControls(element, player, changed, lit) {
     const { camera, data, lighting, pivot } = shown;
     const [dx, dy] = middle(after).map((place, axis) => place - middle(before)[axis]);
     if (event.altKey && after.length === 1 && lighting?.sun) {
-      const toward = turnedAsSeen(camera, lighting.sun.toward, dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL);
+      const toward = turnedAsSeen(
+        camera,
+        lighting.sun.toward,
+        dx * ORBIT_PER_PIXEL,
+        dy * ORBIT_PER_PIXEL,
+      );
       shown.lighting = { ...lighting, sun: { ...lighting.sun, toward } };
       lit();
       return;
     }
     if (after.length === 1 && !event.shiftKey && event.buttons <= 1) {
-      shown.camera = orbited(camera, pivot, data.header.up, -dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL);
+      shown.camera = orbited(
+        camera,
+        pivot,
+        data.header.up,
+        -dx * ORBIT_PER_PIXEL,
+        dy * ORBIT_PER_PIXEL,
+      );
     } else {
-      const scale = Math.max(camera.size[0] / element.clientWidth, camera.size[1] / element.clientHeight);
+      const scale = Math.max(
+        camera.size[0] / element.clientWidth,
+        camera.size[1] / element.clientHeight,
+      );
       [shown.camera, shown.pivot] = panned(camera, pivot, dx * scale, dy * scale);
     }
-    if (after.length > 1) shown.camera = dollied(shown.camera, shown.pivot, distance(before) / distance(after));
+    if (after.length > 1)
+      shown.camera = dollied(shown.camera, shown.pivot, distance(before) / distance(after));
     changed();
   });
   element.addEventListener(
     'wheel',
-    (event) => {
+    event => {
       const shown = player();
       if (!shown) return;
       event.preventDefault();

@@ -12,12 +12,11 @@ const MAX_BYTES = 1 << 30;
 const MAX_VIEW_SIZE = 1 << 16; // pixels
 const CHANNELS = 3;
 
-/**
- * Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
- * @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Data>}
- */
+// Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
+/** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Data>} */
 export async function readData(bytes) {
-  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) throw new DataError('This is not an avatar data file.');
+  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b)
+    throw new DataError('This is not an avatar data file.');
   const raw = await inflate(bytes);
   const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
   if (raw.length < 12 || view.getUint32(0, false) !== 0x53544741)
@@ -38,7 +37,10 @@ async function inflate(bytes) {
   const chunks = [];
   let size = 0;
   try {
-    const reader = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip')).getReader();
+    const reader = new Blob([bytes])
+      .stream()
+      .pipeThrough(new DecompressionStream('gzip'))
+      .getReader();
     for (let part = await reader.read(); !part.done; part = await reader.read()) {
       chunks.push(part.value);
       size += part.value.length;
@@ -74,11 +76,12 @@ function readArrays(header, payload) {
   let at = 0;
   for (const [name, entry] of Object.entries(header.arrays ?? {})) {
     const shape = list(entry?.shape, `${name}.shape`);
-    require(shape.every((size) => Number.isSafeInteger(size) && size >= 0), `${name}.shape`);
+    require(shape.every(size => Number.isSafeInteger(size) && size >= 0), `${name}.shape`);
     const count = shape.reduce((product, size) => product * size, 1);
     const planes = entry.type === 'float32' ? 4 : entry.planes;
     require(Number.isInteger(planes) && planes >= 1 && planes <= 4, `${name}.planes`);
-    if (!(at + planes * count <= payload.length)) throw new DataError('The avatar data is cut off.');
+    if (!(at + planes * count <= payload.length))
+      throw new DataError('The avatar data is cut off.');
     const block = payload.subarray(at, at + planes * count);
     arrays[name] = { shape, values: decoded(name, entry, block, count) };
     at += planes * count;
@@ -86,11 +89,16 @@ function readArrays(header, payload) {
   return arrays;
 }
 
-/** @type {(name: string, entry: any, block: Uint8Array, count: number) => Float32Array | Int32Array} */
+/**
+ * @type {(name: string, entry: any, block: Uint8Array, count: number) => Float32Array |
+ *   Int32Array}
+ */
 function decoded(name, entry, block, count) {
   if (entry.type === 'float32') return new Float32Array(block.slice().buffer);
   const step = entry.type === 'fixed' ? entry.step : 1;
-  require((entry.type === 'fixed' || entry.type === 'integer') && step > 0 && Number.isFinite(step), `${name}.type`);
+  require((entry.type === 'fixed' || entry.type === 'integer') &&
+    step > 0 &&
+    Number.isFinite(step), `${name}.type`);
   require(Number.isSafeInteger(entry.low), `${name}.low`);
   const values = entry.type === 'fixed' ? new Float32Array(count) : new Int32Array(count);
   const columns = count ? (entry.shape.at(-1) ?? 1) : 0;
@@ -98,17 +106,16 @@ function decoded(name, entry, block, count) {
   for (let column = 0; column < columns; column++) {
     for (let to = column; to < count; to += columns, from++) {
       let integer = 0;
-      for (let plane = entry.planes - 1; plane >= 0; plane--) integer = integer * 256 + block[plane * count + from];
+      for (let plane = entry.planes - 1; plane >= 0; plane--)
+        integer = integer * 256 + block[plane * count + from];
       values[to] = (integer + entry.low) * step;
     }
   }
   return values;
 }
 
-/**
- * Throw a DataError unless header and arrays fit each other and hold usable values.
- * @type {(header: any, arrays: Record<string, DataArray>) => void}
- */
+// Throw a DataError unless header and arrays fit each other and hold usable values.
+/** @type {(header: any, arrays: Record<string, DataArray>) => void} */
 function checkData(header, arrays) {
   const splats = size(arrays, 'xyz', 0);
   const vertices = size(arrays, 'base', 0);
@@ -116,7 +123,10 @@ function checkData(header, arrays) {
   const shapes = size(arrays, 'basis', 0);
   const frames = size(arrays, 'coefficients', 0);
   const joints = list(header.parents, 'parents').length;
-  require(vertices > 0 && faces > 0 && joints > 0 && frames > 0, 'number of vertices, triangles, joints or frames');
+  require(vertices > 0 &&
+    faces > 0 &&
+    joints > 0 &&
+    frames > 0, 'number of vertices, triangles, joints or frames');
   /** @type {Record<string, number[]>} */
   const shapesOf = {
     xyz: [splats, 3],
@@ -148,7 +158,10 @@ function checkData(header, arrays) {
     const controls = list(header.shapes.names, 'shapes').length;
     const moved = size(arrays, 'shape_products', 1);
     require(moved <= shapes, 'shape_products');
-    Object.assign(shapesOf, { shape_linear: [controls, moved + 9], shape_products: [controls, moved] });
+    Object.assign(shapesOf, {
+      shape_linear: [controls, moved + 9],
+      shape_products: [controls, moved],
+    });
   }
   if (header.light) {
     const { damping, recorded, typical } = header.light;
@@ -174,10 +187,13 @@ function checkData(header, arrays) {
   const limits = { faces: vertices, rotation_largest: 4, splats_per_face: splats + 1 };
   if (header.light) Object.assign(limits, { light_face: faces, light_lash_face: faces });
   for (const [name, past] of Object.entries(limits)) {
-    require(arrays[name].values.every((value) => isIndex(value, past)), name);
+    require(arrays[name].values.every(value => isIndex(value, past)), name);
   }
-  require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) === splats, 'splats_per_face');
-  require(list(header.parents, 'parents').every((parent, joint) => parent === -1 || isIndex(parent, joint)), 'parents');
+  require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) ===
+    splats, 'splats_per_face');
+  require(list(header.parents, 'parents').every(
+    (parent, joint) => parent === -1 || isIndex(parent, joint),
+  ), 'parents');
   checkHeader(header, joints, shapes);
 }
 
@@ -188,10 +204,12 @@ function checkHeader(header, joints, shapes) {
   require(typeof header.title === 'string', 'title');
   require(numbers([header.fps], 1) && header.fps > 0 && header.fps <= 1000, 'fps');
   require(numbers(header.background, 3) &&
-    header.background.every((/** @type {number} */ value) => value >= 0 && value <= 1), 'background');
+    header.background.every(
+      (/** @type {number} */ value) => value >= 0 && value <= 1,
+    ), 'background');
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
   const names = list(header.joints, 'joints');
-  require(names.length === joints && names.every((name) => typeof name === 'string'), 'joints');
+  require(names.length === joints && names.every(name => typeof name === 'string'), 'joints');
   for (const slider of list(header.sliders, 'sliders')) {
     require(typeof slider?.name === 'string' &&
       Number.isFinite(slider.reach) &&
@@ -205,8 +223,12 @@ function checkHeader(header, joints, shapes) {
   }
   for (const view of list(header.views, 'views')) {
     require(typeof view?.name === 'string' && list(view.size, 'views').length === 2, 'views');
-    require(view.size.every((/** @type {unknown} */ side) => isIndex(side, MAX_VIEW_SIZE) && side !== 0), 'views');
-    require(numbers(view.focal, 2) && Math.min(...view.focal) > 0 && numbers(view.center, 2), 'views');
+    require(view.size.every(
+      (/** @type {unknown} */ side) => isIndex(side, MAX_VIEW_SIZE) && side !== 0,
+    ), 'views');
+    require(numbers(view.focal, 2) &&
+      Math.min(...view.focal) > 0 &&
+      numbers(view.center, 2), 'views');
     require(numbers(view.world_to_camera, 16), 'views');
   }
 }

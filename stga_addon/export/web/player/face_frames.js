@@ -1,6 +1,6 @@
 // @ts-check
-// Local frames of the triangles, in which splats are stored, and what these follow: strain against the neutral mesh.
-// The rules are those of STGA for Blender's embedding.py and strain.py.
+// Local frames of the triangles, in which splats are stored, and what these follow: strain against
+// the neutral mesh. The rules are those of STGA for Blender's embedding.py and strain.py.
 
 /** @import { Arrays, Values, Vector } from './types.js' */
 
@@ -11,36 +11,53 @@ const MAX_STRAIN = 2;
 const AVERAGING_ROUNDS = 3; // of smoothed strain
 const MIN_SQUARED_NORMAL = 1e-24;
 
+// Sides u and v of triangles from corner 0, and their product, twice the area long (9·F).
+/** @type {(faces: Values, vertices: ArrayLike<number>, out?: Float64Array) => Float64Array} */
+export function sidesOf(faces, vertices, out = new Float64Array(3 * faces.length)) {
+  for (let at = 0; at < out.length; at += 9) {
+    const i = 3 * faces[at / 3];
+    const j = 3 * faces[at / 3 + 1];
+    const k = 3 * faces[at / 3 + 2];
+    for (let c = 0; c < 3; c++) {
+      out[at + c] = vertices[j + c] - vertices[i + c];
+      out[at + 3 + c] = vertices[k + c] - vertices[i + c];
+    }
+    out[at + 6] = out[at + 1] * out[at + 5] - out[at + 2] * out[at + 4];
+    out[at + 7] = out[at + 2] * out[at + 3] - out[at] * out[at + 5];
+    out[at + 8] = out[at] * out[at + 4] - out[at + 1] * out[at + 3];
+  }
+  return out;
+}
+
 export class Strain {
+  // faces (3·F), sides of the neutral mesh, number of its vertices, range (6·F: lowest three,
+  // highest three) of strain; ±MAX_STRAIN without one.
   /**
-   * faces (3·F), neutral (3·V) meters, range (6·F: lowest three, highest three) of strain; ±MAX_STRAIN without one.
    * @param {Values} faces
-   * @param {Values} neutral
+   * @param {Float64Array} sides
+   * @param {number} vertices
    * @param {Values} [range]
    */
-  constructor(faces, neutral, range) {
+  constructor(faces, sides, vertices, range) {
     this.faces = faces;
     const count = faces.length / 3;
-    this.range = range ?? new Float32Array(6 * count).map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
+    const limits = new Float32Array(6 * count);
+    this.range = range ?? limits.map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
     this.values = new Float32Array(3 * count);
-    this.gram = new Float64Array(3 * count); // u·u, u·v, v·v of the neutral edges from corner 0
+    this.gram = new Float64Array(3 * count); // u·u, u·v, v·v of the neutral sides
     this.toTensor = new Float32Array(18 * count); // change of gram → tensor xx, yy, zz, xy, yz, zx
-    this.toPlane = new Float32Array(18 * count); // tensor → along the first edge, across it, shear
-    this.share = new Float64Array(neutral.length / 3); // of a triangle in the mean of its vertex, and that in its own
-    this.atVertex = new Float64Array(2 * neutral.length);
+    this.toPlane = new Float32Array(18 * count); // tensor → along the first side, across it, shear
+    this.share = new Float64Array(vertices); // of a triangle in the means of vertex and triangle
+    this.atVertex = new Float64Array(6 * vertices);
     for (const vertex of faces) this.share[vertex]++;
-    for (let v = 0; v < this.share.length; v++) this.share[v] = 1 / (3 * Math.max(1, this.share[v]));
-    for (let f = 0; f < count; f++) this.prepare(f, neutral);
+    for (let v = 0; v < vertices; v++) this.share[v] = 1 / (3 * Math.max(1, this.share[v]));
+    for (let f = 0; f < count; f++) this.prepare(f, sides);
   }
 
-  /** @type {(f: number, neutral: Values) => void} */
-  prepare(f, neutral) {
-    const corner = (/** @type {number} */ k) =>
-      neutral.subarray(3 * this.faces[3 * f + k], 3 * this.faces[3 * f + k] + 3);
-    const u = difference(corner(1), corner(0));
-    const v = difference(corner(2), corner(0));
+  /** @type {(f: number, sides: Float64Array) => void} */
+  prepare(f, sides) {
+    const [u, v, normal] = [0, 3, 6].map(k => sides.subarray(9 * f + k, 9 * f + k + 3));
     this.gram.set([dotProduct(u, u), dotProduct(u, v), dotProduct(v, v)], 3 * f);
-    const normal = crossed(u, v);
     const square = dotProduct(normal, normal);
     if (square < MIN_SQUARED_NORMAL) return;
     const a1 = scaled(crossed(v, normal), 1 / square);
@@ -57,54 +74,40 @@ export class Strain {
     for (let k = 0; k < 18; k++) if (k % 6 > 2) this.toPlane[18 * f + k] *= 2;
   }
 
-  /**
-   * Follow the posed vertices (3·V).
-   * @param {Float64Array} vertices
-   */
-  update(vertices) {
-    this.spread(vertices);
-    this.gather();
-  }
-
-  /**
-   * Add every triangle's tensor to its three vertices, each of which takes its mean.
-   * @param {Float64Array} vertices
-   */
-  spread(vertices) {
+  // Follow the sides of the posed triangles: add every triangle's tensor to its three vertices,
+  // each of which takes its mean.
+  /** @param {Float64Array} sides */
+  update(sides) {
     const { faces, gram, toTensor, atVertex, share } = this;
     atVertex.fill(0);
     for (let f = 0; f < faces.length; f += 3) {
-      const i = 3 * faces[f];
-      const j = 3 * faces[f + 1];
-      const k = 3 * faces[f + 2];
-      const ux = vertices[j] - vertices[i];
-      const uy = vertices[j + 1] - vertices[i + 1];
-      const uz = vertices[j + 2] - vertices[i + 2];
-      const vx = vertices[k] - vertices[i];
-      const vy = vertices[k + 1] - vertices[i + 1];
-      const vz = vertices[k + 2] - vertices[i + 2];
-      const a = ux * ux + uy * uy + uz * uz - gram[f];
-      const b = ux * vx + uy * vy + uz * vz - gram[f + 1];
-      const c = vx * vx + vy * vy + vz * vz - gram[f + 2];
+      const [i, j, k] = [6 * faces[f], 6 * faces[f + 1], 6 * faces[f + 2]];
+      let a = -gram[f];
+      let b = -gram[f + 1];
+      let c = -gram[f + 2];
+      for (let u = 3 * f, v = u + 3; u < 3 * f + 3; u++, v++) {
+        a += sides[u] * sides[u];
+        b += sides[u] * sides[v];
+        c += sides[v] * sides[v];
+      }
       for (let n = 0, t = 6 * f; n < 6; n++, t++) {
         const part = a * toTensor[t] + b * toTensor[t + 6] + c * toTensor[t + 12];
-        atVertex[2 * i + n] += part;
-        atVertex[2 * j + n] += part;
-        atVertex[2 * k + n] += part;
+        atVertex[i + n] += part;
+        atVertex[j + n] += part;
+        atVertex[k + n] += part;
       }
     }
     for (let v = 0, at = 0; v < share.length; v++) {
       for (const end = at + 6; at < end; at++) atVertex[at] *= share[v];
     }
+    this.gather();
   }
 
   /** Strain of every triangle from the tensors of its vertices. */
   gather() {
     const { faces, toPlane, atVertex, range, values } = this;
     for (let f = 0; f < faces.length; f += 3) {
-      const i = 6 * faces[f];
-      const j = 6 * faces[f + 1];
-      const k = 6 * faces[f + 2];
+      const [i, j, k] = [6 * faces[f], 6 * faces[f + 1], 6 * faces[f + 2]];
       let along = 0;
       let across = 0;
       let shear = 0;
@@ -126,10 +129,8 @@ export class Strain {
 export class SmoothedStrain {
   static components = 3;
 
-  /**
-   * Of `strain` (Strain), which is to be updated first.
-   * @param {Strain} strain
-   */
+  // Of `strain` (Strain), which is to be updated first.
+  /** @param {Strain} strain */
   constructor(strain) {
     const { faces, range } = strain;
     const count = faces.length / 3;
@@ -148,10 +149,9 @@ export class SmoothedStrain {
     this.weigh(edgeCount);
   }
 
-  /**
-   * The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor` leaves it once.
-   * @param {number} edgeCount
-   */
+  // The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor`
+  // leaves it once.
+  /** @param {number} edgeCount */
   weigh(edgeCount) {
     const { edges, ownFactor, share } = this;
     const touching = new Int32Array(edgeCount);
@@ -200,10 +200,9 @@ export class SmoothedStrain {
   }
 }
 
-/**
- * [three times the index of the edge from each corner to the next (3·F), number of edges], by the edges' ends.
- * @type {(faces: Values) => [Int32Array, number]}
- */
+// [three times the index of the edge from each corner to the next (3·F), number of edges], by the
+// edges' ends.
+/** @type {(faces: Values) => [Int32Array, number]} */
 function edgesOf(faces) {
   const vertices = faces.reduce((most, vertex) => Math.max(most, vertex), 0) + 1;
   /** @type {Map<number, number>} */
@@ -218,9 +217,10 @@ function edgesOf(faces) {
   return [edges, index.size];
 }
 
+// Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
 /**
- * Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
- * @type {(a: ArrayLike<number>, b: ArrayLike<number>, factor: number, out: Float32Array, at: number) => void}
+ * @type {(a: ArrayLike<number>, b: ArrayLike<number>, factor: number, out: Float32Array, at:
+ *   number) => void}
  */
 function symmetricProduct(a, b, factor, out, at) {
   for (let k = 0; k < 3; k++) {
@@ -230,17 +230,20 @@ function symmetricProduct(a, b, factor, out, at) {
   }
 }
 
-/** By the name of their coefficients in a data file (faces, 3·components); of the strain, which is updated first. */
+// By the name of their coefficients in a data file (faces, 3·components); of the strain, which is
+// updated first.
 export const SIGNALS = { strain_position: SmoothedStrain };
 
 const MIN_DIVISOR = 1e-30;
 const MIN_AREA_RATIO = 1e-4; // of a triangle that counts as a line, to its longest edge's square
 const UPRIGHT_COSINE = 0.8;
-export const FACE_FLOATS = 16; // of a triangle in the texture: three rows of matrix | origin, then strain | selected
+// Of a triangle in the texture: three rows of matrix | origin, then strain | selected.
+export const FACE_FLOATS = 16;
 
 export class FaceFrames {
+  // Arrays of the data file, and the convention of the embedding; strain is computed where splats
+  // follow it.
   /**
-   * Arrays of the data file, and the convention of the embedding; strain is computed where splats follow it.
    * @param {Pick<Arrays, 'faces' | 'neutral'> & Partial<Arrays>} arrays
    * @param {string} convention
    */
@@ -250,11 +253,15 @@ export class FaceFrames {
     this.faces = faces;
     this.count = faces.length / 3;
     this.isStga = convention === 'stga';
-    this.world = new Float64Array(12 * this.count); // rotation · scale and origin, rows of a 3×4 matrix
-    this.neutralArea = neutralAreas(faces, neutral);
+    // Rotation · scale and origin, rows of a 3×4 matrix.
+    this.world = new Float64Array(12 * this.count);
+    this.sides = sidesOf(faces, neutral); // of the triangles as last placed
+    this.neutralArea = neutralAreas(this.sides);
     const offsets = Object.entries(SIGNALS).filter(([name]) => arrays[name]);
     const followsStrain = arrays.strain_color || offsets.length;
-    const strain = followsStrain ? new Strain(faces, neutral, arrays.strain_range?.values) : null;
+    const range = arrays.strain_range?.values;
+    const vertices = neutral.length / 3;
+    const strain = followsStrain ? new Strain(faces, this.sides, vertices, range) : null;
     this.strain = strain;
     /** Signals and their coefficients (3·S·F): for each of S components a vector in the frame. */
     this.offsets = strain
@@ -266,92 +273,71 @@ export class FaceFrames {
       : [];
   }
 
-  /**
-   * Follow the posed vertices (3·V).
-   * @param {Float64Array} vertices
-   */
+  // Follow the posed vertices (3·V).
+  /** @param {Float64Array} vertices */
   update(vertices) {
     this.placeFrames(vertices);
-    this.strain?.update(vertices);
+    this.strain?.update(this.sides);
     for (const { signal, components, coefficients } of this.offsets) {
       signal.update();
       this.moveOrigins(signal.values, components, coefficients);
     }
   }
 
-  /**
-   * "stga": axes [first, normal × first, normal], first from the middle to corner 0; scale sqrt(area / neutral area).
-   * "gaussian_avatars": axes [first, normal, first × normal], first along the first edge; scale the mean of edge and
-   * height.
-   * @param {Float64Array} vertices
-   */
+  // "stga": axes [first, normal × first, normal], first from the middle to corner 0; scale
+  // sqrt(area / neutral area). "gaussian_avatars": axes [first, normal, first × normal], first
+  // along the first edge; scale the mean of edge and height.
+  /** @param {Float64Array} vertices */
   placeFrames(vertices) {
     const { faces, isStga, neutralArea, world } = this;
-    for (let f = 0; f < this.count; f++) {
-      const i = 3 * faces[3 * f];
-      const j = 3 * faces[3 * f + 1];
-      const k = 3 * faces[3 * f + 2];
-      // Edges u and v from corner 0, and their normal n, as long as twice the area.
-      const ux = vertices[j] - vertices[i];
-      const uy = vertices[j + 1] - vertices[i + 1];
-      const uz = vertices[j + 2] - vertices[i + 2];
-      const vx = vertices[k] - vertices[i];
-      const vy = vertices[k + 1] - vertices[i + 1];
-      const vz = vertices[k + 2] - vertices[i + 2];
-      let nx = uy * vz - uz * vy;
-      let ny = uz * vx - ux * vz;
-      let nz = ux * vy - uy * vx;
-      let x = isStga ? -(ux + vx) / 3 : ux;
-      let y = isStga ? -(uy + vy) / 3 : uy;
-      let z = isStga ? -(uz + vz) / 3 : uz;
-      const twice = Math.sqrt(nx * nx + ny * ny + nz * nz);
-      const length = Math.sqrt(x * x + y * y + z * z);
-      const uu = ux * ux + uy * uy + uz * uz;
-      const vv = vx * vx + vy * vy + vz * vz;
-      const longest = Math.max(uu, vv, (vx - ux) * (vx - ux) + (vy - uy) * (vy - uy) + (vz - uz) * (vz - uz));
+    const sides = sidesOf(faces, vertices, this.sides);
+    const [first, normal] = [new Float64Array(3), new Float64Array(3)];
+    for (let f = 0, at = 0; f < this.count; f++, at += 9) {
+      let uu = 0;
+      let vv = 0;
+      let ww = 0;
+      let twice = 0;
+      let length = 0;
+      for (let k = 0; k < 3; k++) {
+        const u = sides[at + k];
+        const v = sides[at + 3 + k];
+        first[k] = isStga ? -(u + v) / 3 : u;
+        normal[k] = sides[at + 6 + k];
+        uu += u * u;
+        vv += v * v;
+        ww += (v - u) * (v - u);
+        twice += normal[k] * normal[k];
+        length += first[k] * first[k];
+      }
+      twice = Math.sqrt(twice);
+      length = Math.sqrt(length);
+      const longest = Math.max(uu, vv, ww);
       const isShort = length <= MIN_AREA_RATIO * Math.sqrt(longest);
       const isLine = twice <= 2 * MIN_AREA_RATIO * longest;
-      if (isShort || isLine) {
-        [x, y, z, nx, ny, nz] = substitutes([x, y, z], [nx, ny, nz], isShort, isLine);
-      } else {
-        const perLength = 1 / length;
-        const perTwice = 1 / twice;
-        x *= perLength;
-        y *= perLength;
-        z *= perLength;
-        nx *= perTwice;
-        ny *= perTwice;
-        nz *= perTwice;
-      }
       let scale = 1;
       if (!isStga) scale = (length + (isShort ? Math.sqrt(vv) : twice / length)) / 2;
       else if (neutralArea[f] > 0) scale = Math.sqrt(twice / 2 / neutralArea[f]);
-      x *= scale;
-      y *= scale;
-      z *= scale;
-      const sx = ny * z - nz * y;
-      const sy = nz * x - nx * z;
-      const sz = nx * y - ny * x;
-      const to = 12 * f;
-      world[to] = x;
-      world[to + 1] = isStga ? sx : scale * nx;
-      world[to + 2] = isStga ? scale * nx : -sx;
-      world[to + 3] = vertices[i] + (ux + vx) / 3;
-      world[to + 4] = y;
-      world[to + 5] = isStga ? sy : scale * ny;
-      world[to + 6] = isStga ? scale * ny : -sy;
-      world[to + 7] = vertices[i + 1] + (uy + vy) / 3;
-      world[to + 8] = z;
-      world[to + 9] = isStga ? sz : scale * nz;
-      world[to + 10] = isStga ? scale * nz : -sz;
-      world[to + 11] = vertices[i + 2] + (uz + vz) / 3;
+      if (isShort || isLine) substitute(first, normal, isShort, isLine);
+      for (let k = 0; k < 3; k++) {
+        first[k] *= isShort || isLine ? scale : scale / length;
+        normal[k] *= isShort || isLine ? 1 : 1 / twice;
+      }
+      const corner = 3 * faces[3 * f];
+      for (let k = 0, to = 12 * f; k < 3; k++, to += 4) {
+        const a = k < 2 ? k + 1 : 0;
+        const b = k > 0 ? k - 1 : 2;
+        const side = normal[a] * first[b] - normal[b] * first[a];
+        world[to] = first[k];
+        world[to + 1] = isStga ? side : scale * normal[k];
+        world[to + 2] = isStga ? scale * normal[k] : -side;
+        world[to + 3] = vertices[corner + k] + (sides[at + k] + sides[at + 3 + k]) / 3;
+      }
     }
   }
 
-  /**
-   * Move the origins by a signal (S·F) times coefficients (3·S·F), in each triangle's own axes and unit.
-   * @type {(values: Float64Array, components: number, coefficients: Values) => void}
-   */
+  // Move the origins by a signal (S·F) times coefficients (3·S·F), in each triangle's own axes and
+  // unit.
+  /** @type {(values: Float64Array, components: number, coefficients: Values) => void} */
   moveOrigins(values, components, coefficients) {
     const { count, world } = this;
     for (let f = 0; f < count; f++) {
@@ -369,10 +355,8 @@ export class FaceFrames {
     }
   }
 
-  /**
-   * Write the frames as a camera (row-major 4×4 world to camera) sees them: FACE_FLOATS a triangle.
-   * @type {(camera: ArrayLike<number>, out: Float32Array) => void}
-   */
+  // Write the frames as a camera (row-major 4×4 world to camera) sees them: FACE_FLOATS a triangle.
+  /** @type {(camera: ArrayLike<number>, out: Float32Array) => void} */
   compose(camera, out) {
     const { world, count } = this;
     for (let row = 0; row < 3; row++) {
@@ -389,10 +373,9 @@ export class FaceFrames {
     }
   }
 
-  /**
-   * Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all selected).
-   * @type {(selection: ArrayLike<number> | null, out: Float32Array) => void}
-   */
+  // Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all
+  // selected).
+  /** @type {(selection: ArrayLike<number> | null, out: Float32Array) => void} */
   annotate(selection, out) {
     const strain = this.strain?.values;
     for (let f = 0; f < this.count; f++) {
@@ -403,36 +386,27 @@ export class FaceFrames {
   }
 }
 
-/**
- * Areas of the triangles; 0 for those that count as lines.
- * @type {(faces: Values, neutral: Values) => Float64Array<ArrayBuffer>}
- */
-function neutralAreas(faces, neutral) {
-  const areas = new Float64Array(faces.length / 3);
-  const corner = (/** @type {number} */ f, /** @type {number} */ k) =>
-    neutral.subarray(3 * faces[3 * f + k], 3 * faces[3 * f + k] + 3);
-  for (let f = 0; f < areas.length; f++) {
-    const u = difference(corner(f, 1), corner(f, 0));
-    const v = difference(corner(f, 2), corner(f, 0));
-    const w = difference(corner(f, 2), corner(f, 1));
-    const area = Math.hypot(...crossed(u, v)) / 2;
+// Areas of triangles by their sides; 0 for those that count as lines.
+/** @param {Float64Array} sides */
+function neutralAreas(sides) {
+  return Float64Array.from({ length: sides.length / 9 }, (_, f) => {
+    const [u, v, normal] = [0, 3, 6].map(k => sides.subarray(9 * f + k, 9 * f + k + 3));
+    const area = Math.hypot(...normal) / 2;
+    const w = difference(v, u);
     const longest = Math.max(dotProduct(u, u), dotProduct(v, v), dotProduct(w, w));
-    areas[f] = area > Math.max(MIN_AREA_RATIO * longest, MIN_DIVISOR) ? area : 0;
-  }
-  return areas;
+    return area > Math.max(MIN_AREA_RATIO * longest, MIN_DIVISOR) ? area : 0;
+  });
 }
 
+// Make first and normal of a triangle that is a line, or whose `first` has no length, perpendicular
+// unit vectors.
 /**
- * Perpendicular unit vectors first and normal (six numbers) of a triangle that is a line, or whose `first` has no length.
- * @param {Vector} first
- * @param {Vector} normal
- * @param {boolean} isShort
- * @param {boolean} isLine
- * @returns {number[]}
+ * @type {(first: Float64Array, normal: Float64Array, isShort: boolean, isLine: boolean) => void}
  */
-function substitutes(first, normal, isShort, isLine) {
+function substitute(first, normal, isShort, isLine) {
   const x = isShort ? [1, 0, 0] : unit(first);
   const isUpright = Math.abs(x[2]) > UPRIGHT_COSINE;
   const n = isLine ? crossed(x, isUpright ? [1, 0, 0] : [0, 0, 1]) : normal;
-  return [...x, ...unit(difference(n, scaled(x, dotProduct(n, x))))];
+  normal.set(unit(difference(n, scaled(x, dotProduct(n, x)))));
+  first.set(x);
 }

@@ -1,12 +1,20 @@
 // @ts-check
-// The recorded motion, ARKit's shapes and the values by which a person or a program replaces parts of it; and the mesh of a
-// pose.
+// The recorded motion, ARKit's shapes and the values by which a person or a program replaces parts
+// of it; and the mesh of a pose.
 
 /** @import { Data, Performance } from './types.js' */
 
-import { axisAngleOf, matrixFromAxisAngle, multiplied, quaternionOf, slerpAxisAngle } from './vector.js';
+import { DataError } from './data.js';
+import {
+  axisAngleOf,
+  matrixFromAxisAngle,
+  multiplied,
+  quaternionOf,
+  slerpAxisAngle,
+} from './vector.js';
 
-/** Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded one. */
+// Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded
+// one.
 export class Motion {
   /** @param {Data} data */
   constructor(data) {
@@ -32,11 +40,9 @@ export class Motion {
     return this.shapes.performance?.fps ?? this.recordedFps;
   }
 
-  /**
-   * Fill coefficients, pose and translation with those of `frame`, between frames on the shortest way. Of a performance,
-   * the head as a whole stays where it is in the first recorded frame.
-   * @param {number} frame
-   */
+  // Fill coefficients, pose and translation with those of `frame`, between frames on the shortest
+  // way. Of a performance, the head as a whole stays where it is in the first recorded frame.
+  /** @param {number} frame */
   sample(frame) {
     const recorded = this.shapes.performance ? 0 : frame;
     const first = Math.min(Math.max(Math.floor(recorded), 0), this.recordedFrames - 1);
@@ -62,7 +68,10 @@ export class Motion {
   }
 }
 
-/** @type {(values: ArrayLike<number>, first: number, second: number, share: number, out: Float64Array) => void} */
+/**
+ * @type {(values: ArrayLike<number>, first: number, second: number, share: number, out:
+ *   Float64Array) => void}
+ */
 function blend(values, first, second, share, out) {
   const size = out.length;
   for (let k = 0; k < size; k++) {
@@ -91,12 +100,13 @@ export class Rig {
     this.vertices = new Float64Array(this.base.length);
     this.joints = new Float64Array(3 * joints);
     this.local = new Float64Array(9 * joints);
-    this.skin = new Float64Array(12 * joints); // per joint: rotation and offset, rows of a 3×4 matrix
+    // Per joint: rotation and offset, rows of a 3×4 matrix.
+    this.skin = new Float64Array(12 * joints);
     this.placed = new Float64Array(3 * joints);
   }
 
+  // Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
   /**
-   * Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
    * @param {ArrayLike<number>} coefficients
    * @param {ArrayLike<number>} pose
    * @param {ArrayLike<number>} translation
@@ -106,7 +116,8 @@ export class Rig {
     this.joints.set(this.jointRest);
     addShapes(this.shaped, this.basis, coefficients);
     addShapes(this.joints, this.jointBasis, coefficients);
-    for (let j = 0; j < this.parents.length; j++) matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
+    for (let j = 0; j < this.parents.length; j++)
+      matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
     // Correctives follow the entries of the rotations of joints 1… minus identity.
     const features = this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
     if (this.correctives.length) addShapes(this.shaped, this.correctives, features);
@@ -129,13 +140,20 @@ export class Rig {
           const from = 12 * parent + 4 * row;
           for (let c = 0; c < 3; c++) {
             const at = 9 * j + c;
-            skin[to + c] = skin[from] * local[at] + skin[from + 1] * local[at + 3] + skin[from + 2] * local[at + 6];
+            skin[to + c] =
+              skin[from] * local[at] +
+              skin[from + 1] * local[at + 3] +
+              skin[from + 2] * local[at + 6];
           }
           let sum = placed[3 * parent + row];
-          for (let c = 0; c < 3; c++) sum += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
+          for (let c = 0; c < 3; c++)
+            sum += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
           placed[3 * j + row] = sum;
         }
-        const turned = skin[to] * joints[3 * j] + skin[to + 1] * joints[3 * j + 1] + skin[to + 2] * joints[3 * j + 2];
+        const turned =
+          skin[to] * joints[3 * j] +
+          skin[to + 1] * joints[3 * j + 1] +
+          skin[to + 2] * joints[3 * j + 2];
         skin[to + 3] = placed[3 * j + row] - turned;
       }
     }
@@ -167,10 +185,9 @@ export class Rig {
   }
 }
 
-/**
- * target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than the sums.
- * @type {(target: Float64Array, shapes: ArrayLike<number>, factors: ArrayLike<number>) => void}
- */
+// target += Σ factor · shape, eight shapes in a pass: passes over `target` and loops cost more than
+// the sums.
+/** @type {(target: Float64Array, shapes: ArrayLike<number>, factors: ArrayLike<number>) => void} */
 function addShapes(target, shapes, factors) {
   const size = target.length;
   /** @type {number[]} */
@@ -220,7 +237,7 @@ export class Shapes {
     this.expressions = arrays.shape_products?.shape[1] ?? 0;
     this.opens = this.names.indexOf(shapes?.opens ?? '');
     this.limited = this.names.indexOf(shapes?.limited ?? '');
-    this.joints = JOINTS.map((joint) => 3 * joints.indexOf(joint));
+    this.joints = JOINTS.map(joint => 3 * joints.indexOf(joint));
     this.neck = 3 * joints.indexOf(NECK);
     this.weights = new Float64Array(this.names.length);
     this.pinned = new Float64Array(this.names.length).fill(NaN);
@@ -231,17 +248,15 @@ export class Shapes {
 
   /** Whether the shapes replace the recorded expressions, jaw and eyes. */
   get active() {
-    return this.performance !== null || this.pinned.some((value) => !Number.isNaN(value));
+    return this.performance !== null || this.pinned.some(value => !Number.isNaN(value));
   }
 
   release() {
     this.pinned.fill(NaN);
   }
 
-  /**
-   * Replace expressions, jaw and eyes, and turn the neck as the performance does.
-   * @type {(frame: number, coefficients: Float64Array, pose: Float64Array) => void}
-   */
+  // Replace expressions, jaw and eyes, and turn the neck as the performance does.
+  /** @type {(frame: number, coefficients: Float64Array, pose: Float64Array) => void} */
   apply(frame, coefficients, pose) {
     const head = this.sample(frame);
     const { columns, expressions, linear, opens, products, values, weights } = this;
@@ -253,20 +268,21 @@ export class Shapes {
       if (weight === 0) continue;
       for (let k = 0; k < columns; k++) values[k] += weight * linear[shape * columns + k];
       const product = weight * weights[opens];
-      for (let k = 0; k < expressions; k++) values[k] += product * products[shape * expressions + k];
+      for (let k = 0; k < expressions; k++)
+        values[k] += product * products[shape * expressions + k];
     }
     coefficients.fill(0);
     coefficients.set(values.subarray(0, expressions));
     for (const [number, at] of this.joints.entries()) {
-      if (at >= 0) pose.set(values.subarray(expressions + 3 * number, expressions + 3 * number + 3), at);
+      if (at >= 0)
+        pose.set(values.subarray(expressions + 3 * number, expressions + 3 * number + 3), at);
     }
     if (head && this.neck >= 0) pose.set(headTurn(head), this.neck);
   }
 
-  /**
-   * Fill the weights with those of the frame; returns yaw, pitch and roll of the head, where the performance has them.
-   * @type {(frame: number) => number[] | null}
-   */
+  // Fill the weights with those of the frame; returns yaw, pitch and roll of the head, where the
+  // performance has them.
+  /** @type {(frame: number) => number[] | null} */
   sample(frame) {
     const { performance, pinned, weights } = this;
     weights.fill(0);
@@ -280,8 +296,10 @@ export class Shapes {
         const column = performance.columns[k];
         if (column >= 0) weights[k] = before[column] + share * (after[column] - before[column]);
       }
-      if (performance.head.every((column) => column >= 0)) {
-        head = performance.head.map((column) => before[column] + share * (after[column] - before[column]));
+      if (performance.head.every(column => column >= 0)) {
+        head = performance.head.map(
+          column => before[column] + share * (after[column] - before[column]),
+        );
       }
     }
     for (let k = 0; k < weights.length; k++) if (!Number.isNaN(pinned[k])) weights[k] = pinned[k];
@@ -289,11 +307,124 @@ export class Shapes {
   }
 }
 
-/**
- * Axis-angle of yaw, pitch and roll: about y, then the turned x, then the turned z.
- * @param {number[]} angles
- */
+// Axis-angle of yaw, pitch and roll: about y, then the turned x, then the turned z.
+/** @param {number[]} angles */
 function headTurn([yaw, pitch, roll]) {
   const turned = multiplied(quaternionOf([0, yaw, 0]), quaternionOf([pitch, 0, 0]));
   return axisAngleOf(multiplied(turned, quaternionOf([0, 0, roll])));
+}
+
+// Performances in CSV: Live Link Face, Audio2Face, and any table with a column per shape. The
+// rules are those of STGA for Blender's read_performance.py.
+
+const MAX_ROWS = 1 << 18;
+const MAX_WEIGHT = 10;
+const DEFAULT_FPS = 60;
+const TIMECODE_BASES = [24, 25, 30, 48, 50, 60, 100, 120];
+const USUAL_BASE = 60; // of a take of less than a second, whose frame numbers do not tell
+const DAY_S = 86400;
+const HEAD = ['headyaw', 'headpitch', 'headroll'];
+const MIN_SHAPES = 10; // of a table that holds a performance
+
+// The performance in a text, with a column per known shape (-1: it has none). Throws DataError in
+// one sentence.
+/** @type {(text: string, names: string[]) => Performance} */
+export function readPerformance(text, names) {
+  const lines = text
+    .replace(/^\uFEFF/, '')
+    .split(/\r?\n/)
+    .filter(line => line.trim());
+  const header = (lines[0] ?? '').split(',').map(cell => cell.trim());
+  const plain = header.map(plainName);
+  const columns = names.map(name => plain.indexOf(name.toLowerCase()));
+  if (columns.filter(column => column >= 0).length < MIN_SHAPES)
+    throw new DataError(
+      'This file is no table of face shapes (CSV of Live Link Face or Audio2Face).',
+    );
+  const counts = header.findIndex(name => name.toLowerCase() === 'blendshapecount');
+  const cells = lines
+    .slice(1, MAX_ROWS + 1)
+    .map(line => line.split(','))
+    .filter(row => row.length === header.length && (counts < 0 || Number(row[counts]) > 0));
+  if (!cells.length) throw new DataError('The performance has no row with a face.');
+  const rows = cells.map(row => Float64Array.from(row, Number));
+  const used = columns.filter(column => column >= 0);
+  if (!rows.every(row => used.every(column => Math.abs(row[column]) <= MAX_WEIGHT)))
+    throw new DataError('The performance holds weights that are no numbers from 0 to 1.');
+  const head = HEAD.map(name => plain.indexOf(name));
+  return evenly({ columns, head, rows, fps: DEFAULT_FPS }, times(header, cells));
+}
+
+// mouthsmileleft of blendShapes.MouthSmile_L, mouth_smile_left, …
+/** @param {string} name */
+function plainName(name) {
+  const last = name.slice(name.lastIndexOf('.') + 1).toLowerCase();
+  const side = /^(.*)[_\- ]([lr])$/.exec(last);
+  return (side ? side[1] + (side[2] === 'l' ? 'left' : 'right') : last).replace(/[_\- ]/g, '');
+}
+
+// Seconds of each row from the first, or null where the table has none.
+/** @type {(header: string[], cells: string[][]) => number[] | null} */
+function times(header, cells) {
+  const names = header.map(name => name.toLowerCase());
+  const at = names.findIndex(name => ['timecode', 'time', 'timestamp', 'seconds'].includes(name));
+  if (at < 0) return null;
+  const texts = cells.map(row => row[at].trim());
+  const found = texts.map(text => /^(\d+):(\d+):(\d+)[:;.](\d+)(\.\d+)?$/.exec(text));
+  if (!found.every(match => match)) {
+    const numbers = texts.map(Number);
+    return numbers.every(Number.isFinite) ? numbers.map(time => time - numbers[0]) : null;
+  }
+  const seconds = found.map(
+    match => 3600 * Number(match?.[1]) + 60 * Number(match?.[2]) + Number(match?.[3]),
+  );
+  const frames = found.map(match => Number(match?.[4]) + Number(match?.[5] ?? 0));
+  const largest = Math.max(...frames);
+  const spread = (/** @type {number} */ base) =>
+    unevenness(seconds.map((second, row) => second + frames[row] / base));
+  const possible = TIMECODE_BASES.filter(base => base > largest);
+  let base = possible[0] ?? largest + 1;
+  if (new Set(seconds).size < 2) base = possible.includes(USUAL_BASE) ? USUAL_BASE : base;
+  else for (const next of possible) if (spread(next) < spread(base)) base = next;
+  let days = 0;
+  const elapsed = seconds.map((second, row) => second + frames[row] / base);
+  return elapsed.map((time, row) => {
+    if (row && time - elapsed[row - 1] < -DAY_S / 2) days += DAY_S;
+    return time + days - elapsed[0];
+  });
+}
+
+/** @param {number[]} values */
+function unevenness(values) {
+  const steps = values.slice(1).map((value, row) => value - values[row]);
+  const usual = steps.filter(step => step > 0 && step < 1);
+  if (!usual.length) return 0;
+  const middle = median(usual);
+  const mean = usual.reduce((sum, step) => sum + Math.abs(step - middle), 0) / usual.length;
+  return Math.round(1e6 * mean) / 1e6;
+}
+
+/** @param {number[]} values */
+function median(values) {
+  return [...values].sort((one, other) => one - other)[Math.floor(values.length / 2)];
+}
+
+// The performance at even times, with rows that are missing interpolated.
+/** @type {(performance: Performance, seconds: number[] | null) => Performance} */
+function evenly(performance, seconds) {
+  if (!seconds || seconds.length < 2) return performance;
+  const steps = seconds.slice(1).map((second, row) => second - seconds[row]);
+  const step = median(steps.filter(length => length > 0));
+  const count = Math.floor((seconds.at(-1) ?? 0) / step + 1.001);
+  if (!(step >= 1e-3 && step <= 1) || count > MAX_ROWS)
+    throw new DataError('The times of the performance are not usable.');
+  const rows = [];
+  for (let number = 0, row = 0; number < count; number++) {
+    while (row < seconds.length - 2 && seconds[row + 1] <= number * step) row++;
+    const span = seconds[row + 1] - seconds[row];
+    const share = span > 0 ? Math.min(Math.max((number * step - seconds[row]) / span, 0), 1) : 0;
+    const [before, after] = [performance.rows[row], performance.rows[row + 1]];
+    rows.push(before.map((value, column) => value + share * (after[column] - value)));
+  }
+  return { ...performance, rows, fps: 1 / step };
 }

@@ -13,10 +13,12 @@ import { scaled } from './vector.js';
 
 const fixed = (/** @type {number} */ value) => value.toFixed(2);
 const degrees = (/** @type {number} */ value) => `${Math.round(value)}°`;
-const signed = (/** @type {number} */ value) => `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
-const PAD_ANGLE = 2.6; // radians from the camera's own direction at the rim of the pad: the light comes from behind
+const signed = (/** @type {number} */ value) =>
+  `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
+// Radians from the camera's own direction at the rim of the pad: the light comes from behind.
+const PAD_ANGLE = 2.6;
 const DRAGGED = 'dragged';
-/** Label, kinds that have it ("*": all environments), range, first value and format of each slider. */
+// Label, kinds that have it ("*": all environments), range, first value and format of each slider.
 const RANGES = {
   strength: { label: 'Strength', kinds: DRAGGED, low: 0, high: 8, value: 3, format: fixed },
   even: { label: 'Even light', kinds: DRAGGED, low: 0, high: 1, value: 0.15, format: fixed },
@@ -25,8 +27,8 @@ const RANGES = {
 };
 
 export class LightControls {
+  // Fill and show `section` for an avatar whose light is known.
   /**
-   * Fill and show `section` for an avatar whose light is known.
    * @param {HTMLElement} section
    * @param {StgaAvatar} avatar
    */
@@ -42,7 +44,11 @@ export class LightControls {
     this.dragged = /** @type {HTMLElement} */ (section.querySelector('#light-dragged'));
     section.hidden = false;
     const environments = Object.entries(ENVIRONMENTS).map(([name, { label }]) => [name, label]);
-    for (const [name, label] of [['recorded', 'As recorded'], [DRAGGED, 'A light to drag'], ...environments]) {
+    for (const [name, label] of [
+      ['recorded', 'As recorded'],
+      [DRAGGED, 'A light to drag'],
+      ...environments,
+    ]) {
       this.select.add(new Option(label, name));
     }
     this.select.addEventListener('change', () => {
@@ -53,12 +59,13 @@ export class LightControls {
     this.rows = Object.entries(RANGES).map(([name, range]) => this.addRange(section, name, range));
     this.color.addEventListener('input', () => this.apply());
     for (const name of ['pointerdown', 'pointermove']) {
-      this.pad.addEventListener(name, (event) => this.drag(/** @type {PointerEvent} */ (event)));
+      this.pad.addEventListener(name, event => this.drag(/** @type {PointerEvent} */ (event)));
     }
     avatar.addEventListener('camerachange', () => this.showDirection());
     avatar.addEventListener('lightchange', () => {
       const sun = avatar.lighting?.sun;
-      if (sun && this.kind === DRAGGED) this.toward = sun.toward; // it may have been dragged over the head
+      // It may have been dragged over the head.
+      if (sun && this.kind === DRAGGED) this.toward = sun.toward;
       this.showDirection();
     });
     this.showKind();
@@ -88,7 +95,9 @@ export class LightControls {
     this.dragged.hidden = this.kind !== DRAGGED;
     const isEnvironment = Object.hasOwn(ENVIRONMENTS, this.kind);
     for (const { row, kinds } of this.rows) {
-      row.hidden = !(isEnvironment ? kinds.endsWith('*') : this.kind === DRAGGED && kinds.startsWith(DRAGGED));
+      row.hidden = !(isEnvironment
+        ? kinds.endsWith('*')
+        : this.kind === DRAGGED && kinds.startsWith(DRAGGED));
     }
     this.showDirection();
   }
@@ -100,9 +109,12 @@ export class LightControls {
   /** @returns {Lighting | null} */
   lighting() {
     if (this.kind === 'recorded') return null;
-    const value = Object.fromEntries(this.rows.map(({ name, input }) => [name, Number(input.value)]));
+    const value = Object.fromEntries(
+      this.rows.map(({ name, input }) => [name, Number(input.value)]),
+    );
     const { strength, even, exposure } = value;
-    if (this.kind !== DRAGGED) return { environment: this.kind, turn: (Math.PI / 180) * value.turn, exposure };
+    if (this.kind !== DRAGGED)
+      return { environment: this.kind, turn: (Math.PI / 180) * value.turn, exposure };
     const color = scaled(linearColor(this.color.value), strength);
     return { even: [even, even, even], sun: { toward: this.toward, color }, exposure };
   }
@@ -126,8 +138,8 @@ export class LightControls {
   }
 }
 
+// The direction in the world of a place on the pad, whose middle is where the camera looks from.
 /**
- * The direction in the world of a place on the pad, whose middle is where the camera looks from.
  * @param {Camera | null} camera
  * @param {number} x from -1 to 1, to the right
  * @param {number} y from -1 to 1, down
@@ -138,27 +150,25 @@ function fromPad(camera, x, y) {
   const angle = PAD_ANGLE * Math.min(1, reach);
   const side = reach > 0 ? Math.sin(angle) / reach : 0;
   const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const part = (/** @type {number} */ k) => m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle);
+  const part = (/** @type {number} */ k) =>
+    m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle);
   return [part(0), part(1), part(2)];
 }
 
-/**
- * The reverse, within the pad.
- * @type {(camera: Camera | null, toward: Vector) => number[]}
- */
+// The reverse, within the pad.
+/** @type {(camera: Camera | null, toward: Vector) => number[]} */
 function onPad(camera, toward) {
   const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const along = (/** @type {number} */ k) => m[k] * toward[0] + m[k + 1] * toward[1] + m[k + 2] * toward[2];
+  const along = (/** @type {number} */ k) =>
+    m[k] * toward[0] + m[k + 1] * toward[1] + m[k + 2] * toward[2];
   const [x, y, z] = [along(0), along(4), along(8)];
   const side = Math.hypot(x, y);
   const reach = Math.min(1, Math.atan2(side, -z) / PAD_ANGLE);
   return side > 1e-9 ? [(x / side) * reach, (y / side) * reach] : [0, 0];
 }
 
-/**
- * "#rrggbb" in linear light.
- * @type {(hex: string) => Vector}
- */
+// "#rrggbb" in linear light.
+/** @type {(hex: string) => Vector} */
 function linearColor(hex) {
   const part = (/** @type {number} */ at) => {
     const value = parseInt(hex.slice(at, at + 2), 16) / 255;
@@ -179,8 +189,9 @@ function linearColor(hex) {
  */
 
 const SLIDERS_SHOWN = 8;
-const SHAPES_FIRST = // the last comes first
-  'browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight eyeBlinkLeft mouthClose jawOpen'.split(' ');
+// The last comes first.
+const SHAPES_FIRST = `browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight
+  eyeBlinkLeft mouthClose jawOpen`.split(/\s+/);
 const FACTS_INTERVAL_MS = 500;
 const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
 const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
@@ -355,8 +366,8 @@ function toggleTheme() {
 
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
+// A row with a name, an `output` or a button that shows the value, and the slider itself.
 /**
- * A row with a name, an `output` or a button that shows the value, and the slider itself.
  * @param {HTMLElement} parent
  * @param {'slider' | 'range'} kind the first has the button
  * @param {string} label
@@ -366,9 +377,12 @@ function toggleTheme() {
  */
 function sliderRow(parent, kind, label, low, high) {
   const row = Object.assign(document.createElement('label'), { className: kind });
-  const shown = kind === 'slider' ? '<button class="value" title="Release"></button>' : '<output></output>';
+  const shown =
+    kind === 'slider' ? '<button class="value" title="Release"></button>' : '<output></output>';
   row.innerHTML = `<span></span>${shown}<input type="range" step="any">`;
-  const [name, value, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([...row.children]);
+  const [name, value, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([
+    ...row.children,
+  ]);
   name.textContent = label;
   [input.min, input.max] = [String(low), String(high)];
   parent.append(row);
@@ -396,7 +410,7 @@ function addSlider(parent, { id, label, low, high, read, write, format = fixed }
     write(Number(input.value));
     update();
   });
-  value.addEventListener('click', (event) => {
+  value.addEventListener('click', event => {
     event.preventDefault();
     pin(false);
     write(null);
@@ -406,10 +420,8 @@ function addSlider(parent, { id, label, low, high, read, write, format = fixed }
   return row;
 }
 
-/**
- * "Expression 3" for expr_003.
- * @param {string} name
- */
+// "Expression 3" for expr_003.
+/** @param {string} name */
 function expressionLabel(name) {
   const number = /^expr_(\d+)$/.exec(name);
   return number ? `Expression ${Number(number[1])}` : name;
@@ -425,17 +437,15 @@ function addExpressions() {
       low: -reach,
       high: reach,
       read: () => avatar.getExpression(name),
-      write: (value) => avatar.setExpression(name, value),
+      write: value => avatar.setExpression(name, value),
     }),
   );
   section.hidden = !rows.length;
   showFirst(rows, byId('more'));
 }
 
-/**
- * Hide all but the first rows until the button is clicked.
- * @type {(rows: HTMLElement[], more: HTMLElement) => void}
- */
+// Hide all but the first rows until the button is clicked.
+/** @type {(rows: HTMLElement[], more: HTMLElement) => void} */
 function showFirst(rows, more) {
   more.hidden = rows.length <= SLIDERS_SHOWN;
   more.textContent = `Show all ${rows.length}`;
@@ -453,14 +463,14 @@ function addFaceShapes() {
   byId('shapes').hidden = !names.length;
   names.sort((one, other) => SHAPES_FIRST.indexOf(other) - SHAPES_FIRST.indexOf(one));
   const list = element('.sliders', HTMLElement, byId('shapes'));
-  const rows = names.map((name) =>
+  const rows = names.map(name =>
     addSlider(list, {
       id: name,
       label: name,
       low: 0,
       high: 1,
       read: () => avatar.getShape(name),
-      write: (value) => avatar.setShape(name, value),
+      write: value => avatar.setShape(name, value),
     }),
   );
   showFirst(rows, byId('more-shapes'));
@@ -472,8 +482,8 @@ function addFaceShapes() {
     byId('close-performance').hidden = !avatar.player?.motion.shapes.performance;
     showLength();
   });
-  document.addEventListener('dragover', (event) => event.preventDefault());
-  document.addEventListener('drop', (event) => {
+  document.addEventListener('dragover', event => event.preventDefault());
+  document.addEventListener('drop', event => {
     event.preventDefault();
     playFile(event.dataTransfer?.files[0]);
   });
@@ -488,13 +498,16 @@ async function playFile(file) {
     avatar.setPerformance(await file.text());
     avatar.play();
   } catch (error) {
-    problem.textContent = error instanceof DataError ? error.message : `The file cannot be read: ${error}`;
+    problem.textContent =
+      error instanceof DataError ? error.message : `The file cannot be read: ${error}`;
     problem.hidden = false;
   }
 }
 
 function addPose() {
-  const known = POSE_SLIDERS.filter(([, joints]) => joints.every((joint) => info().joints.includes(joint)));
+  const known = POSE_SLIDERS.filter(([, joints]) =>
+    joints.every(joint => info().joints.includes(joint)),
+  );
   const list = element('.sliders', HTMLElement, byId('pose'));
   for (const [label, joints, axis, low, high] of known) {
     addSlider(list, {
@@ -503,8 +516,8 @@ function addPose() {
       low,
       high,
       read: () => avatar.getPose(joints[0])[axis],
-      write: (value) => joints.forEach((joint) => avatar.setPose(joint, replaced(joint, axis, value))),
-      format: (value) => degrees((180 / Math.PI) * value),
+      write: value => joints.forEach(joint => avatar.setPose(joint, replaced(joint, axis, value))),
+      format: value => degrees((180 / Math.PI) * value),
     });
   }
   byId('pose').hidden = !known.length;
@@ -549,7 +562,8 @@ const KEYS = {
 /** @param {KeyboardEvent} event */
 function press(event) {
   const isArrow = event.key.startsWith('Arrow');
-  const isTyping = event.target instanceof Element && event.target.matches(isArrow ? 'select, input' : 'select');
+  const isTyping =
+    event.target instanceof Element && event.target.matches(isArrow ? 'select, input' : 'select');
   if (isTyping || event.ctrlKey || event.metaKey || event.altKey || !avatar.info) return;
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const action = /^[1-9]$/.test(key) ? () => showView(Number(key) - 1) : KEYS[key];
@@ -573,7 +587,8 @@ function showFacts() {
   const splats = avatar.splatCount.toLocaleString('en');
   const rate = avatar.frameCount > 1 ? ` · ${Number(avatar.fps.toFixed(2))} fps` : '';
   byId('facts').innerHTML =
-    `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms of JavaScript a frame</span>`;
+    `${splats} splats${rate}<span class="detail"> · ${avatar.frameTime.toFixed(1)} ms ` +
+    'of JavaScript a frame</span>';
 }
 
 function start() {
@@ -603,19 +618,21 @@ function fail() {
   for (const id of ['heading', 'transport', 'panel', 'open']) byId(id).hidden = true;
 }
 
-document.documentElement.dataset.theme = matchMedia('(prefers-color-scheme: dark)').matches ? 'dark' : 'light';
+document.documentElement.dataset.theme = matchMedia('(prefers-color-scheme: dark)').matches
+  ? 'dark'
+  : 'light';
 byId('theme').addEventListener('click', toggleTheme);
 byId('fullscreen').addEventListener('click', toggleFullscreen);
 addEventListener('keydown', press);
 avatar.addEventListener('load', start, { once: true });
 avatar.addEventListener('error', fail);
 
-/** The data file that the page holds as base64. Throws DataError where it was cut off or altered. */
+// The data file that the page holds as base64. Throws DataError where it was cut off or altered.
 async function embeddedData() {
   const text = document.querySelector('#data')?.textContent?.trim();
   if (!text) throw new DataError('This page holds no avatar data.');
   try {
-    return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+    return Uint8Array.from(atob(text), character => character.charCodeAt(0));
   } catch {
     throw new DataError('The avatar data is damaged.');
   }

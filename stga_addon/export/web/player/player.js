@@ -5,24 +5,26 @@
 
 import { cameraOfView, fitted, frontCamera, bounds } from './camera.js';
 import { FaceFrames } from './face_frames.js';
-import { RendererError } from './gl.js';
 import { LightPass } from './light_pass.js';
 import { litBy } from './light.js';
 import { Motion, Rig } from './motion.js';
-import { DepthSort, Renderer } from './renderer.js';
+import { DepthSort, Renderer, RendererError } from './renderer.js';
 
 const TIMING_SHARE = 0.1; // of the newest frame in the running mean
 
 export class Player {
+  // `data` of readData. Throws RendererError where the browser cannot draw it.
   /**
-   * `data` of readData. Throws RendererError where the browser cannot draw it.
    * @param {HTMLCanvasElement} canvas
    * @param {Data} data
    */
   constructor(canvas, data) {
     const options = { alpha: true, antialias: false, depth: false, premultipliedAlpha: true };
     const gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
-    if (!gl) throw new RendererError('This page needs WebGL 2, which this browser or graphics driver does not offer.');
+    if (!gl)
+      throw new RendererError(
+        'This page needs WebGL 2, which this browser or graphics driver does not offer.',
+      );
     this.gl = gl;
     const { header, arrays } = data;
     this.canvas = canvas;
@@ -73,10 +75,8 @@ export class Player {
     this.milliseconds += (this.milliseconds ? TIMING_SHARE : 1) * (spent - this.milliseconds);
   }
 
-  /**
-   * Pixels of the current frame from `camera`, which has its own size (Renderer.read).
-   * @param {Camera} camera
-   */
+  // Pixels of the current frame from `camera`, which has its own size (Renderer.read).
+  /** @param {Camera} camera */
   read(camera) {
     return this.renderer.read(this.prepare(camera), camera, this.background, this.showSelection);
   }
@@ -105,13 +105,14 @@ export class Player {
     this.lit = null;
   }
 
-  /**
-   * The light pass for the current pose.
-   * @param {Lighting} lighting
-   */
+  // The light pass for the current pose.
+  /** @param {Lighting} lighting */
   litPass(lighting) {
     this.lightPass ??= new LightPass(this.gl, this.data);
-    if (this.lit !== lighting) this.lightPass.update(this.rig.vertices, litBy(lighting, this.data.header.up));
+    if (this.lit !== lighting) {
+      const light = litBy(lighting, this.data.header.up);
+      this.lightPass.update(this.rig.vertices, this.faceFrames.sides, light);
+    }
     this.lit = lighting;
     return this.lightPass;
   }

@@ -1,5 +1,6 @@
 // @ts-check
-// Splats on a WebGL2 canvas: sorted, blended back to front into a float target, then over the background.
+// Splats on a WebGL2 canvas: sorted, blended back to front into a float target, then over the
+// background.
 
 /**
  * @import { LightPass } from './light_pass.js'
@@ -7,16 +8,6 @@
  */
 
 import { FACE_FLOATS } from './face_frames.js';
-import {
-  RendererError,
-  bindTexture,
-  deleteTarget,
-  floatTexture,
-  makeTarget,
-  paddedLength,
-  program,
-  updateTexture,
-} from './gl.js';
 import {
   FACE_TEXELS,
   OVER_FRAGMENT_SHADER,
@@ -31,15 +22,121 @@ import { wholeQuaternion } from './vector.js';
 
 const SH_C0 = 0.28209479177387814;
 
+export class RendererError extends Error {}
+
+/** @param {number} texels */
+export function paddedLength(texels) {
+  return 4 * TEXTURE_WIDTH * Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
+}
+
+/** @type {(gl: WebGL2RenderingContext, vertex: string, fragment: string) => Program} */
+export function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  /** @type {[number, string][]} */
+  const stages = [
+    [gl.VERTEX_SHADER, vertex],
+    [gl.FRAGMENT_SHADER, fragment],
+  ];
+  for (const [kind, source] of stages) {
+    const shader = gl.createShader(kind);
+    if (!shader) continue; // the context is lost
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+    gl.deleteShader(shader);
+  }
+  gl.bindAttribLocation(made, 0, 'splatIndex');
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const logs = (gl.getAttachedShaders(made) ?? []).map(shader => gl.getShaderInfoLog(shader));
+    throw new RendererError(
+      `The graphics driver rejects a shader: ${logs.join(' ')} ${gl.getProgramInfoLog(made)}`,
+    );
+  }
+  /** @type {Program['uniforms']} */
+  const uniforms = {};
+  const count = gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS) ?? 0;
+  for (let k = 0; k < count; k++) {
+    const name = gl.getActiveUniform(made, k)?.name;
+    if (name) uniforms[name] = gl.getUniformLocation(made, name);
+  }
+  return { program: made, uniforms };
+}
+
+/** @type {(gl: WebGL2RenderingContext, format: number, values: Float32Array) => WebGLTexture} */
+export function floatTexture(gl, format, values) {
+  const height = values.length / (4 * TEXTURE_WIDTH);
+  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+    throw new RendererError('The avatar has more splats than this graphics card can hold.');
+  }
+  const made = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXTURE_WIDTH, height, 0, gl.RGBA, gl.FLOAT, values);
+  return made;
+}
+
+// Replace all of a texture of `floatTexture`.
+/** @type {(gl: WebGL2RenderingContext, texture: WebGLTexture, values: Float32Array) => void} */
+export function updateTexture(gl, texture, values) {
+  gl.activeTexture(gl.TEXTURE0);
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  const rows = values.length / (4 * TEXTURE_WIDTH);
+  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RGBA, gl.FLOAT, values);
+}
+
+/**
+ * @param {WebGL2RenderingContext} gl
+ * @param {number} unit
+ * @param {WebGLTexture} bound
+ * @param {WebGLUniformLocation | null} [uniform]
+ */
+export function bindTexture(gl, unit, bound, uniform) {
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.bindTexture(gl.TEXTURE_2D, bound);
+  gl.uniform1i(uniform ?? null, unit);
+}
+
+/**
+ * @param {WebGL2RenderingContext} gl
+ * @param {number} format
+ * @param {number} width
+ * @param {number} height
+ * @param {number} [attachment]
+ * @returns {Target}
+ */
+export function makeTarget(gl, format, width, height, attachment = gl.COLOR_ATTACHMENT0) {
+  const made = gl.createTexture();
+  gl.activeTexture(gl.TEXTURE0);
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  const framebuffer = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, attachment, gl.TEXTURE_2D, made, 0);
+  return { texture: made, framebuffer, format, width, height };
+}
+
+/** @type {(gl: WebGL2RenderingContext, target: Target) => void} */
+export function deleteTarget(gl, target) {
+  gl.deleteFramebuffer(target.framebuffer);
+  gl.deleteTexture(target.texture);
+}
+
 export class Renderer {
+  // Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw
+  // them.
   /**
-   * Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw them.
    * @param {WebGL2RenderingContext} gl
    * @param {Data} data
    */
   constructor(gl, data) {
     if (!gl.getExtension('EXT_color_buffer_float')) {
-      throw new RendererError('This browser cannot draw to float textures, which the avatar needs.');
+      throw new RendererError(
+        'This browser cannot draw to float textures, which the avatar needs.',
+      );
     }
     this.gl = gl;
     const { arrays, header } = data;
@@ -55,7 +152,11 @@ export class Renderer {
     this.lightPass = null;
     this.overProgram = program(gl, OVER_VERTEX_SHADER, OVER_FRAGMENT_SHADER);
     this.splatTexture = floatTexture(gl, gl.RGBA32F, splatTexels(arrays));
-    this.tailTexture = floatTexture(gl, gl.RGBA16F, tailValues(arrays, tailTexels(harmonics, strains)));
+    this.tailTexture = floatTexture(
+      gl,
+      gl.RGBA16F,
+      tailValues(arrays, tailTexels(harmonics, strains)),
+    );
     this.frameValues = new Float32Array(paddedLength(this.faces * FACE_TEXELS));
     this.frameTexture = floatTexture(gl, gl.RGBA32F, this.frameValues);
     this.vertexArray = gl.createVertexArray();
@@ -71,10 +172,10 @@ export class Renderer {
     this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
   }
 
+  // Draw `order` (back to front) of the splats on the frames in `frameValues`. camera: { size,
+  // focal, center, matrix }; background: red, green, blue, alpha; framebuffer: null for the canvas;
+  // format: of the target in which they are blended.
   /**
-   * Draw `order` (back to front) of the splats on the frames in `frameValues`.
-   * camera: { size, focal, center, matrix }; background: red, green, blue, alpha; framebuffer: null for the canvas;
-   * format: of the target in which they are blended.
    * @param {Uint32Array} order
    * @param {Camera} camera
    * @param {Color} background
@@ -85,7 +186,11 @@ export class Renderer {
   draw(order, camera, background, showSelection, framebuffer = null, format = this.gl.RGBA16F) {
     const gl = this.gl;
     const [width, height] = camera.size;
-    if (this.target?.width !== width || this.target.height !== height || this.target.format !== format) {
+    if (
+      this.target?.width !== width ||
+      this.target.height !== height ||
+      this.target.format !== format
+    ) {
       if (this.target) deleteTarget(gl, this.target);
       this.target = makeTarget(gl, format, width, height);
     }
@@ -94,7 +199,12 @@ export class Renderer {
     gl.bindVertexArray(this.vertexArray);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
-    const colors = this.lightPass?.draw(camera.matrix, this.splatTexture, this.tailTexture, this.frameTexture);
+    const colors = this.lightPass?.draw(
+      camera.matrix,
+      this.splatTexture,
+      this.tailTexture,
+      this.frameTexture,
+    );
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
@@ -104,7 +214,13 @@ export class Renderer {
     gl.useProgram(this.overProgram.program);
     bindTexture(gl, 0, target.texture, this.overProgram.uniforms.uPicture);
     const [red, green, blue, alpha] = background;
-    gl.uniform4f(this.overProgram.uniforms.uBackground, red * alpha, green * alpha, blue * alpha, alpha);
+    gl.uniform4f(
+      this.overProgram.uniforms.uBackground,
+      red * alpha,
+      green * alpha,
+      blue * alpha,
+      alpha,
+    );
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
@@ -115,7 +231,8 @@ export class Renderer {
    */
   drawSplats(camera, showSelection, colors) {
     const gl = this.gl;
-    if (colors) this.litProgram ??= program(gl, splatVertexShader(0, 0, true), SPLAT_FRAGMENT_SHADER);
+    if (colors)
+      this.litProgram ??= program(gl, splatVertexShader(0, 0, true), SPLAT_FRAGMENT_SHADER);
     const { program: used, uniforms } = (colors && this.litProgram) || this.splatProgram;
     gl.useProgram(used);
     bindTexture(gl, 0, this.frameTexture, uniforms.uFaces);
@@ -123,7 +240,17 @@ export class Renderer {
     bindTexture(gl, 2, colors ?? this.tailTexture, colors ? uniforms.uColors : uniforms.uTail);
     const m = camera.matrix;
     // Rows of world to camera are columns of its transpose, camera to world.
-    gl.uniformMatrix3fv(uniforms.uToWorld, false, [m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]]);
+    gl.uniformMatrix3fv(uniforms.uToWorld, false, [
+      m[0],
+      m[1],
+      m[2],
+      m[4],
+      m[5],
+      m[6],
+      m[8],
+      m[9],
+      m[10],
+    ]);
     gl.uniform2f(uniforms.uFocal, ...camera.focal);
     gl.uniform2f(uniforms.uCenter, ...camera.center);
     gl.uniform2f(uniforms.uSize, ...camera.size);
@@ -135,8 +262,9 @@ export class Renderer {
     gl.disable(gl.BLEND);
   }
 
+  // The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied
+  // with alpha.
   /**
-   * The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied with alpha.
    * @param {Uint32Array} order
    * @param {Camera} camera
    * @param {Color} background
@@ -161,16 +289,26 @@ export class Renderer {
 
   dispose() {
     const gl = this.gl;
-    for (const item of [this.splatTexture, this.tailTexture, this.frameTexture]) gl.deleteTexture(item);
+    for (const item of [this.splatTexture, this.tailTexture, this.frameTexture])
+      gl.deleteTexture(item);
     gl.deleteBuffer(this.indexBuffer);
     gl.deleteVertexArray(this.vertexArray);
-    for (const item of [this.splatProgram, this.overProgram, this.litProgram]) gl.deleteProgram(item?.program ?? null);
+    for (const item of [this.splatProgram, this.overProgram, this.litProgram])
+      gl.deleteProgram(item?.program ?? null);
     if (this.target) deleteTarget(gl, this.target);
   }
 }
 
 /** @param {Arrays} arrays */
-function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_scale, opacity, color }) {
+function splatTexels({
+  xyz,
+  splats_per_face,
+  rotation,
+  rotation_largest,
+  log_scale,
+  opacity,
+  color,
+}) {
   const values = new Float32Array(paddedLength(xyz.shape[0] * SPLAT_TEXELS));
   for (let face = 0, splat = 0; face < splats_per_face.values.length; face++) {
     for (const end = splat + splats_per_face.values[face]; splat < end; splat++) {
@@ -182,7 +320,10 @@ function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, log_sca
         values[to + 12 + k] = 0.5 + SH_C0 * color.values[from + k];
       }
       values[to + 3] = face; // a float holds whole numbers up to 2^24
-      values.set(wholeQuaternion(rotation.values.subarray(from, from + 3), rotation_largest.values[splat]), to + 4);
+      values.set(
+        wholeQuaternion(rotation.values.subarray(from, from + 3), rotation_largest.values[splat]),
+        to + 4,
+      );
       values[to + 11] = opacity.values[splat];
     }
   }
@@ -197,7 +338,10 @@ function tailValues({ xyz, sh, strain_color }, texels) {
     if (!array) continue;
     const size = array.shape[1];
     for (let splat = 0; splat < xyz.shape[0]; splat++) {
-      values.set(array.values.subarray(size * splat, size * (splat + 1)), 4 * texels * splat + offset);
+      values.set(
+        array.values.subarray(size * splat, size * (splat + 1)),
+        4 * texels * splat + offset,
+      );
     }
     offset += size;
   }
@@ -211,8 +355,8 @@ const DIGITS = 1 << DIGIT_BITS;
 const MAX_KEY = DIGITS * DIGITS - 1;
 
 export class DepthSort {
+  // xyz (3·N) of splats sorted by triangle, and how many each triangle has.
   /**
-   * xyz (3·N) of splats sorted by triangle, and how many each triangle has.
    * @param {ArrayLike<number>} xyz
    * @param {ArrayLike<number>} splatsPerFace
    */
@@ -228,10 +372,8 @@ export class DepthSort {
     this.high = new Int32Array(DIGITS);
   }
 
-  /**
-   * Indices of the splats, farthest first; `frames` as FaceFrames.compose writes them.
-   * @param {ArrayLike<number>} frames
-   */
+  // Indices of the splats, farthest first; `frames` as FaceFrames.compose writes them.
+  /** @param {ArrayLike<number>} frames */
   sort(frames) {
     const { byLow, depth, high, key, low, order } = this;
     const [near, far] = this.measureDepth(frames);
@@ -239,7 +381,8 @@ export class DepthSort {
     low.fill(0);
     high.fill(0);
     for (let i = 0; i < key.length; i++) {
-      // From 0 for the farthest to MAX_KEY for the nearest and those behind the camera; below 0 only by rounding.
+      // From 0 for the farthest to MAX_KEY for the nearest and those behind the camera; below 0
+      // only by rounding.
       const steps = (far - depth[i]) * scale;
       key[i] = steps < MAX_KEY ? Math.max(steps, 0) : MAX_KEY;
       low[key[i] & (DIGITS - 1)]++;
@@ -257,10 +400,8 @@ export class DepthSort {
     return order;
   }
 
-  /**
-   * Fill `depth`; returns the nearest in front of the camera, and the farthest.
-   * @param {ArrayLike<number>} frames
-   */
+  // Fill `depth`; returns the nearest in front of the camera, and the farthest.
+  /** @param {ArrayLike<number>} frames */
   measureDepth(frames) {
     const { depth, splatsPerFace, xyz } = this;
     let near = Infinity;

@@ -1,6 +1,6 @@
 // @ts-check
-// GLSL: splats as quads, then the picture over its background; and a pass that computes the color of each splat under a
-// light once, with the shadow map of the sun.
+// GLSL: splats as quads, then the picture over its background; and a pass that computes the color
+// of each splat under a light once, with the shadow map of the sun.
 
 export const TEXTURE_WIDTH = 2048;
 export const SPLAT_TEXELS = 4; // xyz, triangle | rotation | scale, opacity | color
@@ -11,6 +11,7 @@ export const MAP_SIZE = 512;
 export const LIFT_M = 0.001;
 const SKIN_ROUGHNESS = 0.45;
 const MIN_ALPHA = 1 / 255;
+const LIT_COLOR = 'color = texelFetch(uColors, texel(splat), 0).rgb;';
 /** Of the recorded color without what depends on the view, by degree from 1 (light/relight.py). */
 const VIEW_MEANS = [0.65, 0.195, -0.089375];
 
@@ -25,21 +26,20 @@ ivec2 texel(int index) {
 /** Of degree 1 on, by x, y, z and their squares: what the export writes here. */
 const SH = '{{harmonics}}'.split('; ');
 
-/**
- * Texels a splat needs for its view-dependent and strain-dependent colors.
- * @type {(harmonics: number, strains: number) => number}
- */
+// Texels a splat needs for its view-dependent and strain-dependent colors.
+/** @type {(harmonics: number, strains: number) => number} */
 export function tailTexels(harmonics, strains) {
   return Math.ceil((3 * (harmonics + strains)) / 4);
 }
 
 /** @param {number} k */
 function tailTriple(k) {
-  return `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map((at) => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
+  return `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map(at => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
 }
 
+// Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices
+// are slow on many GPUs.
 /**
- * Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices are slow on many GPUs.
  * @param {number} harmonics
  * @param {string} direction
  * @param {string} sum
@@ -51,26 +51,32 @@ function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
     return `${sum} += ${factor.toFixed(8)} * (${term}) * ${tailTriple(k)};`;
   });
   return `{
-    float x = ${direction}.x, y = ${direction}.y, z = ${direction}.z, xx = x * x, yy = y * y, zz = z * z;
+    float x = ${direction}.x, y = ${direction}.y, z = ${direction}.z;
+    float xx = x * x, yy = y * y, zz = z * z;
     ${terms.join('\n    ')}
   }`;
 }
 
+// Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain
+// to `byStrain`.
 /**
- * Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain to `byStrain`.
- * @type {(harmonics: number, strains: number, direction: string, byView?: string, byStrain?: string) => string}
+ * @type {(harmonics: number, strains: number, direction: string, byView?: string, byStrain?:
+ *   string) => string}
  */
 function tailColor(harmonics, strains, direction, byView = 'color', byStrain = 'color') {
   const texels = tailTexels(harmonics, strains);
   const lines = [];
-  for (let t = 0; t < texels; t++) lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
-  if (harmonics) lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
-  for (let k = 0; k < strains; k++) lines.push(`${byStrain} += face.${'xyz'[k]} * ${tailTriple(harmonics + k)};`);
+  for (let t = 0; t < texels; t++)
+    lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
+  if (harmonics)
+    lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
+  for (let k = 0; k < strains; k++)
+    lines.push(`${byStrain} += face.${'xyz'[k]} * ${tailTriple(harmonics + k)};`);
   return lines.join('\n  ');
 }
 
+// The limits and constants are those of the kernels that trained the splats (raster/cpu).
 /**
- * The limits and constants are those of the kernels that trained the splats (raster/cpu).
  * @param {number} harmonics
  * @param {number} strains
  * @param {boolean} [isLit] whether colors come from the light pass
@@ -88,7 +94,8 @@ flat out vec2 vCenter;
 flat out mat2 vToUnit;
 flat out vec4 vColor;
 
-const float SNAP = 0.07; // pixels: more than a corner moves to the driver's grid, of 1/16 pixel at the coarsest
+// Pixels: more than a corner moves to the driver's grid, of 1/16 pixel at the coarsest.
+const float SNAP = 0.07;
 const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.15;
 
 mat3 rotation(vec4 q) {
@@ -146,14 +153,15 @@ void main() {
   if (uShowSelection && face.w < 0.5) {
     color = vec3(0.25 + 0.4 * dot(color, vec3(0.299, 0.587, 0.114)));
   } else {
-  ${isLit ? 'color = texelFetch(uColors, texel(splat), 0).rgb;' : tailColor(harmonics, strains, 'uToWorld * center')}
+  ${isLit ? LIT_COLOR : tailColor(harmonics, strains, 'uToWorld * center')}
   }
   vColor = vec4(max(color, 0.0), opacity);
   gl_Position = vec4(2.0 * pixel.x / uSize.x - 1.0, 1.0 - 2.0 * pixel.y / uSize.y, 0.0, 1.0);
 }`;
 }
 
-// From the pixel's own place: an interpolated offset would move with the corners, which drivers round to a grid.
+// From the pixel's own place: an interpolated offset would move with the corners, which drivers
+// round to a grid.
 export const SPLAT_FRAGMENT_SHADER = `#version 300 es
 precision highp float;
 flat in vec2 vCenter;
@@ -183,22 +191,24 @@ void main() {
   result = vec4(min(picture.rgb, 1.0), picture.a) + (1.0 - picture.a) * uBackground;
 }`;
 
-/** Vertices by their index, as the sun sees them: depth from 0 to 1 within twice the radius of the head. */
+// Vertices by their index, as the sun sees them: depth from 0 to 1 within twice the radius of the
+// head.
 export const SHADOW_VERTEX_SHADER = `${PREAMBLE}
 uniform sampler2D uVertices;
 uniform mat3 uToSun;
 uniform vec3 uMiddle;
 uniform float uRadius;
 void main() {
-  vec3 local = uToSun * (texelFetch(uVertices, texel(gl_VertexID * ${VERTEX_TEXELS}), 0).xyz - uMiddle);
+  vec3 vertex = texelFetch(uVertices, texel(gl_VertexID * ${VERTEX_TEXELS}), 0).xyz;
+  vec3 local = uToSun * (vertex - uMiddle);
   gl_Position = vec4(local / uRadius, 1.0);
 }`;
 
 export const SHADOW_FRAGMENT_SHADER = `#version 300 es
 void main() {}`;
 
+// A texel a splat: its color in sRGB, not clipped.
 /**
- * A texel a splat: its color in sRGB, not clipped.
  * @param {number} harmonics of splats whose color depends on the view
  * @param {number} strains 3 where it depends on strain
  */
@@ -223,7 +233,8 @@ void main() {
   int splat = int(gl_FragCoord.x) + ${TEXTURE_WIDTH} * int(gl_FragCoord.y);
   vec4 surface = texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS}), 0);
   vec4 old = texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS} + 1), 0);
-  ivec3 corners = ${VERTEX_TEXELS} * ivec3(texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS} + 2), 0).xyz + 0.5);
+  vec4 vertices = texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS} + 2), 0);
+  ivec3 corners = ${VERTEX_TEXELS} * ivec3(vertices.xyz + 0.5);
   vec3 weights = texelFetch(uSurface, texel(splat * ${SURFACE_TEXELS} + 3), 0).xyz;
   vec3 normal = mean(corners, weights, 1);
   normal /= max(length(normal), 1e-12);
@@ -245,10 +256,12 @@ void main() {
   int triangle = int(texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS}), 0).w);
   vec4 face = texelFetch(uFaces, texel(triangle * ${FACE_TEXELS} + 3), 0);
   ${tailColor(harmonics, strains, 'point - uEye', 'byView', 'byStrain')}
-  vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + byStrain, recorded = color + byView;
+  vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + byStrain;
+  vec3 recorded = color + byView;
   vec3 inward = -surface.xyz / max(length(surface.xyz), 1e-12);
   ${harmonics ? harmonicsSum(harmonics, 'inward', 'color', VIEW_MEANS) : ''}
-  vec3 lit = lit_color(vec4(color, surface.a), old.rgb, arriving, highlight, recorded, uTypical, uKept);
+  vec4 albedo = vec4(color, surface.a);
+  vec3 lit = lit_color(albedo, old.rgb, arriving, highlight, recorded, uTypical, uKept);
   result = vec4(linear_to_srgb(uFactor * lit), 1.0);
 }`;
 }

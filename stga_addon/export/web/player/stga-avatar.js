@@ -1,13 +1,14 @@
 // @ts-check
-// <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element (docs/web.md).
+// <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element
+// (docs/web.md).
 
 /** @import { Camera, Lighting } from './types.js' */
 
 import { addControls, cameraOfView } from './camera.js';
 import { DataError, readData } from './data.js';
-import { RendererError } from './gl.js';
+import { RendererError } from './renderer.js';
 import { litBy } from './light.js';
-import { readPerformance } from './performance.js';
+import { readPerformance } from './motion.js';
 import { Player } from './player.js';
 
 const MAX_PIXEL_RATIO = 2;
@@ -15,9 +16,11 @@ const MAX_STEP_S = 0.25; // of playback time between two frames: a hidden tab re
 
 const STYLE = `
 :host { display: block; position: relative; overflow: hidden; contain: content; }
-canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab; outline: none; }
+canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab;
+  outline: none; }
 canvas:active { cursor: grabbing; }
-p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 30em; padding: 1em; text-align: center;
+p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 30em; padding: 1em;
+  text-align: center;
   font: 16px/1.5 system-ui, sans-serif; }
 [hidden] { display: none; }`;
 
@@ -50,7 +53,7 @@ export class StgaAvatar extends HTMLElement {
       () => this.#changed('camerachange'),
       () => this.#changed('lightchange'),
     );
-    this.#canvas.addEventListener('webglcontextlost', (event) => this.#lose(event));
+    this.#canvas.addEventListener('webglcontextlost', event => this.#lose(event));
     this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
     new ResizeObserver(() => this.#resize()).observe(this);
   }
@@ -63,15 +66,17 @@ export class StgaAvatar extends HTMLElement {
     if (name === 'background' && value && this.#player) this.background = value;
   }
 
+  // Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of
+  // one). Rejects, and says why on the page.
   /**
-   * Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of one). Rejects, and
-   * says why on the page.
-   * @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>} source
+   * @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>}
+   *   source
    */
   async load(source) {
     const loading = ++this.#loading;
     try {
-      const bytes = typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(await source);
+      const bytes =
+        typeof source === 'string' ? await fetchBytes(source) : new Uint8Array(await source);
       const data = await readData(bytes);
       if (loading !== this.#loading) return; // another load has begun
       this.#show(new Player(this.#canvas, data));
@@ -81,7 +86,8 @@ export class StgaAvatar extends HTMLElement {
     }
   }
 
-  /** What the data file says of itself: title, fps, views, sliders, joints, …; null before it is loaded. */
+  // What the data file says of itself: title, fps, views, sliders, joints, …; null before it is
+  // loaded.
   get info() {
     return this.#player?.data.header ?? null;
   }
@@ -120,10 +126,8 @@ export class StgaAvatar extends HTMLElement {
     this.#changed('pause');
   }
 
-  /**
-   * Replace an expression (its name or component) by a value; null: as recorded.
-   * @type {(name: string | number, value: number | null) => void}
-   */
+  // Replace an expression (its name or component) by a value; null: as recorded.
+  /** @type {(name: string | number, value: number | null) => void} */
   setExpression(name, value) {
     const component = this.#component(name);
     this.#loaded.motion.pinnedCoefficients[component] = value ?? NaN;
@@ -135,10 +139,9 @@ export class StgaAvatar extends HTMLElement {
     return this.#loaded.motion.coefficients[this.#component(name)];
   }
 
-  /**
-   * Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded; null: all parts.
-   * @type {(joint: string, rotation: ArrayLike<number | null> | null) => void}
-   */
+  // Replace a joint's rotation by an axis-angle vector in radians, parts that are null as recorded;
+  // null: all parts.
+  /** @type {(joint: string, rotation: ArrayLike<number | null> | null) => void} */
   setPose(joint, rotation) {
     const at = 3 * this.#index(this.#loaded.data.header.joints, joint, 'joint');
     const { pinnedPose } = this.#loaded.motion;
@@ -152,11 +155,9 @@ export class StgaAvatar extends HTMLElement {
     return Array.from(this.#loaded.motion.pose.subarray(at, at + 3));
   }
 
-  /**
-   * Replace a shape (one of `info.shapes.names`) by a weight; null: as the performance has it, or 0. While one is
-   * replaced, the shapes move expressions, jaw and eyes instead of the recording.
-   * @type {(name: string, weight: number | null) => void}
-   */
+  // Replace a shape (one of `info.shapes.names`) by a weight; null: as the performance has it, or
+  // 0. While one is replaced, the shapes move expressions, jaw and eyes instead of the recording.
+  /** @type {(name: string, weight: number | null) => void} */
   setShape(name, weight) {
     const { shapes } = this.#loaded.motion;
     shapes.pinned[this.#index(shapes.names, name, 'shape')] = weight ?? NaN;
@@ -169,14 +170,13 @@ export class StgaAvatar extends HTMLElement {
     return weights[this.#index(names, name, 'shape')];
   }
 
-  /**
-   * Play a performance (the text of a CSV file with a column per shape) instead of the recording; null: the recording.
-   * Throws DataError where it is none.
-   * @param {string | null} text
-   */
+  // Play a performance (the text of a CSV file with a column per shape) instead of the recording;
+  // null: the recording. Throws DataError where it is none.
+  /** @param {string | null} text */
   setPerformance(text) {
     const { shapes } = this.#loaded.motion;
-    if (text !== null && !shapes.names.length) throw new DataError('This avatar has no shapes for a performance.');
+    if (text !== null && !shapes.names.length)
+      throw new DataError('This avatar has no shapes for a performance.');
     shapes.performance = text === null ? null : readPerformance(text, shapes.names);
     if (text === null) shapes.weights.fill(0);
     this.#time = 0;
@@ -196,18 +196,15 @@ export class StgaAvatar extends HTMLElement {
     this.#posed();
   }
 
-  /**
-   * { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes, meters).
-   * @returns {Camera | null}
-   */
+  // { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes,
+  // meters).
+  /** @returns {Camera | null} */
   get camera() {
     return this.#player?.camera ?? null;
   }
 
-  /**
-   * A camera as above, or the name of one of the file's views.
-   * @param {Camera | string} value
-   */
+  // A camera as above, or the name of one of the file's views.
+  /** @param {Camera | string} value */
   set camera(value) {
     const player = this.#loaded;
     const { views } = player.data.header;
@@ -216,7 +213,7 @@ export class StgaAvatar extends HTMLElement {
         ? cameraOfView(
             views[
               this.#index(
-                views.map((view) => view.name),
+                views.map(view => view.name),
                 value,
                 'view',
               )
@@ -240,10 +237,12 @@ export class StgaAvatar extends HTMLElement {
 
   set background(value) {
     const digits = /^#([0-9a-f]{6})$/i.exec(value)?.[1];
-    if (!digits && value !== 'transparent') throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
+    if (!digits && value !== 'transparent')
+      throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
     const part = (/** @type {number} */ at) => parseInt((digits ?? '').slice(at, at + 2), 16) / 255;
-    if (this.#player) this.#player.background = digits ? [part(0), part(2), part(4), 1] : [0, 0, 0, 0];
-    this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+    if (this.#player)
+      this.#player.background = digits ? [part(0), part(2), part(4), 1] : [0, 0, 0, 0];
+    this.#request ||= requestAnimationFrame(now => this.#tick(now));
   }
 
   /** Whether splats on triangles that the frame did not train are gray. */
@@ -265,10 +264,8 @@ export class StgaAvatar extends HTMLElement {
     return Boolean(this.#player?.data.header.light);
   }
 
-  /**
-   * What lights the avatar (types.d.ts); null: the light that it was recorded in.
-   * @returns {Lighting | null}
-   */
+  // What lights the avatar (types.d.ts); null: the light that it was recorded in.
+  /** @returns {Lighting | null} */
   get lighting() {
     return this.#player?.lighting ?? null;
   }
@@ -290,16 +287,14 @@ export class StgaAvatar extends HTMLElement {
     return this.#player?.milliseconds ?? 0;
   }
 
-  /**
-   * The current frame as a PNG (Blob) from `camera`, by default the current one at its own size.
-   * @type {(camera?: Camera) => Promise<Blob | null>}
-   */
+  // The current frame as a PNG (Blob) from `camera`, by default the current one at its own size.
+  /** @type {(camera?: Camera) => Promise<Blob | null>} */
   async snapshot(camera = this.#loaded.camera) {
     const pixels = this.#loaded.read(camera);
     const picture = document.createElement('canvas');
     [picture.width, picture.height] = camera.size;
     picture.getContext('2d')?.putImageData(new ImageData(pixels, ...camera.size), 0, 0);
-    return new Promise((resolve) => picture.toBlob(resolve, 'image/png'));
+    return new Promise(resolve => picture.toBlob(resolve, 'image/png'));
   }
 
   /** The player, for what this interface leaves out. */
@@ -313,10 +308,8 @@ export class StgaAvatar extends HTMLElement {
     return this.#player;
   }
 
-  /**
-   * Index of a name among the names of a kind of thing. Throws RangeError where there is none.
-   * @type {(names: (string | number)[], name: string | number, kind: string) => number}
-   */
+  // Index of a name among the names of a kind of thing. Throws RangeError where there is none.
+  /** @type {(names: (string | number)[], name: string | number, kind: string) => number} */
   #index(names, name, kind) {
     const index = names.indexOf(name);
     if (index < 0) throw new RangeError(`There is no ${kind} "${name}".`);
@@ -326,7 +319,9 @@ export class StgaAvatar extends HTMLElement {
   /** @param {string | number} name of an expression, or its component */
   #component(name) {
     const { sliders } = this.#loaded.data.header;
-    const names = sliders.map((slider) => (typeof name === 'string' ? slider.name : slider.component));
+    const names = sliders.map(slider =>
+      typeof name === 'string' ? slider.name : slider.component,
+    );
     return sliders[this.#index(names, name, 'expression')].component;
   }
 
@@ -347,10 +342,8 @@ export class StgaAvatar extends HTMLElement {
     this.#changed('frame'); // the first one is drawn once, as whoever waited for "load" wants it
   }
 
-  /**
-   * The graphics driver was restarted.
-   * @param {Event} event
-   */
+  // The graphics driver was restarted.
+  /** @param {Event} event */
   #lose(event) {
     event.preventDefault(); // so that it will be given back
     this.#message.textContent = 'The graphics driver was restarted. Waiting for it …';
@@ -390,7 +383,7 @@ export class StgaAvatar extends HTMLElement {
 
   /** @param {string} event */
   #changed(event) {
-    if (this.#player) this.#request ||= requestAnimationFrame((now) => this.#tick(now));
+    if (this.#player) this.#request ||= requestAnimationFrame(now => this.#tick(now));
     this.#player?.motion.sample(this.#time); // what listeners ask for is that of the new frame
     this.dispatchEvent(new CustomEvent(event));
   }
@@ -419,7 +412,9 @@ export class StgaAvatar extends HTMLElement {
 
   #resize() {
     const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    const [width, height] = [this.clientWidth, this.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    const [width, height] = [this.clientWidth, this.clientHeight].map(side =>
+      Math.max(1, Math.round(side * ratio)),
+    );
     if (this.#canvas.width === width && this.#canvas.height === height) return;
     this.#canvas.width = width;
     this.#canvas.height = height;
@@ -430,7 +425,7 @@ export class StgaAvatar extends HTMLElement {
 /** @param {number[]} color red, green, blue from 0 to 1 */
 export function hexOf(color) {
   return `#${color
-    .map((part) =>
+    .map(part =>
       Math.round(255 * part)
         .toString(16)
         .padStart(2, '0'),

@@ -39,16 +39,39 @@ export interface Header {
   joints: string[];
   parents: number[];
   sliders: Slider[];
-  /** Controls that move expressions, jaw and eyes together: one counts up to the weight of another only. */
+  /**
+   * Controls that move expressions, jaw and eyes together: one counts up to the weight of another
+   * only.
+   */
   shapes?: { names: string[]; opens: string; limited: string };
-  /** Where it is known, the light of the capture (27 harmonics); how much albedo is drawn to its mean, 0 to 1, and that. */
+  /**
+   * Where it is known, the light of the capture (27 harmonics); how much albedo is drawn to its
+   * mean, 0 to 1, and that.
+   */
   light?: { damping: number; recorded: number[]; typical: number[] };
   views: View[];
 }
 
 type NeededArrays =
-  | ('xyz' | 'rotation' | 'rotation_largest' | 'log_scale' | 'opacity' | 'color' | 'splats_per_face')
-  | ('faces' | 'neutral' | 'base' | 'basis' | 'correctives' | 'weights' | 'joint_rest' | 'joint_basis')
+  | (
+      | 'xyz'
+      | 'rotation'
+      | 'rotation_largest'
+      | 'log_scale'
+      | 'opacity'
+      | 'color'
+      | 'splats_per_face'
+    )
+  | (
+      | 'faces'
+      | 'neutral'
+      | 'base'
+      | 'basis'
+      | 'correctives'
+      | 'weights'
+      | 'joint_rest'
+      | 'joint_basis'
+    )
   | ('coefficients' | 'pose' | 'translation');
 
 /** Arrays of a data file, checked; what others there are, `checkData` (data.js) lists. */
@@ -67,13 +90,19 @@ export interface Camera {
   matrix: Float64Array;
 }
 
-/** Unit vector towards a distant light, and what a surface that faces it gets: W/m², linear red, green, blue. */
+/**
+ * Unit vector towards a distant light, and what a surface that faces it gets: W/m², linear red,
+ * green, blue.
+ */
 export interface Sun {
   toward: Vector;
   color: Vector;
 }
 
-/** What lights the avatar, in the axes of its meshes. Radiance 1 from everywhere shows albedo as it is. */
+/**
+ * What lights the avatar, in the axes of its meshes. Radiance 1 from everywhere shows albedo as it
+ * is.
+ */
 export interface Lighting {
   /** Radiance from everywhere, linear red, green, blue. */
   even?: Vector;
@@ -119,7 +148,10 @@ export interface Target {
   height: number;
 }
 
-/** Rows at even times; the column of each shape, and of yaw, pitch and roll of the head (radians); -1: none. */
+/**
+ * Rows at even times; the column of each shape, and of yaw, pitch and roll of the head (radians);
+ * -1: none.
+ */
 export interface Performance {
   columns: number[];
   head: number[];

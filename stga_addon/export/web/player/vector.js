@@ -1,5 +1,6 @@
 // @ts-check
-// Vectors of three numbers, and rotations as axis-angle vectors, unit quaternions (w, x, y, z) and 3×3 matrices, row by row.
+// Vectors of three numbers, and rotations as axis-angle vectors, unit quaternions (w, x, y, z) and
+// 3×3 matrices, row by row.
 
 /** @import { Values, Vector } from './types.js' */
 
@@ -30,10 +31,8 @@ export function unit(v) {
   return scaled(v, 1 / Math.hypot(v[0], v[1], v[2]));
 }
 
-/**
- * Least and largest coordinates of points (3·V).
- * @type {(points: ArrayLike<number>) => [Vector, Vector]}
- */
+// Least and largest coordinates of points (3·V).
+/** @type {(points: ArrayLike<number>) => [Vector, Vector]} */
 export function box(points) {
   /** @type {Vector} */
   const low = [Infinity, Infinity, Infinity];
@@ -46,10 +45,8 @@ export function box(points) {
   return [low, high];
 }
 
-/**
- * Write the matrix of the axis-angle vector at `from` of `vectors` to `out` (9 numbers from `to`).
- * @type {(vectors: ArrayLike<number>, from: number, out: Float64Array, to: number) => void}
- */
+// Write the matrix of the axis-angle vector at `from` of `vectors` to `out` (9 numbers from `to`).
+/** @type {(vectors: ArrayLike<number>, from: number, out: Float64Array, to: number) => void} */
 export function matrixFromAxisAngle(vectors, from, out, to) {
   const [x, y, z] = [vectors[from], vectors[from + 1], vectors[from + 2]];
   const angle = Math.hypot(x, y, z);
@@ -67,16 +64,14 @@ export function matrixFromAxisAngle(vectors, from, out, to) {
   out[to + 8] = 1 - second * (x * x + y * y);
 }
 
-/**
- * Axis-angle vector on the shortest arc from axis-angle vector `a` to `b`, at `share` of the way.
- * @type {(a: ArrayLike<number>, b: ArrayLike<number>, share: number) => Vector}
- */
+// Axis-angle vector on the shortest arc from axis-angle vector `a` to `b`, at `share` of the way.
+/** @type {(a: ArrayLike<number>, b: ArrayLike<number>, share: number) => Vector} */
 export function slerpAxisAngle(a, b, share) {
   const p = quaternionOf(a);
   let q = quaternionOf(b);
   let cosine = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
   if (cosine < 0) {
-    q = q.map((part) => -part);
+    q = q.map(part => -part);
     cosine = -cosine;
   }
   const angle = Math.acos(Math.min(1, cosine));
@@ -102,10 +97,8 @@ export function axisAngleOf([w, x, y, z]) {
   return [factor * x, factor * y, factor * z];
 }
 
-/**
- * The quaternion that turns by `b`, then by `a`.
- * @type {(a: number[], b: number[]) => number[]}
- */
+// The quaternion that turns by `b`, then by `a`.
+/** @type {(a: number[], b: number[]) => number[]} */
 export function multiplied([aw, ax, ay, az], [bw, bx, by, bz]) {
   return [
     aw * bw - ax * bx - ay * by - az * bz,
@@ -115,10 +108,8 @@ export function multiplied([aw, ax, ay, az], [bw, bx, by, bz]) {
   ];
 }
 
-/**
- * The unit quaternion whose parts but the largest, which is positive, are `smaller`.
- * @type {(smaller: Values, largest: number) => number[]}
- */
+// The unit quaternion whose parts but the largest, which is positive, are `smaller`.
+/** @type {(smaller: Values, largest: number) => number[]} */
 export function wholeQuaternion(smaller, largest) {
   const rest = Math.sqrt(Math.max(0, 1 - smaller[0] ** 2 - smaller[1] ** 2 - smaller[2] ** 2));
   const whole = Array.from(smaller);
