@@ -80,7 +80,7 @@ COLD = """
 import json
 from stga_addon.raster.cpu import tiles
 from stga_addon.training.optimize import precompile
-precompile._optimize = precompile._limit = lambda: None  # which the first process compiles meanwhile
+precompile._step = lambda: None  # which the first process compiles meanwhile
 precompile.precompile_kernels()
 kernel = getattr(tiles.fill_pairs, "__wrapped__", tiles.fill_pairs)
 print(json.dumps([sum(kernel.stats.cache_hits.values()), len(kernel.signatures)]))
