@@ -165,6 +165,7 @@ def assert_close(errors: dict[str, float], image: float, gradient: float) -> Non
 
 
 __all__ = [
-    "NAMES", "Scene", "assert_close", "cloud", "compare", "facing", "kernel_gradients", "random_cotangents",
+    "NAMES", "Scene", "assert_close", "cloud", "compare", "facing", "kernel_gradients",
+    "random_cotangents",
     "reference_gradients", "rows", "steady_pixels",
 ]  # fmt: skip

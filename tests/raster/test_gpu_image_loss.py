@@ -36,7 +36,8 @@ def on_device(
     device.upload("v_image", np.full_like(image, 77))
     with device.record() as work:
         v_image, loss = image_loss(
-            work, width, height, view=device.upload("view", view, "uniform"), image=device.upload("image", image),
+            work, width, height, view=device.upload("view", view, "uniform"),
+            image=device.upload("image", image),
             touched=device.upload("touched", touched.astype(np.uint32)), whole=bool(touched.all()),
         )  # fmt: skip
     return device.read(v_image, image.shape), float(device.read(loss, (1,))[0])

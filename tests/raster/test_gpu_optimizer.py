@@ -60,15 +60,18 @@ def random_state(count: int = 700, seed: int = 1) -> State:
 
     return State(
         splats=table(), gradients=table(), first=table(), second=table() ** 2, average=table(),
-        steps=rng.integers(0, 3000, count).astype(np.int32), face=rng.integers(0, 11, count).astype(np.int32),
+        steps=rng.integers(0, 3000, count).astype(np.int32), face=rng.integers(0, 11,
+        count).astype(np.int32),
         unbound=rng.random(count) < 0.3, share=rng.random(count).astype(np.float32),
-        limits=rng.uniform(0.2, 2, (3, 11)).astype(np.float32), screen=rng.random(count).astype(np.float32),
+        limits=rng.uniform(0.2, 2, (3, 11)).astype(np.float32),
+        screen=rng.random(count).astype(np.float32),
         statistics=rng.random((count, 2)).astype(np.float32), wanted=rng.random(count) < 0.7,
     )  # fmt: skip
 
 
 def on_device(
-    device: Device, state: State, weights: tuple[float, float, float] = (0, 0, 0), statistics: bool = False,
+    device: Device, state: State, weights: tuple[float, float, float] = (0, 0, 0),
+    statistics: bool = False,
     ema_share: float = 0.05, epsilon: float = EPSILON,
 ) -> State:  # fmt: skip
     """The state after a step; weights: of scale, distance, opacity."""
@@ -86,9 +89,11 @@ def on_device(
     upload_step(device, RATES, (BETA1, BETA2), epsilon, ema_share, weights, statistics)
     with device.record() as work:
         optimize(
-            work, n, STRIDE, any(weights[:2]), tables, view=upload("view", view, "uniform"), splats=splats,
+            work, n, STRIDE, any(weights[:2]), tables, view=upload("view", view, "uniform"),
+            splats=splats,
             gradients=gradients, face=upload("test face", state.face),
-            wanted=upload("test wanted", state.wanted.astype(np.uint32)), screen=upload("test screen", state.screen),
+            wanted=upload("test wanted", state.wanted.astype(np.uint32)),
+            screen=upload("test screen", state.screen),
         )  # fmt: skip
     after = device.read(tables.history, (n, 3), np.int32)
     read = {
@@ -97,7 +102,8 @@ def on_device(
         **{k: getattr(tables, k) for k in ("first", "second", "average")},
     }
     return replace(
-        state, **{name: device.read(buffer, (n, STRIDE)) for name, buffer in read.items()}, steps=after[:, 0].copy(),
+        state, **{name: device.read(buffer, (n, STRIDE)) for name, buffer in read.items()},
+        steps=after[:, 0].copy(),
         statistics=after[:, 1:].copy().view(np.float32),
     )  # fmt: skip
 

@@ -57,7 +57,8 @@ class Raw:
         self.table = upload_splats(self.device, self.splats, np.zeros(self.count, np.int32))
         frames = upload_frames(self.device, frames_in_camera(WORLD, self.scene.camera))
         options = ViewOptions(
-            self.scene.camera, self.scene.degree, background, antialiased=self.antialiased, focused=focus is not None,
+            self.scene.camera, self.scene.degree, background, antialiased=self.antialiased,
+            focused=focus is not None,
             reach=reach,
         )  # fmt: skip
         marked = None if focus is None else self.device.upload("focus", focus.astype(np.uint32))

@@ -100,7 +100,8 @@ def test_the_step_is_adam_in_float64() -> None:
         if number == 2:
             gradient[rows[face[rows] == 3]] = np.inf
         adam.step_offsets(
-            {"strain_position": state}, rows, face, gradient, {"strain_position": smoothed}.__getitem__, rate,
+            {"strain_position": state}, rows, face, gradient,
+            {"strain_position": smoothed}.__getitem__, rate,
             ema_share, epsilon,
         )  # fmt: skip
         for f in np.unique(face[rows]):

@@ -397,6 +397,6 @@ def test_views_that_show_something_else_are_named(
     prepare(replace(request, captures=(take,)), ignore, said.append)
     (line,) = [line for line in said if "swapped" in line]
     assert (
-        line
-        == "warning: images/00001_01.png: does not look like the head from this camera; are images swapped?"
+        line == "warning: images/00001_01.png: does not look like the head from this camera; are "
+        "images swapped?"
     )

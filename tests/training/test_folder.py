@@ -189,7 +189,8 @@ def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
     them."""
     rows = np.zeros((FACES, 3, 3), np.float32)
     arrays = {
-        "value": rows, "average": rows, "first": rows, "second": rows, "steps": np.zeros(FACES, np.int32), **changes,
+        "value": rows, "average": rows, "first": rows, "second": rows, "steps": np.zeros(FACES,
+        np.int32), **changes,
     }  # fmt: skip
     return {f"strain_position/{name}": array for name, array in arrays.items()}
 

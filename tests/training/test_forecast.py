@@ -172,7 +172,8 @@ def test_why_a_target_was_missed() -> None:
         curve(TIMES[:6], -rising(TIMES[:6])), 40
     )
     assert explain_missed_target([(1.0, 20.0)], 40) == (
-        "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it would take"
+        "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it "
+        "would take"
     )
 
 

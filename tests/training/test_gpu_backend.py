@@ -99,7 +99,8 @@ def batch_of(
 ) -> Batch:
     view = view_of(capture, timestep)
     values = {
-        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3, np.float32), "sh_degree": 3,
+        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3,
+        np.float32), "sh_degree": 3,
         "selected": None, "rates": learning_rates(settings.rates, 0.0),
     }  # fmt: skip
     return Batch(**{**values, **changes})

@@ -47,7 +47,8 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     iteration."""
     out = tmp_path_factory.mktemp("finished") / "run"
     settings = quick_settings(
-        "global", iterations=12, strain_color=True, lattice=1, density_interval=10, density_span=(0.0, 1.0),
+        "global", iterations=12, strain_color=True, lattice=1, density_interval=10,
+        density_span=(0.0, 1.0),
         stray_reset_interval=4, stray_limit=0.3, hull_points=True,
     )  # fmt: skip
     without_held_out = replace(toy, views={"train": toy.views["train"]})

@@ -105,7 +105,8 @@ def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
     np.testing.assert_array_equal(avatar.faces, toy.faces)
     assert avatar.settings["strategy"] == "selective"
     assert sorted(p.name for p in unbroken.iterdir()) == [
-        "avatar.npz", "checkpoint.npz", "metrics.jsonl", "residuals.npz", "run.json", "selection.npz",
+        "avatar.npz", "checkpoint.npz", "metrics.jsonl", "residuals.npz", "run.json",
+        "selection.npz",
     ]  # fmt: skip
 
 
