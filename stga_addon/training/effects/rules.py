@@ -232,7 +232,7 @@ def torso(facts: CaptureFacts) -> Verdict | None:
     return Verdict(found.motion != "head", found.description)
 
 
-def _turning(*joints: int) -> Rule:
+def _turning(name: str, *joints: int) -> Rule:
     """On where one of these FLAME joints turns."""
 
     def rule(facts: CaptureFacts) -> Verdict | None:
@@ -241,6 +241,7 @@ def _turning(*joints: int) -> Rule:
         turn = facts.joint_angle(*joints)
         return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
 
+    rule.__name__ = name
     return rule
 
 
@@ -272,8 +273,8 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
 
 _RULES: tuple[Rule, ...] = (
     view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection,
-    strain_color, strain_position, relight, world, teeth, torso, dynamic_offsets, tracking,
+    strain_color, strain_position, relight, world, teeth, torso, _turning("neck", 1),
+    _turning("jaw", 2), _turning("eyes", 3, 4), dynamic_offsets, tracking,
 )  # fmt: skip
-_JOINTS = {"neck": _turning(1), "jaw": _turning(2), "eyes": _turning(3, 4)}
-RULES: dict[str, Rule] = {rule.__name__.replace("_", "-"): rule for rule in _RULES} | _JOINTS
-"""Effect -> its rule; most are functions of that name."""
+RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
+"""Effect -> its rule, a function of that name."""

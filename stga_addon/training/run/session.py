@@ -213,7 +213,6 @@ class _Session:
         trainer, tracking = self.trainer, self.trainer.tracking
         saved, started, first = self.elapsed_s, self.elapsed_s, trainer.iteration
         asked_s = _asked_interval_s()
-        interval_s = CHECKPOINT_S if asked_s is None else asked_s
         with self._loader() as loader:
             while not self._spent().share >= 1:
                 begin = perf_counter()
@@ -234,7 +233,7 @@ class _Session:
                     self._evaluate()
                     if self._is_finished():
                         break
-                if self.elapsed_s - saved > interval_s:
+                if self.elapsed_s - saved > (CHECKPOINT_S if asked_s is None else asked_s):
                     self._write_checkpoint()
                     saved = self.elapsed_s
                 elapsed_s = max(self.elapsed_s - started, 1e-9)
