@@ -358,6 +358,10 @@ def _open(name: str) -> tuple[Any, dict[tuple, Kernel], list[Exception]]:
     return device, {}, failures
 
 
+def _source(name: str) -> str:
+    return files(__package__).joinpath(f"{name}.wgsl").read_text(encoding="utf-8")
+
+
 @cache
 def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
     """The text of an entry point with the functions that it calls, and index and kind of each table
@@ -366,8 +370,7 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
     A table is bound for reading where none of them assigns to it: what only reads needs no barrier
     between dispatches.
     """
-    paths = [files(__package__).joinpath(f"{name}.wgsl") for name in ("common", file)]
-    sources = [path.read_text(encoding="utf-8") for path in paths]
+    sources = _source("common"), _source(file)
     text = "\n".join([constants_wgsl(), struct_wgsl("View", VIEW), *sources])
     code = re.sub("//.*", "", text)
     bodies, reached, left = dict(_FUNCTION.findall(code)), set[str](), {entry}

@@ -102,11 +102,35 @@ class Rasterizer:
     def draw(
         self, work: Recording, tables: Tables, count: int, camera: Camera, focus: Any = None
     ) -> Tables:
-        """Record the rendering of `count` projected splats, with the view in `tables`."""
+        """Record the rendering of `count` projected splats, with the view in `tables`.
+
+        Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable
+        sort by tile keeps. A splat has a pair with each rendered tile that its outline reaches; its
+        bounding box would count more. How many pairs there are is known on the device only, so
+        everything that follows is dispatched indirectly.
+        """
         columns, rows = tile_grid(camera.width, camera.height)
+        tiles, room, buffer = columns * rows, self.capacity, self.device.buffer
+        words = {"touched": tiles, "rendered": tiles, "wanted": count, "slots": 2 * count}
+        words |= dict.fromkeys(("slot_tile", "slot_splat"), room)
+        words["pairs_until"] = count + -(-count // WORKGROUP)
+        tables |= {name: buffer(name, each) for name, each in words.items()}
+        tables["tile_range"] = buffer("ranges", 2 * tiles)
+        tables["counts"] = counts_buffer(self.device)
         tables["focus"] = tables["rect"] if focus is None else focus
-        choose_tiles(work, count, columns * rows, tables, focus is not None)
-        list_pairs(work, count, columns * rows, self.capacity, tables)
+        if focus is not None:
+            work.clear(tables["touched"], tiles)
+            work.dispatch("tiles.mark_touched", count, tables)
+        work.dispatch("tiles.choose_rendered", tiles, tables)
+        view = tables["view"]
+        _, tables["order"] = sort_keys(work, tables["depth_key"], count, DEPTH_BITS, view)
+        work.dispatch("tiles.count_pairs", count, tables)
+        work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
+        work.dispatch("tiles.fill_pairs", count, tables)
+        keys, bits = tables["slot_tile"], tiles.bit_length()
+        by_tile = sort_keys(work, keys, room, bits, view, of_pairs=True)
+        tables["pair_tile"], tables["pair_slot"] = by_tile
+        work.dispatch("tiles.find_ranges", (tables["counts"], 4 * PAIR_GROUPS), tables)
         blend(work, camera, tables)
         return tables
 
@@ -208,41 +232,6 @@ def projected_tables(device: Device, count: int) -> Tables:
     """Room for `count` projected splats."""
     words = {"projected": PROJECTED, "depth_key": 1, "rect": 4}
     return {name: device.buffer(name, count * each) for name, each in words.items()}
-
-
-def choose_tiles(work: Recording, count: int, tiles: int, tables: Tables, focused: bool) -> None:
-    """Record which of `tiles` tiles are rendered of `count` splats, by view, rect and, if there is
-    one, the focus."""
-    buffer = work.device.buffer
-    tables |= {"touched": buffer("touched", tiles), "rendered": buffer("rendered", tiles)}
-    tables["tile_range"] = buffer("ranges", 2 * tiles)
-    if focused:
-        work.clear(tables["touched"], tiles)
-        work.dispatch("tiles.mark_touched", count, tables)
-    work.dispatch("tiles.choose_rendered", tiles, tables)
-
-
-def list_pairs(work: Recording, count: int, tiles: int, capacity: int, tables: Tables) -> None:
-    """Record every rendered tile's list of pairs, near to far, with room for `capacity` pairs.
-
-    Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable
-    sort by tile keeps. A splat has a pair with each tile that its outline reaches; its bounding box
-    would count more. How many pairs there are is known on the device only, so everything that
-    follows is dispatched indirectly.
-    """
-    buffer, counts = work.device.buffer, counts_buffer(work.device)
-    _, tables["order"] = sort_keys(work, tables["depth_key"], count, DEPTH_BITS, tables["view"])
-    words = {"pairs_until": count + -(-count // WORKGROUP), "wanted": count, "slots": 2 * count}
-    words |= {"slot_tile": capacity, "slot_splat": capacity}
-    tables |= {name: buffer(name, each) for name, each in words.items()} | {"counts": counts}
-    work.dispatch("tiles.count_pairs", count, tables)
-    work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
-    work.dispatch("tiles.fill_pairs", count, tables)
-    keys, bits = tables["slot_tile"], tiles.bit_length()
-    tables["pair_tile"], tables["pair_slot"] = sort_keys(
-        work, keys, capacity, bits, tables["view"], of_pairs=True
-    )
-    work.dispatch("tiles.find_ranges", (counts, 4 * PAIR_GROUPS), tables)
 
 
 def sort_keys(
