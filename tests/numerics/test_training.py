@@ -200,3 +200,26 @@ def test_adam_of_any_age(steps: int) -> None:
     np.testing.assert_allclose(
         adam_path(gradients, steps), float64_adam(gradients, steps), atol=1e-4, rtol=1e-5
     )
+
+
+def test_a_row_that_is_stepped_once_in_ten_thousand() -> None:
+    """Catches bias correction by iterations instead of the row's own steps: after three rare ones
+    its moments are still corrected by 1 − β³, while its neighbor's are not any more."""
+    state = new_state(random_splats(2, 3))
+    state.parameters.opacity[:] = 0
+    for array in state.gradients:
+        array[:] = 0
+    rng = np.random.default_rng(4)
+    rare = rng.normal(size=3)
+    for g in rare:
+        state.gradients.opacity[1] = float(g)
+        adam.step(state, np.array([0, 1], np.int32), RATE)
+        for _ in range(20):
+            state.gradients.opacity[:] = float(rng.normal())
+            adam.step(state, np.array([0], np.int32), RATE)
+        # the steps in between do nothing to row 1, however many they are
+        state.steps[0] += 10_000 - 21
+    assert state.steps.tolist() == [30_000, 3]
+    assert float(state.parameters.opacity[1]) == pytest.approx(
+        1e-3 * float64_adam(rare)[-1], rel=1e-5
+    )
